@@ -126,6 +126,6 @@ if __name__ == "__main__":
     )
     plots = TrajectoryPlots(every=60_000, n_flights=2, max_steps=200, task="state_recovery")
     model.learn(arguments.timesteps, callback=plots)
-    flights = fly(model, "state_recovery", n_episodes=480, seed=1_000_000)
+    flights = fly(model, "state_recovery", n_flights=480, seed=1_000_000)
     print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")
     print("plots are in tb/")

@@ -25,6 +25,7 @@ from sb3_quad.cli import closing, main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
@@ -520,7 +521,7 @@ def test_any_task_has_a_closing_table(task):
     assert table.title.startswith(
         task if isinstance(task, str) else "75% target_tracking, 25% far_tracking"
     )
-    of_thesis = isinstance(task, str) and task in closing.SCENARIOS
+    of_thesis = isinstance(task, str) and task in THESIS_SCENARIOS
     assert [bool(column.source) for column in table.columns] == [False, False] + of_thesis * [
         True,
         True,

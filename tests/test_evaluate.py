@@ -105,11 +105,13 @@ def test_the_physical_limit_stands_beside_the_time_to_stay(here, capsys):
     assert [entry.physical_limit for entry in load_results("out").entries] == [*limits, None, None]
     lines = capsys.readouterr().out.splitlines()
     (at,) = (
-        number for number, line in enumerate(lines) if "physical limit of that time, s" in line
+        number
+        for number, line in enumerate(lines)
+        if "physical limit of the settling time, s" in line
     )
     assert (
         all(f"{limit:.2f}" in lines[at] for limit in limits)
-        and "to stay within 0.1 m, s" in lines[at - 1]
+        and "settling time (0.1 m), s" in lines[at - 1]
     )
 
 
@@ -260,10 +262,56 @@ def test_failures_are_one_line_each_and_the_others_fly(here, capsys):
     assert len(results.failures) == len(bad)
 
 
+def test_an_own_reward_is_in_tables_and_files(here, capsys):
+    (here / "my_rewards.py").write_text(
+        "number = 1\n\n\ndef calm(state, actions):\n    return -abs(actions).sum(axis=1)\n"
+    )
+    calm = ["--scenario", "tracking", "--reward", "my_rewards:calm"]
+    assert (
+        main(
+            [
+                "evaluate",
+                "pid",
+                "still=my_controllers:hover",
+                "--suite",
+                "small.yaml",
+                "-o",
+                "out",
+                *calm,
+            ]
+        )
+        == 0
+    )
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "mean own reward" in line]
+    results = load_results("out")
+    assert (
+        results.reward == "my_rewards:calm"
+        and "my_rewards:calm" in (here / "out" / "report.html").read_text()
+    )
+    for name in ("pid", "still"):
+        entry = results.entry(name, "tracking")
+        sums = [float(row["own_reward"]) for row in rows() if row["controller"] == name]
+        assert entry.metrics.own_reward.value == pytest.approx(np.mean(sums))
+        assert f"{entry.metrics.own_reward.value:.2f}".replace("-", "−") in line
+        np.testing.assert_allclose(read_flights(f"out/{entry.flights}")["episode_own_reward"], sums)
+    assert results.entry("still", "tracking").metrics.own_reward.value == 0.0
+    # Its code may change, so a finished evaluation is not shown again as if it were the same.
+    assert evaluate("pid", "still=my_controllers:hover", *calm) == 2
+    for reward, message in {
+        "my_rewards:number": "is not a function reward(state, actions)",
+        "my_rewards:nothing": "cannot be imported as package.module:function",
+        "no_such_module:calm": "cannot be imported as package.module:function",
+    }.items():
+        capsys.readouterr()
+        assert evaluate("pid", "--reward", reward, folder="other") == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+
+
 def test_labels():
     specs = parse_controllers(["pid", "x/other.zip", "runs/lr=1/z.zip", "me=q.zip"])
     assert [spec.label for spec in specs] == ["pid", "other", "z", "me"]
-    with pytest.raises(ConfigError, match="two are called so"):
+    with pytest.raises(ConfigError, match="two have this label"):
         parse_controllers(["a/best.zip", "b/best.zip"])
 
 

@@ -3,6 +3,7 @@ environment.
 """
 
 import io
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -11,13 +12,15 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from sb3_quad import env_kwargs, load_pretrained
+from sb3_quad.base.errors import ControllerError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.evaluation import statistics
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, Hook, fly, fly_settings
 from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.evaluation.statistics import share
+from sb3_quad.evaluation.statistics import bootstrap, share
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.settings import FlightSettings
@@ -108,6 +111,56 @@ def test_hovering_covers_no_distance_and_time_zero_is_the_start():
     assert flights.final_error == pytest.approx(np.full(2, 0.3))
 
 
+def test_an_own_reward_is_summed_over_the_control_steps_of_each_flight():
+    class Tilts(Hook):
+        """The z axis after each step, which a flight's last step has, too."""
+
+        def on_start(self, state, vehicle):
+            self.seen = []
+
+        def after_step(self, step, state, actions, flying):
+            self.seen.append(np.square(actions).sum(axis=1) + state.position[:, 2])
+
+    hook = Tilts()
+    flights = fly(
+        fall,
+        "state_recovery",
+        4,
+        hooks=[hook],
+        reward=lambda state, actions: np.square(actions).sum(axis=1) + state.position[:, 2],
+    )
+    assert not flights.survival.any() and len(set(flights.length)) > 1
+    for row, length in enumerate(flights.length):
+        expected = sum(values[row] for values in hook.seen[:length])
+        assert flights.own_reward[row] == pytest.approx(expected, rel=1e-12)
+    assert np.isnan(fly(fall, "state_recovery", 4).own_reward).all()
+    assert (fly(fall, n_flights=2, max_steps=3, reward=Changes).own_reward == [1.0, 1.0]).all()
+
+
+class Changes:
+    """A reward that remembers: by how much the first action changes, from hover."""
+
+    last = 0.0
+
+    def __call__(self, state, actions):
+        change = abs(actions[:, 0] - self.last)
+        self.last = actions[:, 0]
+        return change
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (lambda state, actions: 1.0, r"gives shape \(\), must be \(3,\)"),
+        (lambda state, actions: state.nothing, "fails with AttributeError"),
+        (lambda state, actions: np.full(3, np.inf), "gives inf in row 0"),
+    ],
+)
+def test_an_own_reward_that_does_not_fit_is_named(reward, message):
+    with pytest.raises(ControllerError, match=f"reward <lambda>: {message}"):
+        fly(hover, n_flights=3, max_steps=2, reward=reward)
+
+
 def test_the_conventions_give_the_specified_metrics():
     metrics = summarise(fly(PIDExpert(), "target_tracking", 480, seed=0))
     arrivals = {arrival.tolerance: arrival for arrival in metrics.arrivals}
@@ -136,7 +189,7 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
     distances = Distances()
     flights = fly(
         load_pretrained("itm-robust"),
-        n_episodes=24,
+        n_flights=24,
         max_steps=700,
         hooks=[distances],
         **env_kwargs("itm-robust"),
@@ -168,6 +221,7 @@ def test_tables_say_how_many_arrived():
         survival=np.array([True, True, False, True]),
         collision=np.array([False, False, True, False]),
         reward=np.full(n, -8.0),
+        own_reward=np.full(n, np.nan),
         length=np.full(n, 1500),
         flown=np.full(n, 15.0),
         time_to={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 5.0, np.nan, 6.0])},
@@ -216,6 +270,20 @@ def test_tables_say_how_many_arrived():
         assert part in text
     one_lost = metrics.model_copy(update={"success": share([False] + [True] * 3839)})
     assert metric_cells(one_lost)[SUCCESS].number == "99.97"  # not 100
+
+
+def test_a_bootstrap_of_many_values_needs_little_memory_and_blocks_change_no_number(monkeypatch):
+    values = np.random.default_rng(1).normal(size=50_000)
+    tracemalloc.start()
+    whole = bootstrap(values[:999])
+    bootstrap(values)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6  # at once, the indices alone would take 400 MB
+    monkeypatch.setattr(statistics, "BLOCK", 2500)
+    assert bootstrap(values[:999]) == whole
+    monkeypatch.setattr(statistics, "BLOCK", 1)
+    assert bootstrap(values[:999]) == whole
 
 
 def test_tables_stand_without_a_single_success():

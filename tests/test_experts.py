@@ -56,7 +56,7 @@ def time_to(distances, tolerance):
 
 
 def test_pid_tracking_figures():
-    flights = fly(PIDExpert(), task="target_tracking", n_episodes=2400, seed=11)
+    flights = fly(PIDExpert(), task="target_tracking", n_flights=2400, seed=11)
     assert flights.success.all()
     for tolerance, seconds in ((0.1, 7.71), (0.2, 6.89), (0.5, 5.80), (1.0, 4.90)):
         assert np.mean(flights.time_to[tolerance]) == pytest.approx(seconds, rel=0.02)
@@ -65,7 +65,7 @@ def test_pid_tracking_figures():
 
 
 def test_pid_recovery_figure():
-    flights = fly(PIDExpert(), task="state_recovery", n_episodes=4800, seed=12)
+    flights = fly(PIDExpert(), task="state_recovery", n_flights=4800, seed=12)
     assert 100 * flights.survival.mean() == pytest.approx(31.9, abs=2.0)
 
 

@@ -157,7 +157,7 @@ def test_privileged_derived_is_gentler_where_commands_act_late(name: str, late: 
     vehicle = load_vehicle(name)
     bold = GeometricExpert(vehicle, derived_gains(vehicle), privileged=True)
     gentle, plain = (
-        fly(expert, seed=3, n_episodes=24, vehicle=vehicle, max_steps=900)
+        fly(expert, seed=3, n_flights=24, vehicle=vehicle, max_steps=900)
         for expert in (privileged_derived(name), bold)
     )
     assert gentle.success.all() and not np.isnan(gentle.settling_time[0.1]).any()

@@ -1,11 +1,11 @@
-"""When a flight is stable again and how far beside its way it gets, on made-up flights whose answer
-is known.
+"""When a flight is stable again, how far it deviates from its line and when it arrives, on made-up
+flights whose answer is known.
 """
 
 import numpy as np
 import pytest
 
-from sb3_quad.evaluation.flights import Motion
+from sb3_quad.evaluation.flights import Arrivals, Motion
 from sb3_quad.simulation.state import (
     BODY_RATES,
     POSITION,
@@ -43,7 +43,7 @@ def test_a_lost_flight_gets_stable_no_more():
     assert np.isnan(watched([state(tilt=2.0), *[state()] * 40], flying=False).recovery_time[0])
 
 
-def test_sideways_is_across_the_way_only():
+def test_the_cross_track_error_is_across_the_line_only():
     states = [state(), state(position=(4, 3, 4)), state(position=(12, 0, 1))]
     assert watched(states).cross_track_error[0] == pytest.approx(5.0)
     assert np.isnan(
@@ -51,3 +51,14 @@ def test_sideways_is_across_the_way_only():
             [state(target=(0, 0, 0)), state(position=(1, 2, 3), target=(0, 0, 0))]
         ).cross_track_error[0]
     )
+
+
+def test_arrival_and_settling_times_are_those_of_each_tolerance():
+    everyone = np.ones(3, dtype=np.bool_)
+    arrivals = Arrivals((0.1, 1.0), np.array([0.05, 2.0, 2.0]))
+    # The first leaves 0.1 m and returns, the second overshoots within 1 m, the third never arrives.
+    for step, distance in enumerate([[0.3, 0.5, 1.5], [0.08, 0.9, 1.2], [0.02, 0.09, 1.1]], 1):
+        arrivals.see(float(step), np.array(distance), everyone)
+    np.testing.assert_array_equal(arrivals.time_to, [[0, 3, np.nan], [0, 1, np.nan]])
+    np.testing.assert_array_equal(arrivals.settling_time, [[2, 3, np.nan], [0, 1, np.nan]])
+    np.testing.assert_array_equal(arrivals.overshoot, [0.3, 0.09, np.nan])

@@ -29,7 +29,7 @@ def runs(tmp_path):
 
 def test_a_curve_holds_the_means_of_the_evaluations(runs):
     curve = read_curve(runs / "Env_2")
-    np.testing.assert_array_equal(curve.success, [0.5, 1.0])
+    np.testing.assert_array_equal(curve.values("success"), [0.5, 1.0])
     np.testing.assert_array_equal(curve.reward, [-6.0, -2.0])
     np.testing.assert_array_equal(curve.seconds, [120.0, 240.0])
 
@@ -46,10 +46,9 @@ def test_seeds_are_drawn_as_mean_and_range(runs):
 
 
 def test_every_evaluation_is_marked_and_the_legend_covers_nothing(runs):
-    long, short = (
-        read_curve(runs / "Env_1"),
-        Curve(*(np.array([each]) for each in (150.0, 30.0, 0.5, -2.0))),
-    )
+    long = read_curve(runs / "Env_1")
+    once = {"success": np.array([0.5]), "reward": np.array([-2.0])}
+    short = Curve(np.array([150.0]), np.array([30.0]), once)
     figure = plot_curves(
         {"agent": [long], "a run with a single evaluation": [short]}, EXPERT, "title"
     )
@@ -121,7 +120,10 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
             "survival: the runs' evaluations hold none",
         ),
         (["agent={runs}/Env_1", "--show", "losses"], "losses: the runs' evaluations hold none"),
-        (["agent={runs}/Env_1", "--task", "target_tracking"], "none of this run's eval_tasks"),
+        (
+            ["agent={runs}/Env_1", "--task", "target_tracking"],
+            "is not one of this run's eval_tasks",
+        ),
     ],
 )
 def test_bad_input_is_one_line(runs, arguments, message, capsys):

@@ -249,7 +249,7 @@ def test_the_measured_offset_is_cancelled_and_the_way_is_quicker():
     adapted = AdaptiveScaling(policy, measure_mean(policy, n_flights=8))
     assert np.linalg.norm(hover_offset(adapted, 8)) < 0.01
     plain, quick = (
-        fly(each, n_episodes=8, max_steps=900, tolerances=(0.5,)).time_to[0.5].mean()
+        fly(each, n_flights=8, max_steps=900, tolerances=(0.5,)).time_to[0.5].mean()
         for each in (policy, adapted)
     )
     assert quick < plain

@@ -76,7 +76,7 @@ class UnhurriedExpert(Expert):
 def recorded(controller, n=24, seed=7):
     """Trajectories of n flights to targets 10 m away."""
     recorder = Recorder(n)
-    fly(controller, "target_tracking", n_episodes=n, seed=seed, hooks=[recorder])
+    fly(controller, "target_tracking", n_flights=n, seed=seed, hooks=[recorder])
     return recorder.arrays()
 
 

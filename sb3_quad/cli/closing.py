@@ -12,9 +12,8 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.evaluation.compare import SCENARIOS, task_table
+from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.tables import Table
-from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
@@ -30,14 +29,13 @@ def print_tables(
     seed: int,
     thesis_columns: Iterable[str] = (),
 ) -> None:
-    """Print a table as of :func:`task_table` for each task.
+    """Print the tables of some controllers over the same episodes of both tasks of the thesis.
 
     :param how: the controllers fly in any task: vehicle, noise and scaling.
     """
-    for task in SCENARIOS:
-        console().print(
-            task_table(controllers, FlightSettings(task=task, **how), n, seed, thesis_columns)
-        )
+    result = compare(controllers, n_flights=n, seed=seed, thesis_columns=thesis_columns, **how)
+    for table in result.tables:
+        console().print(table)
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
@@ -46,12 +44,18 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
 
     :param job: of an environment of this package.
     """
-    settings = job.flight_settings
+    how = dict(job.flight_settings)
     controllers = {"agent": model, "expert": _expert(job)}
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
-    return task_table(
-        controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert")
+    result = compare(
+        controllers,
+        [how.pop("task")],
+        FRESH_EPISODES,
+        seed_for("table", job.seed),
+        thesis_columns=(agent, "expert"),
+        **how,
     )
+    return result.tables[0]
 
 
 def _expert(job: TrainingJob) -> Any:

@@ -1,48 +1,188 @@
-"""Controllers on the same fresh episodes of a task, in one table."""
+"""Controllers on the same episodes of some tasks, in one table for each task."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.seeds import row_seeds
-from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.validate import validate
+from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
+from sb3_quad.evaluation.flights import Reward, fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
-from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.metrics import Metrics, summarise
+from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import in_words
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
 THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
-SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of its suite, by task
 
 
-def task_table(
-    controllers: Mapping[str, Any],
-    settings: FlightSettings,
-    n: int,
-    seed: int,
-    thesis_columns: Iterable[str] = (),
-) -> Table:
-    """The table of some controllers over the same episodes of a task.
+class Comparison(dict[str, dict[str, Metrics]]):
+    """The metrics by label and task; ``str`` and notebooks show them as tables.
 
-    :param settings: how all of them fly.
-    :param n: how many episodes.
-    :param thesis_columns: columns of the thesis to add if they fly the thesis's vehicle.
+    ``tables`` (one :class:`~sb3_quad.evaluation.tables.Table` for each task) are what is shown.
     """
-    seeds = row_seeds(seed, n)
-    measured = [
-        metric_cells(summarise(fly_settings(each, settings, seeds)))
-        for each in controllers.values()
-    ]
-    task = in_words(settings.task)
-    scenario = load_suite("thesis").scenario(
-        SCENARIOS.get(task, SCENARIOS["target_tracking"])
-    )  # whose rows others have, too
-    of_thesis = task in SCENARIOS and settings.vehicle == THESIS_VEHICLE
-    shown = [name for name in thesis_columns if of_thesis and name in scenario.reference]
-    columns = [*map(Column, controllers), *(Column(name, source="thesis") for name in shown)]
-    rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
-    title = f"{task}: {n} fresh episodes, the same for all" + (
-        "" if settings.noise else ", true state"
-    )
-    return Table(columns, rows, title=title, caption=CAPTION)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tables: list[Table] = []
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self.tables))
+
+    def _repr_markdown_(self) -> str:
+        # Notebooks render this; a table in Markdown has no title of its own.
+        parts = []
+        for table in self.tables:
+            parts += [f"**{table.title}**", table.markdown()]
+        return "\n\n".join(parts)
+
+
+def compare(
+    controllers: Mapping[str, Any],
+    tasks: Sequence[Any] = ("target_tracking", "state_recovery"),
+    n_flights: int = 240,
+    seed: int | None = None,
+    reward: str | Reward | None = None,
+    thesis_columns: Iterable[str] = (),
+    **env_kwargs: Any,
+) -> Comparison:
+    """Fly several controllers through the same episodes of some tasks and compare their metrics.
+
+    Each agent flies as it was trained: with the vehicle, the noise and the observation that its zip
+    or ``model.flight_settings`` names. Experts, functions and agents that name none fly the vehicle
+    and the noise of the first agent that names them. Experts see the true state.
+
+    >>> from sb3_quad.evaluation.compare import compare
+    >>> result = compare({"PID": "pid", "agent": "itm-recovery"}, ["state_recovery"], n_flights=48)
+    >>> result["agent"]["state_recovery"].survival.value
+    1.0
+    >>> print(result)  # doctest: +SKIP
+    state_recovery: 48 fresh episodes, the same for all
+    ┏━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━━━━━━━┓
+    ┃             ┃                 PID ┃                 agent ┃
+    ...
+
+    :param controllers: by label: the name of an expert (``"pid"``) or of an agent that comes with
+        the package (``"itm-robust"``), the path of a zip, ``"package.module:factory"``, an SB3
+        model, an expert, or a function from observations (n, 18) to actions (n, 4).
+    :param tasks: names, :class:`~sb3_quad.simulation.tasks.Task` or mixtures ``{name: weight}``.
+    :param n_flights: episodes of each task.
+    :param seed: of the episodes, as :func:`~sb3_quad.evaluation.flights.fly` takes it; None: one
+        that no training flies.
+    :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) as
+        :func:`~sb3_quad.evaluation.flights.fly` takes it, or ``"package.module:function"``. Its
+        mean stands below that of the task.
+    :param thesis_columns: columns of the thesis to add where its vehicle flies one of its tasks:
+        ``"expert"``, ``"IL-agent"``, ``"RL-agent"``.
+    :param env_kwargs: fields of :class:`~sb3_quad.simulation.settings.FlightSettings` that hold for
+        all controllers, such as ``vehicle`` or ``noise``.
+    :return: ``result[label][task]`` are :class:`~sb3_quad.evaluation.metrics.Metrics`, each with
+        its 95 % interval; ``print(result)`` shows the tables.
+    :raises ConfigError: no controllers, an unknown name or keyword, a zip that cannot be read.
+    :raises ControllerError: a controller or reward that fails in flight.
+    """
+    if not controllers:
+        raise ConfigError("compare: give at least one controller, such as {'PID': 'pid'}")
+    if n_flights < 1:
+        raise ConfigError(f"compare: n_flights is {n_flights}, must be at least 1")
+    if seed is None:
+        seed = seed_for("table")
+    seeds = row_seeds(seed, n_flights)
+    own_reward = load_reward(reward)
+    settings = _settings(controllers, env_kwargs)
+    pilots = {}
+    for label, controller in controllers.items():
+        flown = settings[label]
+        pilots[label] = resolve_expert(
+            controller, flown.vehicle, "controller", layout=flown.rotor_layout
+        )
+
+    comparison = Comparison()
+    for task in tasks:
+        name = in_words(task)
+        metrics = {}
+        for label, pilot in pilots.items():
+            how = settings[label].with_changes(task=task)
+            metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
+            comparison.setdefault(label, {})[name] = metrics[label]
+        comparison.tables.append(_task_table(name, metrics, settings, thesis_columns))
+    return comparison
+
+
+def _settings(
+    controllers: Mapping[str, Any], env_kwargs: Mapping[str, Any]
+) -> dict[str, FlightSettings]:
+    """Return how each controller flies, the task excepted."""
+    shared: dict[str, Any] = {}
+    own: dict[str, dict[str, Any]] = {}
+    for label, controller in controllers.items():
+        known = _own_settings(controller)
+        if known is not None:
+            # On another vehicle the agent still finds its rotors where it knows them.
+            own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
+            # The first agent decides for all that do not say how they fly.
+            if not shared:
+                shared = {key: getattr(known, key) for key in ("vehicle", "vehicles", "noise")}
+    settings = {}
+    for label in controllers:
+        how = FlightSettings(**own.get(label, shared))
+        settings[label] = how.with_changes(**env_kwargs)
+    return settings
+
+
+def _own_settings(controller: Any) -> FlightSettings | None:
+    """Return what a zip or a model says about how it flies; None: it says nothing."""
+    if isinstance(controller, (str, Path)):
+        path = agent_path(str(controller))
+        return ControllerSpec(path, path).own
+    record = getattr(controller, KEY, None)
+    if not isinstance(record, dict):
+        return None
+    where = f"{type(controller).__name__}.{KEY}"
+    vehicle = validate(Vehicle, record.get("vehicle"), f"{where}: vehicle")
+    # The task of its training does not matter here.
+    default = FlightSettings()
+    changes = {"vehicle": vehicle, "task": default.task, "task_kwargs": default.task_kwargs}
+    return validate(FlightSettings, record | changes, where)
+
+
+def _task_table(
+    task: str,
+    metrics: Mapping[str, Metrics],
+    settings: Mapping[str, FlightSettings],
+    thesis_columns: Iterable[str],
+) -> Table:
+    """Return the table of some controllers that flew the same episodes of a task."""
+    vehicles = {}
+    true_state = True
+    for label, how in settings.items():
+        vehicles[label] = first_vehicle(how.vehicle)
+        true_state &= not how.noise
+    first, *others = vehicles.values()
+    # Tasks of your own have the rows of target tracking.
+    scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
+    columns = [*map(Column, metrics)]
+    references = []
+    if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):
+        for name in thesis_columns:
+            if name in scenario.reference:
+                columns.append(Column(name, source="thesis"))
+                references.append(scenario.reference[name])
+    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
+
+    n_flights = next(iter(metrics.values())).n
+    title = f"{task}: {n_flights} fresh episodes, the same for all"
+    if true_state:
+        title += ", true state"
+    caption = CAPTION
+    if any(vehicle != first for vehicle in others):
+        for label, vehicle in vehicles.items():
+            caption += f"; {label} flies {vehicle.name}"
+    return Table(columns, rows, title=title, caption=caption)

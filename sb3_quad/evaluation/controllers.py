@@ -1,6 +1,4 @@
-"""The controllers of an evaluation, from what a command line names: labels, records, and how the
-agents among them fly.
-"""
+"""The controllers and the reward that a command line names: labels, records, and how agents fly."""
 
 import hashlib
 from collections.abc import Sequence
@@ -10,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.imports import import_name
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory
 from sb3_quad.controllers.zips import saved_algorithm
+from sb3_quad.evaluation.flights import Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
@@ -37,96 +37,135 @@ class ControllerSpec:
 
     @cached_property
     def own(self) -> FlightSettings | None:
-        """How the agent in a zip says that it flies; None: experts, factories, and zips that say
-        nothing.
+        """The settings that the agent's zip holds; None: experts, factories, and zips without any.
 
         :raises ConfigError: see :func:`agent_settings`.
         """
-        settings, source = agent_settings(self.spec) if self.is_zip else (None, None)
+        if not self.is_zip:
+            return None
+        settings, source = agent_settings(self.spec)
         return settings if source else None
 
     @property
     def observed(self) -> dict[str, Any]:
-        """What goes with the agent wherever it flies, see :attr:`FlightSettings.observed`; also
-        where its rotors are.
+        """Settings that go with the agent wherever it flies.
+
+        These are :attr:`FlightSettings.observed` and the layout of the rotors that it knows.
         """
-        return (
-            FlightSettings().observed
-            if self.own is None
-            else {**self.own.observed, "rotor_layout": self.own.layout}
-        )
+        if self.own is None:
+            return FlightSettings().observed
+        return {**self.own.observed, "rotor_layout": self.own.layout}
 
     def notice(self, vehicle: str | Path | Vehicle) -> str:
-        """A warning if the agent was trained on another vehicle than ``vehicle``, or does not say
-        on which; else empty.
+        """Return a warning if the agent was trained on another vehicle, or does not say on which.
 
+        :return: the warning, in one line; else empty.
         :raises ConfigError: it cannot fly the vehicle, whose rotors are elsewhere.
         """
         flown = load_vehicle(vehicle)
-        if self.own is None:
-            silent = f"{self.label}: {self.spec} does not say how its agent flies; it flies"
-            return f"{silent} {flown.name}, with the scaling of Table A.2" if self.is_zip else ""
-        flown.in_layout_of(self.own.layout)
-        return unlike_trained(self.label, self.own, flown)
+        if self.own is not None:
+            # Raises if the rotors of the two do not fit.
+            flown.in_layout_of(self.own.layout)
+            return unlike_trained(self.label, self.own, flown)
+        # Experts and factories are made for the vehicle that they fly.
+        if not self.is_zip:
+            return ""
+        return (
+            f"{self.label}: {self.spec} does not say how its agent flies; it flies {flown.name},"
+            " with the scaling of Table A.2"
+        )
 
 
 def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
-    """A warning if an agent with ``own`` settings was trained on another vehicle than ``flown``;
-    else empty.
+    """Return a warning if an agent was trained on another vehicle than ``flown``; else empty.
+
+    :param own: the agent's settings.
     """
-    known = first_vehicle(own.vehicle)
-    if own.vehicles is not None or known.flies_as(
-        flown
-    ):  # an agent of many vehicles knows none of them
+    trained = first_vehicle(own.vehicle)
+    # An agent that was trained on many vehicles knows none of them in particular.
+    if own.vehicles is not None or trained.flies_as(flown):
         return ""
-    same = " of other parameters" if known.name == flown.name else ""
-    return f"{label}: was trained on the vehicle {known.name} and flies {flown.name}{same}"
+    warning = f"{label}: was trained on the vehicle {trained.name} and flies {flown.name}"
+    if trained.name == flown.name:
+        warning += " of other parameters"
+    return warning
 
 
 def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
-    """Controllers from ``spec`` or ``label=spec``; a label left out is the spec, of a zip the
-    file's name.
+    """Read controllers from ``spec`` or ``label=spec``.
+
+    Without a label it is the spec; of a zip, the file's name.
 
     :raises ConfigError: two controllers of the same label.
     """
-    found = [ControllerSpec(*_label_and_spec(text)) for text in texts]
-    files = [file_name(entry.label) for entry in found]
-    for file, entry in zip(files, found, strict=True):
-        if not entry.label.isprintable():
-            raise ConfigError(
-                f"controller {entry.label!r}: holds control characters; label it: name={entry.spec}"
-            )
-        if files.count(file) > 1:
-            raise ConfigError(
-                f"controller {entry.label!r}: two are called so; label them: name={entry.spec}"
-            )
-    return found
+    specs = [*map(_parse, texts)]
+    files = set[str]()
+    for spec in specs:
+        who = f"controller {spec.label!r}"
+        if not spec.label.isprintable():
+            raise ConfigError(f"{who}: holds control characters; label it: name={spec.spec}")
+        # Labels that differ may still be the same as names of files.
+        file = file_name(spec.label)
+        if file in files:
+            raise ConfigError(f"{who}: two have this label; label them: name={spec.spec}")
+        files.add(file)
+    return specs
 
 
-def describe(spec: ControllerSpec) -> ControllerRecord:
-    """Who a controller is.
+def controller_record(spec: ControllerSpec) -> ControllerRecord:
+    """Return the record of a controller for the results.
 
     :raises ConfigError: an unknown name, a missing file, a module that cannot be imported.
     """
-    path = Path(spec.spec)
     if spec.is_zip:
-        algorithm, content = saved_algorithm(path), hashlib.sha256(path.read_bytes()).hexdigest()
+        path = Path(spec.spec)
         return ControllerRecord(
-            label=spec.label, spec=path.name, kind="model", algorithm=algorithm, content=content
+            label=spec.label,
+            spec=path.name,
+            kind="model",
+            algorithm=saved_algorithm(path),
+            content=hashlib.sha256(path.read_bytes()).hexdigest(),
         )
-    import_factory(spec.spec, "controller")  # says what is wrong
+    # Import it now, so that an error shows before anything flies.
+    import_factory(spec.spec, "controller")
     return ControllerRecord(
-        label=spec.label, spec=spec.spec, kind="expert" if spec.spec in EXPERTS else "factory"
+        label=spec.label,
+        spec=spec.spec,
+        kind="expert" if spec.spec in EXPERTS else "factory",
     )
 
 
-def _label_and_spec(text: str) -> tuple[str, str]:
+def load_reward(reward: str | Reward | None) -> Reward | None:
+    """Return a reward of the user's own.
+
+    :param reward: a function, returned as it is; or ``package.module:function``.
+    :raises ConfigError: it cannot be imported, or is not a function.
+    """
+    if not isinstance(reward, str):
+        return reward
+    try:
+        function = import_name(reward)
+    except (Exception, SystemExit) as error:  # the module may do anything when it is imported
+        raise ConfigError(
+            f"reward {reward}: cannot be imported as package.module:function"
+            f" ({type(error).__name__}: {error})"
+        ) from error
+    if not callable(function):
+        raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
+    return function  # type: ignore[no-any-return]
+
+
+def _parse(text: str) -> ControllerSpec:
     label, equals, spec = text.partition("=")
-    if not equals or "/" in label or "\\" in label:  # an equals sign further on belongs to the path
-        path = agent_path(text)
-        return Path(text).name if path != text else Path(path).stem if path.endswith(
-            ".zip"
-        ) else path, path
-    if not label or not spec:
-        raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
-    return label, agent_path(spec)
+    # An equals sign after a slash belongs to the path.
+    if equals and "/" not in label and "\\" not in label:
+        if not label or not spec:
+            raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
+        return ControllerSpec(label, agent_path(spec))
+    path = agent_path(text)
+    # A name or a run folder has become a path: its last part is the label.
+    if path != text:
+        return ControllerSpec(Path(text).name, path)
+    if path.endswith(".zip"):
+        return ControllerSpec(Path(path).stem, path)
+    return ControllerSpec(path, path)

@@ -19,10 +19,10 @@ from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
-from sb3_quad.evaluation.controllers import ControllerSpec, describe
+from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
-from sb3_quad.evaluation.flights import Flights, fly_settings
+from sb3_quad.evaluation.flights import Flights, Reward, fly_settings
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
     FLIGHTS,
@@ -41,24 +41,40 @@ from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Su
 from sb3_quad.executors import Executor, start_executor
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
-PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
-RECORDED_FIXED, RECORDED_RANDOM = 24, 8  # flights whose trajectories are kept, at most
-Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
+PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
+# Flights whose trajectories are kept, at most: of a scenario that is the same each time, and of
+# others.
+RECORDED_FIXED = 24
+RECORDED_RANDOM = 8
+Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, the last one done
+Name = tuple[str, str]  # of a job and its entry: scenario and controller
 
 
 @dataclass(frozen=True)
 class Job:
-    """A controller in a scenario, as the suite has it."""
+    """A controller in a scenario, as the suite has it.
+
+    :param reward: your own, as a function or ``package.module:function``; None: none.
+    """
 
     spec: ControllerSpec
     record: ControllerRecord
     scenario: Scenario
     backend: str
+    reward: str | Reward | None
 
     @property
-    def name(self) -> tuple[str, str]:
-        """As of :class:`~sb3_quad.evaluation.results.Entry`."""
+    def name(self) -> Name:
+        """Scenario and controller, as :class:`~sb3_quad.evaluation.results.Entry` has it."""
         return self.scenario.name, self.record.label
+
+    @property
+    def repeats(self) -> bool:
+        """Whether the flights are sure to be the same again.
+
+        Code outside of this package may have changed: a factory's, and that of an own reward.
+        """
+        return self.record.kind != "factory" and self.reward is None
 
 
 def evaluate(
@@ -72,84 +88,127 @@ def evaluate(
     report: Callable[[str], None] = lambda line: None,
     executor: str = "local",
     address: str | None = None,
+    reward: str | Reward | None = None,
 ) -> Results:
     """Fly all scenarios of a suite by all controllers, on the same episodes.
 
     A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the
-    others fly on. An interrupted call goes on when it is repeated, but for factories, whose code
-    may have changed.
+    others still fly. Repeat an interrupted call and it resumes. Only factories, and all controllers
+    where there is an own reward, fly again, since their code may have changed.
 
     :param folder: of the results; where no controller can be loaded, it is not made.
-    :param workers: that fly side by side; with one, and no Ray, this process flies.
-    :param overwrite: remove the results that the folder holds, instead of refusing it; begin anew.
+    :param workers: processes that fly at the same time; with one, and no Ray, this process flies.
+    :param overwrite: remove the results that the folder holds, instead of refusing it, and start
+        from scratch.
     :param report: gets a line for each agent that flies another vehicle than it was trained on, or
         does not say on which.
     :param executor: of the workers, see :func:`~sb3_quad.executors.start_executor`, as is
         ``address``.
-    :raises ConfigError: an unknown backend; a folder that holds results of another call, that
-        cannot be written, or that another process is writing to.
+    :param reward: a reward of your own, see :func:`~sb3_quad.evaluation.flights.fly`, or
+        ``package.module:function``.
+    :raises ConfigError: an unknown backend; a reward that cannot be imported; a folder that holds
+        results of another call, that cannot be written, or that another process is writing to.
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
-    if backend == "pybullet":  # once, rather than for each controller
+    if backend == "pybullet":
+        # A missing PyBullet is one error here, not one for each controller.
         importlib.import_module("sb3_quad.base.bullet")
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
-    place, failures = Path(folder), list[Failure]()
+    # An error in it shows now, rather than as a failure of each controller.
+    load_reward(reward)
+
+    records, failures = _load_controllers(suite, controllers, report)
+    # Scenario by scenario, so that a suite that is interrupted compares all controllers.
+    jobs = []
+    for scenario in suite.scenarios:
+        for spec, record in records.items():
+            jobs.append(Job(spec, record, scenario, backend, reward))
+    results = Results(
+        suite=suite.name,
+        description=suite.description,
+        source=suite.source,
+        reward=getattr(reward, "__name__", reward or ""),
+        package_version=__version__,
+        controllers=[*records.values()],
+        scenarios=[*suite.scenarios],
+        entries=[],
+        failures=failures,
+        digest=_digest(jobs),
+    )
+    place = Path(folder)
+    # Without a controller there is nothing to write, and no folder.
+    if jobs:
+        make_folder(place, "results folder", "-o")
+        with locked(place, "folder"):
+            done = _resume(place, results.digest, jobs, overwrite)
+            return _fly_missing(place, results, jobs, done, workers, progress, executor, address)
+    return results
+
+
+def _load_controllers(
+    suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]
+) -> tuple[dict[ControllerSpec, ControllerRecord], list[Failure]]:
+    """Load the controllers; report those that fly another vehicle than they were trained on."""
     records: dict[ControllerSpec, ControllerRecord] = {}
-    for spec in controllers:
+    failures = []
+    for spec in specs:
         try:
-            vehicles = [_vehicle(spec, each) for each in suite.scenarios]
-            record, notices = describe(spec), dict.fromkeys(map(spec.notice, vehicles))
-            for line in filter(None, notices):
-                report(line)
+            record = controller_record(spec)
+            notices: dict[str, None] = {}
+            for scenario in suite.scenarios:
+                notices[spec.notice(_vehicle(spec, scenario))] = None
+            # Several scenarios give the same notice, or an empty one: report it once.
+            for notice in filter(None, notices):
+                report(notice)
             records[spec] = record
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
-    _report_vehicles(suite, list(records), report)
-    jobs = [
-        Job(spec, record, each, backend)
-        for each in suite.scenarios
-        for spec, record in records.items()
-    ]
-    digest, done = _digest(jobs), dict[tuple[str, str], Entry]()
+    _report_vehicles(suite, records, report)
+    return records, failures
 
-    def results(finished: bool = True) -> Results:
-        return Results(
-            suite=suite.name,
-            description=suite.description,
-            source=suite.source,
-            package_version=__version__,
-            controllers=list(records.values()),
-            scenarios=list(suite.scenarios),
-            entries=[done[job.name] for job in jobs if job.name in done],
-            failures=failures,
-            digest=digest,
-            finished=finished,
-        )
 
-    if not jobs:
-        return results()
-    make_folder(place, "results folder", "-o")
-    with locked(place, "folder"):
-        done |= _begin(place, digest, jobs, overwrite)
-        missing = [job for job in jobs if job.name not in done]
-        progress(len(done), len(jobs), "")
-        alone = executor == "local" and min(workers, len(missing)) <= 1
-        with nullcontext() if alone else start_executor(executor, workers, address) as working:
-            for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
-                if isinstance(outcome, Failure):
-                    failures.append(outcome)
-                else:
-                    done[job.name], arrays = outcome
-                    write_arrays(place / done[job.name].flights, compressed=True, **arrays)
-                    write_text(place / RESULTS, results(finished=False).model_dump_json(indent=2))
-                progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
-        found = results()  # in the order of the suite, whoever was done first
-        if done:
-            write_episodes(place, found.entries)
-            write_text(place / RESULTS, found.model_dump_json(indent=2))
-    return found
+def _fly_missing(
+    place: Path,
+    results: Results,
+    jobs: Sequence[Job],
+    done: dict[Name, Entry],
+    workers: int,
+    progress: Progress,
+    executor: str,
+    address: str | None,
+) -> Results:
+    """Fly the jobs that are not done, and write everything into the folder."""
+    missing = [job for job in jobs if job.name not in done]
+    failures = [*results.failures]
+
+    def write(finished: bool) -> Results:
+        # Workers finish in any order; the entries stand in that of the suite.
+        entries = [done[job.name] for job in jobs if job.name in done]
+        changes = {"entries": entries, "failures": failures, "finished": finished}
+        current = results.model_copy(update=changes)
+        if finished and entries:
+            write_episodes(place, entries)
+        if entries:
+            write_text(place / RESULTS, current.model_dump_json(indent=2))
+        return current
+
+    progress(len(done), len(jobs), "")
+    pool: Any = nullcontext()
+    if executor != "local" or min(workers, len(missing)) > 1:
+        pool = start_executor(executor, workers, address)
+    with pool as working:
+        for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
+            if isinstance(outcome, Failure):
+                failures.append(outcome)
+            else:
+                done[job.name], arrays = outcome
+                write_arrays(place / done[job.name].flights, compressed=True, **arrays)
+            # After each job, so that an interrupted evaluation can resume.
+            write(finished=False)
+            progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+    return write(finished=True)
 
 
 def fly_scenario(
@@ -158,48 +217,62 @@ def fly_scenario(
     backend: str = "batch",
     recorded: int | None = 0,
     own: Mapping[str, Any] | None = None,
+    reward: Reward | None = None,
 ) -> tuple[Flights, Arrays]:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
 
-    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`.
+    :param controller: as :func:`~sb3_quad.evaluation.flights.fly` takes it, as is ``reward``.
     :param recorded: flights to sample; None: all of a scenario that is the same each time, the
         first few of others.
-    :param own: changes to how it is flown that go with the controller: its
-        ``FlightSettings.observed``.
+    :param own: settings that go with the controller: its ``FlightSettings.observed``.
     :return: the metrics, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
-    :raises ConfigError: an unknown backend, or a controller that cannot be asked.
-    :raises ControllerError: a controller that fails in flight.
+    :raises ConfigError: an unknown backend, or a controller of an unknown kind.
+    :raises ControllerError: a controller or reward that fails in flight.
     """
     seeds = scenario.episode_seeds()
+    settings = scenario.flown_as.with_changes(**(own or {}))
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
-    size, settings = PART_SIZES.get(backend, 1), scenario.flown_as.with_changes(**(own or {}))
-    parts, recorder = [], Recorder(recorded)
+    recorder = Recorder(recorded)
+    hooks = [recorder] if recorded else []
+    parts = []
+    size = PART_SIZES.get(backend, 1)
     for first in range(0, len(seeds), size):
-        part = slice(first, first + size)
-        plan = sample_plan(scenario, seeds[part])
-        hooks = [recorder] if recorded and first == 0 else []
-        parts.append(
-            fly_settings(
-                controller, settings, seeds[part], backend, scenario.tolerances, hooks, plan
-            )
+        part = seeds[first : first + size]
+        flights = fly_settings(
+            controller,
+            settings,
+            part,
+            backend,
+            scenario.tolerances,
+            hooks,
+            plan=sample_plan(scenario, part),
+            reward=reward,
         )
-    return Flights.concatenate(parts), recorder.arrays() if recorded else {}
+        parts.append(flights)
+        # Only flights of the first part are recorded.
+        hooks = []
+    return Flights.concatenate(parts), recorder.arrays()
 
 
 def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
-    """Fly and sum up; the arrays are those of the flights (``flightlog.py``). Of a controller that
-    fails, its Failure.
+    """Fly a job and sum it up.
+
+    :return: the entry, and the arrays of its flights (``flightlog.py``); or the failure of a
+        controller that fails.
     """
     start = time.perf_counter()
+    own = job.spec.own
     try:
-        scenario, seen = (
-            job.scenario.flown_by(job.spec.own and job.spec.own.vehicle),
-            job.spec.observed,
-        )
+        scenario = job.scenario.flown_by(own and own.vehicle)
         controller = resolve_expert(job.spec.spec, scenario.nominal_vehicle(), "controller")
         flights, trajectories = fly_scenario(
-            controller, scenario, job.backend, recorded=None, own=seen
+            controller,
+            scenario,
+            job.backend,
+            recorded=None,
+            own=job.spec.observed,
+            reward=load_reward(job.reward),
         )
     except SB3QuadError as error:
         return _failure(job.record.label, job.scenario.name, error)
@@ -218,73 +291,72 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
 
 
 def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tuple[Job, Any]]:
-    """Fly jobs, and hand out each as it is done: one after another here, or side by side in an
-    executor's workers.
+    """Fly jobs and yield each when it is done: in this process, or in an executor's workers.
 
-    A job whose worker process ends, as a crash or too little memory makes it, becomes a
-    :class:`Failure`.
+    A job whose worker process ends, by a crash or too little memory, becomes a :class:`Failure`.
     """
     if executor is None:
-        yield from ((job, fly_job(job)) for job in jobs)
+        for job in jobs:
+            yield job, fly_job(job)
         return
     submitted = {executor.submit(fly_job, job): job for job in jobs}
     for future in as_completed(submitted):
         job = submitted[future]
         try:
             yield job, future.result()
-        except WorkerDied as ended:
-            yield job, _failure(job.record.label, job.scenario.name, ended)
+        except WorkerDied as error:
+            yield job, _failure(job.record.label, job.scenario.name, error)
 
 
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
-    """What a controller flies in a scenario: the scenario's vehicle, else its own."""
-    own = spec.own.vehicle if spec.own else DEFAULT_VEHICLE
-    return first_vehicle(own) if scenario.vehicle is None else scenario.nominal_vehicle()
+    """The vehicle that a controller flies in a scenario: the scenario's, else its own."""
+    if scenario.vehicle is not None or spec.own is None:
+        return scenario.nominal_vehicle()
+    return first_vehicle(spec.own.vehicle)
 
 
 def _report_vehicles(
-    suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]
+    suite: Suite, specs: Mapping[ControllerSpec, Any], report: Callable[[str], None]
 ) -> None:
-    """Say so if the controllers, or the reference beside them, fly different vehicles where a
-    scenario names none.
-    """
-    unfixed = [each for each in suite.scenarios if each.vehicle is None]
-    vehicles = {spec.label: _vehicle(spec, unfixed[0]).name for spec in specs} if unfixed else {}
-    if any(each.reference for each in unfixed):
-        vehicles["the reference"] = DEFAULT_VEHICLE
-    if len(set(vehicles.values())) > 1:
-        each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
-        report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
+    """Report controllers, or a reference, that fly different vehicles in the same scenario."""
+    vehicles: dict[str, str] = {}
+    for scenario in suite.scenarios:
+        # All fly the vehicle that a scenario names.
+        if scenario.vehicle is not None:
+            continue
+        for spec in specs:
+            vehicles[spec.label] = _vehicle(spec, scenario).name
+        if scenario.reference:
+            vehicles["the reference"] = DEFAULT_VEHICLE
+    if len({*vehicles.values()}) > 1:
+        flown = ", ".join(map(" flies ".join, vehicles.items()))
+        report(f"not all fly the same vehicle: {flown}; --vehicle gives all of them one")
 
 
-def _begin(
-    folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool
-) -> dict[tuple[str, str], Entry]:
-    """What the same evaluation has flown before it was interrupted, but for factories, whose code
-    may have changed.
+def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> dict[Name, Entry]:
+    """Return the entries that an interrupted call of the same evaluation has left.
 
-    One that was finished has flown all, so that its table can be shown again; with factories it is
-    other results.
+    A finished one has flown all, so that its table can be shown again. Jobs that may not repeat
+    are not among them, and a finished evaluation with such jobs is other results.
 
-    :raises ConfigError: the folder holds other results, and they are not to be overwritten; or
-        damaged ones.
+    :raises ConfigError: the folder holds other results that are not to be overwritten, or damaged
+        ones.
     """
     if not (folder / RESULTS).is_file():
         for name in WRITTEN:
             refuse_existing(folder / name, overwrite)
         return {}
     before = load_results(folder)
-    certain = {job.name for job in jobs if job.record.kind != "factory"}
-    if (
-        before.digest == digest
-        and not overwrite
-        and (len(certain) == len(jobs) or not before.finished)
-    ):
-        return {entry.name: entry for entry in before.entries if entry.name in certain}
     if not overwrite:
-        raise ConfigError(
-            f"{folder}: holds results already; give another folder with -o, or remove them with --overwrite"
-        )
+        kept = {job.name for job in jobs if job.repeats}
+        can_resume = len(kept) == len(jobs) or not before.finished
+        if before.digest != digest or not can_resume:
+            raise ConfigError(
+                f"{folder}: holds results already; give another folder with -o,"
+                " or remove them with --overwrite"
+            )
+        return {entry.name: entry for entry in before.entries if entry.name in kept}
+    # Start from scratch: all numbers in a folder are those of one command.
     for name in WRITTEN:
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
@@ -292,16 +364,18 @@ def _begin(
 
 
 def _digest(jobs: Sequence[Job]) -> str:
-    """SHA-256 of all that the flights of some jobs depend on, the sources of this package included."""
+    """Hash all inputs of the flights, the sources of this package included (SHA-256)."""
     digest = hashlib.sha256()
+    # The environments lie next to the package in a checkout, inside it when installed.
     for folder in (Path(__file__).parents[1], Path(registration.__file__).parent):
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
             digest.update(path.read_bytes())
     for job in jobs:
-        digest.update(repr((job, job.spec.own, _vehicle(job.spec, job.scenario))).encode())
+        inputs = job, job.spec.own, _vehicle(job.spec, job.scenario)
+        digest.update(repr(inputs).encode())
     return digest.hexdigest()
 
 
 def _failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:
-    """The record of an error, in one line; without a scenario, the controller could not be loaded."""
+    """Return the record of an error, in one line; scenario None: the controller did not load."""
     return Failure(controller=controller, scenario=scenario, message=" ".join(str(error).split()))

@@ -1,9 +1,9 @@
-"""The same n episodes in either environment, side by side in one process, for
+"""n episodes flown at the same time, in either environment, for
 :mod:`sb3_quad.evaluation.flights`.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -12,10 +12,16 @@ from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
 
-# What a control step gives: observations, (n, 18) or what else the agent is to see; rewards, (n,);
-# which rows are lost, on the ground or out of range, and which on the ground; |r - r_T|, m; which
-# would be a success if they ended now.
-FleetStep: TypeAlias = tuple[Float32Array, FloatArray, BoolArray, BoolArray, FloatArray, BoolArray]
+
+class FleetStep(NamedTuple):
+    """The outcome of a control step, by row."""
+
+    observation: Float32Array  # (n, 18), or the size that the agent observes
+    reward: FloatArray  # (n,)
+    lost: BoolArray  # (n,), crashed or out of range
+    collided: BoolArray  # (n,), touches the ground
+    distance: FloatArray  # (n,), |r - r_T|, m
+    success: BoolArray  # (n,), would be a success if it ended now
 
 
 class BatchFleet:
@@ -26,19 +32,16 @@ class BatchFleet:
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        self._batch = QuadcopterBatch(
-            len(seeds), settings.with_changes(max_episode_steps=ENDLESS), autoreset=False
-        )
+        endless = settings.with_changes(max_episode_steps=ENDLESS)
+        self._batch = QuadcopterBatch(len(seeds), endless, autoreset=False)
         self._batch.seed(seeds)
-        self.vehicle, self.observation_size = (
-            self._batch.vehicle_list[0],
-            self._batch.observation.size,
-        )
+        self.vehicle = self._batch.vehicle_list[0]
+        self.observation_size = self._batch.observation.size
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
-        """Begin; observations (n, observation_size).
+        """Begin the episodes; return the observations, (n, observation_size).
 
-        :param start: what replaces the episodes' own sample: any of position, velocity, body_rates,
+        :param start: replaces the episodes' own sample: any of position, velocity, body_rates,
             target (n, 3) and quaternion (n, 4).
         """
         self._batch.reset()
@@ -47,26 +50,30 @@ class BatchFleet:
         return self._batch.observe()
 
     def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
-        """One control step of the rows that are ``flying``; what comes back of the others has no
-        meaning.
-        """
+        """Fly one control step; only the rows that are ``flying`` have meaning in the result."""
         observation, reward, _ = self._batch.step(actions)
         end = self._batch.outcome
-        ends = ~end["truncated"], end["collision"], end["distance"], end["success"]
-        return observation, reward.astype(np.float64), *ends
+        return FleetStep(
+            observation,
+            reward.astype(np.float64),
+            ~end["truncated"],
+            end["collision"],
+            end["distance"],
+            end["success"],
+        )
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
-        """Move the targets of some rows, (len(rows), 3); all observations with the new targets."""
+        """Move the targets of some rows, (len(rows), 3); return all observations."""
         self._batch.set_target(targets, rows)
         return self._batch.observe()
 
     def set_wrench(self, wrench: FloatArray) -> None:
-        """The wrench from now on, (n, WRENCH_SIZE), see :mod:`sb3_quad.simulation.state`."""
+        """Set the wrench from now on, (n, WRENCH_SIZE), see :mod:`sb3_quad.simulation.state`."""
         self._batch.wrench[:] = wrench.T
 
     @property
     def wrench(self) -> FloatArray:
-        """What pushes all rows in this control step, drag excepted, (n, WRENCH_SIZE)."""
+        """The external wrench on all rows in this control step, without drag, (n, WRENCH_SIZE)."""
         return self._batch.total_wrench().T
 
     def true_state(self) -> QuadcopterState:
@@ -78,44 +85,44 @@ class BatchFleet:
 
 
 class PyBulletFleet:
-    """As :class:`BatchFleet`, with a PyBullet environment per row, in turn; the controller still
-    sees them as one batch.
+    """Flies as :class:`BatchFleet`, with a PyBullet environment per row, one after the other.
+
+    The controller still sees them as one batch.
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        from sb3_quad.envs.quadcopter_env import QuadcopterEnv  # PyBullet may be missing
+        # PyBullet may be missing, which matters here only.
+        from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 
+        # Flights end by their plan; none is truncated by its environment.
+        keywords = dict(settings.with_changes(max_episode_steps=ENDLESS))
         self._seeds = seeds
-        self._envs = [
-            QuadcopterEnv(**dict(settings.with_changes(max_episode_steps=ENDLESS))) for _ in seeds
-        ]
-        self.vehicle, self.observation_size = (
-            self._envs[0].vehicle,
-            self._envs[0].batch.observation.size,
-        )
+        self._envs = [QuadcopterEnv(**keywords) for _ in seeds]
+        self.vehicle = self._envs[0].vehicle
+        self.observation_size = self._envs[0].batch.observation.size
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
-        for row, (env, seed) in enumerate(zip(self._envs, self._seeds, strict=True)):
+        for row, env in enumerate(self._envs):
             state = {name: values[row] for name, values in start.items()}
+            # A target is no part of an environment's state.
             options: dict[str, Any] = {"target": state.pop("target", None), "state": state}
-            env.reset(seed=seed, options=options)
+            env.reset(seed=self._seeds[row], options=options)
         self._observation = np.stack([env.observe() for env in self._envs])
         return self._observation.copy()
 
     def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
         n = len(actions)
-        reward, distance = np.zeros(n), np.zeros(n)
-        lost, collided, arrived = np.zeros((3, n), np.bool_)
+        reward, distance = np.zeros((2, n))
+        lost, collided, success = np.zeros((3, n), np.bool_)
+        # The others have ended; their environments may not be stepped.
         for row in np.flatnonzero(flying):
             self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(
                 actions[row]
             )
-            collided[row], distance[row], arrived[row] = (
-                info["collision"],
-                info["distance"],
-                info["is_success"],
-            )
-        return self._observation.copy(), reward, lost, collided, distance, arrived
+            collided[row] = info["collision"]
+            distance[row] = info["distance"]
+            success[row] = info["is_success"]
+        return FleetStep(self._observation.copy(), reward, lost, collided, distance, success)
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         for row, target in zip(rows, targets, strict=True):

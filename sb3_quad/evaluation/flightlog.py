@@ -1,5 +1,5 @@
-"""Sampled trajectories of flights, and the ``.npz`` file that holds them beside the metrics of
-every flight.
+"""Sampled trajectories of flights, and the ``.npz`` file that holds them and the metrics of every
+flight.
 
 docs/reference/evaluation.md lists the arrays.
 """
@@ -23,17 +23,27 @@ from sb3_quad.simulation.state import (
 from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
-OUTCOMES = {
-    "success": "",
-    "missed": "",
-    "collision": "touches the ground",
-    "out_of_range": "leaves the range",
-}  # in words
+OUTCOMES = ("success", "missed", "collision", "out_of_range")
+# How a flight ended that was lost, in words.
+LOST = {"collision": "touches the ground", "out_of_range": "leaves the range"}
 STATES = ("position", "quaternion", "velocity", "body_rates", "target")
+# Fields of Flights that become arrays of the same name.
+EPISODES = (
+    "start",
+    "target",
+    "flown",
+    "reward",
+    "own_reward",
+    "final_error",
+    "final_offset",
+    "recovery_time",
+    "cross_track_error",
+    "overshoot",
+)
 
 
 class Recorder(Hook):
-    """Samples the first ``m`` flights at 50 Hz, or nearly so; float32, since it is for looking at."""
+    """Samples the first ``m`` flights at about 50 Hz, as float32: they are for looking at."""
 
     def __init__(self, m: int) -> None:
         self._m = m
@@ -41,13 +51,13 @@ class Recorder(Hook):
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         self._control_step = vehicle.control_step
         self._stride = max(1, round(1.0 / (SAMPLE_RATE * vehicle.control_step)))
-        m = min(self._m, state.n)
         self._log: list[Arrays] = []
+        m = min(self._m, state.n)
         self._samples = np.zeros(m, dtype=np.int64)
         self._wrench = np.zeros((m, 6))
-        self._sample(
-            state, np.full((state.n, 4), np.nan, np.float32), np.ones(state.n, dtype=np.bool_)
-        )
+        # No action has been given at the start.
+        no_actions = np.full((state.n, 4), np.nan, np.float32)
+        self._sample(state, no_actions, np.ones(state.n, dtype=np.bool_))
 
     def before_step(
         self,
@@ -56,15 +66,16 @@ class Recorder(Hook):
         wrench: FloatArray,
         flying: BoolArray,
     ) -> None:
-        if wrench.any():
-            rows = wrench[: self._m]
-            rotation = QuadcopterState(state.array[:, : self._m]).rotation
-            self._wrench[:, :3] += rows[:, FORCE_WORLD] + np.einsum(
-                "nij,nj->ni", rotation, rows[:, FORCE_BODY]
-            )
-            self._wrench[:, 3:] += rows[:, TORQUE_BODY] + np.einsum(
-                "nji,nj->ni", rotation, rows[:, TORQUE_WORLD]
-            )
+        if not wrench.any():
+            return
+        # Sum forces in the world frame and torques in the body frame until the next sample.
+        rows = wrench[: self._m]
+        rotation = QuadcopterState(state.array[:, : self._m]).rotation
+        self._wrench[:, :3] += rows[:, FORCE_WORLD]
+        self._wrench[:, :3] += np.einsum("nij,nj->ni", rotation, rows[:, FORCE_BODY])
+        self._wrench[:, 3:] += rows[:, TORQUE_BODY]
+        # World to body: the transposed rotation.
+        self._wrench[:, 3:] += np.einsum("nji,nj->ni", rotation, rows[:, TORQUE_WORLD])
 
     def after_step(
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
@@ -75,52 +86,44 @@ class Recorder(Hook):
     def _sample(self, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
         rows = flying[: self._m]
         values = {name: getattr(state, name)[: self._m] for name in STATES}
-        values |= {"action": actions[: self._m], "wrench": self._wrench / self._stride}
-        self._log.append(
-            {
-                name: np.where(rows[:, None], each, np.nan).astype(np.float32)
-                for name, each in values.items()
-            }
-        )
+        values["action"] = actions[: self._m]
+        values["wrench"] = self._wrench / self._stride
+        for name, array in values.items():
+            values[name] = np.where(rows[:, None], array, np.nan).astype(np.float32)
+        self._log.append(values)
         self._samples[rows] = len(self._log)
         self._wrench[:] = 0.0
 
     def arrays(self) -> Arrays:
-        """The arrays of trajectories, as long as the longest flight."""
+        """Return the arrays of trajectories, as long as the longest flight; none if ``m`` is 0."""
+        if self._m == 0:
+            return {}
         log = self._log[: self._samples.max(initial=1)]
-        time = np.arange(len(log)) * (self._stride * self._control_step)
-        trajectories = {name: np.stack([sample[name] for sample in log], axis=1) for name in log[0]}
-        return {"time": time, "samples": self._samples, **trajectories}
+        arrays: Arrays = {
+            "time": np.arange(len(log)) * (self._stride * self._control_step),
+            "samples": self._samples,
+        }
+        for name in log[0]:
+            arrays[name] = np.stack([sample[name] for sample in log], axis=1)
+        return arrays
 
 
 def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
-    """The ``episode_`` arrays, of all flights."""
-    as_they_are = (
-        "start",
-        "target",
-        "flown",
-        "reward",
-        "final_error",
-        "final_offset",
-        "recovery_time",
-        "cross_track_error",
-        "overshoot",
-    )
-    return {
-        "episode_seed": np.asarray(seeds, dtype=np.int64),
-        "episode_outcome": np.select(
-            [flights.success, flights.survival, flights.collision], [*OUTCOMES][:3], [*OUTCOMES][3]
-        ),
-        **{f"episode_{name}": getattr(flights, name) for name in as_they_are},
-        "episode_path": flights.path_length,
-        "episode_time_to": np.stack(list(flights.time_to.values()), axis=1),
-        "episode_settling_time": np.stack(list(flights.settling_time.values()), axis=1),
-        "episode_tolerances": np.array(list(flights.time_to)),
-        "episode_waypoints": flights.waypoint_times,
-    }
+    """Return the ``episode_`` arrays, of all flights."""
+    arrays: Arrays = {f"episode_{name}": getattr(flights, name) for name in EPISODES}
+    # The first condition that holds decides.
+    conditions = [flights.success, flights.survival, flights.collision]
+    arrays["episode_seed"] = np.asarray(seeds, dtype=np.int64)
+    arrays["episode_outcome"] = np.select(conditions, OUTCOMES[:3], OUTCOMES[3])
+    arrays["episode_path"] = flights.path_length
+    arrays["episode_tolerances"] = np.array([*flights.time_to])
+    arrays["episode_time_to"] = np.stack([*flights.time_to.values()], axis=1)
+    arrays["episode_settling_time"] = np.stack([*flights.settling_time.values()], axis=1)
+    arrays["episode_waypoints"] = flights.waypoint_times
+    return arrays
 
 
-read_flights = read_arrays  # by name; of episodes alone with the prefix ``episode_``
+read_flights = read_arrays  # by name; with the prefix ``episode_`` only the metrics
 
 
 class Track(NamedTuple):
@@ -141,22 +144,25 @@ class Track(NamedTuple):
     @property
     def targets(self) -> FloatArray:
         """The targets, one after the other, (n, 3), m."""
+        # The first sample of each target.
         changed = np.flatnonzero((np.diff(self.target, axis=0) != 0).any(axis=1)) + 1
         return np.asarray(self.target[[0, *changed]])
 
 
 def read_tracks(path: str | Path) -> list[Track]:
-    """The flights of a file whose trajectories were kept.
+    """Read the flights of a file whose trajectories were kept.
 
     :raises ConfigError: a missing or damaged file.
     """
     arrays = read_arrays(path)
     tracks = []
     for number, samples in enumerate(arrays.get("samples", ())):
-        rows = {
-            name: arrays[name][number, :samples].astype(np.float64)
-            for name in ("position", "target", "wrench")
-        }
-        lost = OUTCOMES.get(str(arrays["episode_outcome"][number]), "lost")
-        tracks.append(Track(times=arrays["time"][:samples], lost=lost, **rows))
+        track = Track(
+            times=arrays["time"][:samples],
+            position=arrays["position"][number, :samples].astype(np.float64),
+            target=arrays["target"][number, :samples].astype(np.float64),
+            wrench=arrays["wrench"][number, :samples].astype(np.float64),
+            lost=LOST.get(str(arrays["episode_outcome"][number]), ""),
+        )
+        tracks.append(track)
     return tracks

@@ -1,17 +1,18 @@
-"""Flying a controller over fresh episodes, and what is measured on the true state along the way.
+"""Fly a controller over fresh episodes, and measure the true state along the way.
 
-Conventions, found by the expert's numbers in the thesis (4.3.1): the time to a tolerance is the end
-of the first control step after which |r - r_T| is within it; the path is that of the whole episode,
-15 s, not of the way until arrival.
+Two conventions follow from the expert's numbers in the thesis (4.3.1). The time to a tolerance is
+the end of the first control step after which |r - r_T| is within it. The path is that of the whole
+episode, 15 s, not only of the way until arrival.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, unknown
@@ -26,47 +27,51 @@ from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
-NEAR = 0.1  # m, of arrival, where it is among the tolerances; else the tightest is
+NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance where it is not one
 ACTIONS = quadcopter_spaces()[1]
-TILT, RATE, HOLD = (
-    np.radians(45.0),
-    2.0,
-    0.2,
-)  # stable: tilt (rad), roll and pitch rate (rad/s) below these, for so long (s)
+# A vehicle is stable while its tilt (rad) and its roll and pitch rate (rad/s) are below these for
+# at least HOLD (s).
+TILT = np.radians(45.0)
+RATE = 2.0
+HOLD = 0.2
+
+Reward: TypeAlias = Callable[[QuadcopterState, Float32Array], npt.ArrayLike]
+"""A reward of your own: the state after a control step and the actions (n, 4) that led to it, to
+rewards (n,).
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Flights:
     """The metrics of n episodes, one per row."""
 
-    # : (n,), survived, and ended at the (last) target: success_distance and success_tilt of the
-    # task
+    #: (n,), survived and ended at the (last) target: the task's success_distance and success_tilt
     success: BoolArray
     survival: BoolArray  #: (n,), neither collision nor out of range: the thesis's success
-    collision: BoolArray  #: (n,), the ground was touched
+    collision: BoolArray  #: (n,), touched the ground
     reward: FloatArray  #: (n,), sum of the rewards
+    own_reward: FloatArray  #: (n,), sum of your own reward; NaN if you gave none
     length: IntArray  #: (n,), control steps
     flown: FloatArray  #: (n,), s until lost or the end
-    # : By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a
-    # course, to the last waypoint.
+    #: By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was. On a
+    #: course it counts from the last waypoint on.
     time_to: Mapping[float, FloatArray]
-    # : By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or
-    # was lost.
+    #: By tolerance (m): s after which |r - r_T| stays within it to the end, (n,), NaN if the flight
+    #: ended outside or was lost.
     settling_time: Mapping[float, FloatArray]
-    # : (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
+    #: (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
     overshoot: FloatArray
     path_length: FloatArray  #: (n,), m, over the whole episode
     final_error: FloatArray  #: (n,), |r - r_T| at the end, m
-    final_offset: (
-        FloatArray  #: (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
-    )
+    #: (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    final_offset: FloatArray
     recovery_time: FloatArray  #: (n,), s until it was stable again, NaN if it never was, see Motion
-    # : (n,), largest distance from the straight way to the target, m; NaN where there is none
+    #: (n,), largest distance from the straight line to the target, m; NaN where there is no line
     cross_track_error: FloatArray
-    # : (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
+    #: (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
     waypoint_times: FloatArray
-    # : (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
-    # (body); SI
+    #: (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
+    #: (body); SI
     start: FloatArray
     target: FloatArray  #: (n, 3), the first target, m
 
@@ -77,30 +82,31 @@ class Flights:
 
     @staticmethod
     def concatenate(parts: Sequence["Flights"]) -> "Flights":
-        """Several parts as one, in order."""
+        """Join several parts in their order."""
         columns: dict[str, Any] = {}
-        for name in (entry.name for entry in dataclasses.fields(Flights)):
-            values: list[Any] = [getattr(part, name) for part in parts]
+        for field in dataclasses.fields(Flights):
+            values: list[Any] = [getattr(part, field.name) for part in parts]
             if isinstance(values[0], Mapping):
-                columns[name] = {
-                    key: np.concatenate([value[key] for value in values]) for key in values[0]
+                columns[field.name] = {
+                    tolerance: np.concatenate([value[tolerance] for value in values])
+                    for tolerance in values[0]
                 }
             else:
-                columns[name] = np.concatenate(values)
+                columns[field.name] = np.concatenate(values)
         return Flights(**columns)
 
 
 def arrival_tolerance(tolerances: Iterable[float]) -> float:
-    """The tolerance, m, by which overshoot and the time to stay are judged."""
-    known = [*tolerances]
+    """Return the tolerance, m, by which overshoot and the settling time are judged."""
+    known = {*tolerances}
     return NEAR if NEAR in known else min(known)
 
 
 class Hook:
-    """What is done along a flight; a subclass writes what it needs."""
+    """Called along a flight; a subclass overrides the methods that it needs."""
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        """The state that the flights start in."""
+        """See the state that the flights start in."""
 
     def before_step(
         self,
@@ -109,22 +115,27 @@ class Hook:
         wrench: FloatArray,
         flying: BoolArray,
     ) -> None:
-        """The state before a control step, its observations (n, 18), the wrench (n, WRENCH_SIZE)
-        during it, who flies (n,).
+        """See the state before a control step.
+
+        :param observation: (n, 18).
+        :param wrench: (n, WRENCH_SIZE), acts during the step.
+        :param flying: (n,), the flights that are still in the air.
         """
 
     def after_step(
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
     ) -> None:
-        """The state after control step ``step``, the actions (n, 4) that led to it, and the flights
-        (n,) that go on.
+        """See the state after control step ``step``.
+
+        :param actions: (n, 4), led to this state.
+        :param flying: (n,), the flights that continue.
         """
 
 
 def fly(
     controller: Any,
     task: Any = "target_tracking",
-    n_episodes: int = 240,
+    n_flights: int = 240,
     seed: int = 0,
     vehicle: str | Vehicle = "itm",
     noise: float = 0.05,
@@ -132,10 +143,13 @@ def fly(
     max_steps: int = MAX_EPISODE_STEPS,
     tolerances: Sequence[float] = TOLERANCES,
     hooks: Sequence[Hook] = (),
+    reward: Reward | None = None,
     **environment: Any,
 ) -> Flights:
-    """Fly ``n_episodes`` episodes; number k is the first one of the environment reset with
-    ``row_seeds(seed, n_episodes)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
+    """Fly ``n_flights`` episodes.
+
+    Number k is the first episode of an environment that is reset with
+    ``row_seeds(seed, n_flights)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
 
     :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model,
         asked by ``predict(observation, deterministic=True)``; or a function from observations (n,
@@ -143,29 +157,28 @@ def fly(
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``observation_std`` and
         ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
-        ``rotor_layout``, unless another is given here.
+        ``rotor_layout``, unless you give another.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
     :param tolerances: of arrival, |r - r_T|, m.
     :param hooks: are called along the way.
-    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller that
-        is none of the three.
-    :raises ControllerError: a controller that fails in flight.
+    :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
+        control step and the actions (n, 4); its sums are ``Flights.own_reward``. A class is
+        instantiated for these episodes and may remember.
+    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller of
+        another kind.
+    :raises ControllerError: a controller or reward that fails in flight.
     """
-    if n_episodes < 1:
-        raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
-    environment |= {
-        "task": task,
-        "vehicle": vehicle,
-        "noise": noise,
-        "max_episode_steps": max_steps,
-    }
+    if n_flights < 1:
+        raise ConfigError(f"n_flights {n_flights}: must be at least 1")
+    # A model flies with its rotors where it knows them.
     if environment.get("rotor_layout") is None:
         environment["rotor_layout"] = known_layout(controller)
-    settings = FlightSettings().with_changes(**environment)
-    return fly_settings(
-        controller, settings, row_seeds(seed, n_episodes), backend, tolerances, hooks
+    settings = FlightSettings().with_changes(
+        task=task, vehicle=vehicle, noise=noise, max_episode_steps=max_steps, **environment
     )
+    seeds = row_seeds(seed, n_flights)
+    return fly_settings(controller, settings, seeds, backend, tolerances, hooks, reward=reward)
 
 
 def fly_settings(
@@ -177,8 +190,9 @@ def fly_settings(
     hooks: Sequence[Hook] = (),
     plan: Plan | None = None,
     deterministic: bool = True,
+    reward: Reward | None = None,
 ) -> Flights:
-    """As :func:`fly`, by one record of how the episodes are flown: the first episode of each seed.
+    """Fly the first episode of each seed, as :func:`fly` does, by one record of settings.
 
     :param plan: what happens to the episodes along the way.
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
@@ -186,9 +200,20 @@ def fly_settings(
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     with closing(FLEETS[backend](seeds, settings)) as fleet:
-        spaces = ACTIONS, quadcopter_spaces(fleet.observation_size)[0]
-        asked = Controller(controller, *spaces, fleet.true_state, deterministic=deterministic)
-        return _fly_fleet(fleet, asked, plan or Plan(), settings.longest_episode, tolerances, hooks)
+        pilot = Controller(
+            controller,
+            ACTIONS,
+            quadcopter_spaces(fleet.observation_size)[0],
+            fleet.true_state,
+            deterministic=deterministic,
+        )
+        if isinstance(reward, type):
+            # A reward that remembers, such as the last actions, begins afresh with these episodes.
+            reward = reward()
+        plan = plan or Plan()
+        return _fly_fleet(
+            fleet, pilot, plan, settings.longest_episode, tolerances, [*hooks], reward
+        )
 
 
 def _fly_fleet(
@@ -198,95 +223,195 @@ def _fly_fleet(
     max_steps: int,
     tolerances: Sequence[float],
     hooks: Sequence[Hook],
+    reward: Reward | None,
 ) -> Flights:
     observation = fleet.reset(plan.start)
-    n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
+    control_step = fleet.vehicle.control_step
     state = fleet.true_state()
-    position, error = state.position.copy(), state.distance
+    position = state.position.copy()
+    course = Waypoints(plan, state.n)
+    arrivals = Arrivals(tolerances, course.to_last(state.distance))
     motion = Motion(state, control_step)
-    limits = np.array(tolerances)[:, None]
-    waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
-    times = np.where((error <= limits) & on_last, 0.0, np.nan)
-    stays = times.copy()
-    first = (
-        times[[*tolerances].index(arrival_tolerance(tolerances))]
-        if len(limits)
-        else np.full(n, np.nan)
-    )  # a view
-    flights = Flights(
-        success=np.zeros(n, dtype=np.bool_),
-        survival=np.ones(n, dtype=np.bool_),
-        collision=np.zeros(n, dtype=np.bool_),
-        reward=np.zeros(n),
-        length=np.zeros(n, dtype=np.int64),
-        flown=np.zeros(n),
-        time_to=dict(zip(tolerances, times, strict=True)),
-        settling_time=dict(zip(tolerances, stays, strict=True)),
-        overshoot=np.where(np.isnan(first), np.nan, error),
-        path_length=np.zeros(n),
-        final_error=error.copy(),
-        final_offset=np.full((n, 3), np.nan),
-        recovery_time=motion.recovery_time,
-        cross_track_error=motion.cross_track_error if count == 0 else np.full(n, np.nan),
-        waypoint_times=np.full((n, count), np.nan),
-        start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
-        target=state.target.copy(),
-    )
-    flying = flights.survival  # until it is lost
+    flights = _at_start(state, plan, arrivals, motion, course)
+    if reward is not None:
+        flights.own_reward[:] = 0.0
+    flying = flights.survival  # the same array: a flight survives until it is lost
     for hook in hooks:
         hook.on_start(state, fleet.vehicle)
 
     for step in range(1, max_steps + 1):
+        time = step * control_step
+        # Disturbances of the plan begin and end between two control steps.
         if step - 1 in plan.wrenches:
             fleet.set_wrench(plan.wrenches[step - 1])
         try:
             actions = controller.actions(observation, flying)
-        except ControllerError as failed:
-            raise ControllerError(f"{failed}, after {(step - 1) * control_step:.2f} s") from failed
+        except ControllerError as error:
+            raise ControllerError(f"{error}, after {(step - 1) * control_step:.2f} s") from error
         for hook in hooks:
             hook.before_step(state, observation, fleet.wrench, flying)
-        observation, step_reward, lost, collided, error, arrived = fleet.step(actions, flying)
+        result = fleet.step(actions, flying)
+        observation = result.observation
         state = fleet.true_state()
-        flights.reward[flying] += step_reward[flying]
-        flights.path_length[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
+
+        # Sums and last values count also for the flights that this step has ended.
+        flights.reward[flying] += result.reward[flying]
+        if reward is not None:
+            flights.own_reward[flying] += _ask_reward(reward, state, actions)[flying]
+        way = np.linalg.norm(state.position - position, axis=1)
+        flights.path_length[flying] += way[flying]
         position = state.position.copy()
-        flights.final_error[flying], flights.success[flying] = error[flying], arrived[flying]
-        flights.length[flying], flights.flown[flying] = step, step * control_step
-        within = (error <= limits) & on_last
-        times[np.isnan(times) & within & flying] = step * control_step
-        stays[~within & flying] = np.nan
-        stays[np.isnan(stays) & within & flying] = step * control_step
-        after = flying & ~np.isnan(first)
-        flights.overshoot[after] = np.fmax(flights.overshoot, error)[after]
-        flights.collision[flying & lost & collided] = True
-        flying &= ~lost
+        flights.final_error[flying] = result.distance[flying]
+        flights.success[flying] = result.success[flying]
+        flights.length[flying] = step
+        flights.flown[flying] = time
+        arrivals.see(time, course.to_last(result.distance), flying)
+        flights.collision[flying & result.lost & result.collided] = True
+
+        # From here on, only the flights that continue count.
+        flying &= ~result.lost
         motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
-        if count:
-            reached = np.flatnonzero(flying & (waypoint < count) & (error <= plan.radius))
-            flights.waypoint_times[reached, waypoint[reached]] = step * control_step
-            waypoint[reached] += 1
-            on_last |= waypoint >= count - 1
-            onward = reached[waypoint[reached] < count]
-            if onward.size:
-                observation = fleet.set_targets(onward, plan.waypoints[waypoint[onward]])
-    flights.success[~(flying & on_last)] = False
-    stays[:, ~flying] = np.nan
+        # Whoever has reached a waypoint sees the next one from the next step on.
+        onward = course.see(time, result.distance, flying)
+        if onward.size:
+            observation = fleet.set_targets(onward, course.targets(onward))
+
+    # A flight that was lost, or that did not get to its last target, has no success and no time
+    # after which it stays there.
+    flights.success[~(flying & course.on_last)] = False
+    arrivals.settling_time[:, ~flying] = np.nan
     flights.final_offset[flying] = (state.position - state.target)[flying]
     return flights
 
 
-class Motion:
-    """Watches n flights, step by step.
+def _at_start(
+    state: QuadcopterState, plan: Plan, arrivals: "Arrivals", motion: "Motion", course: "Waypoints"
+) -> Flights:
+    """The metrics before the first step; arrivals, motion and course update theirs in place."""
+    n = state.n
+    undefined = np.full(n, np.nan)
+    cross_track_error = motion.cross_track_error
+    if len(plan.waypoints):
+        # A course has no single straight line to deviate from.
+        cross_track_error = undefined
+    return Flights(
+        success=np.zeros(n, dtype=np.bool_),
+        survival=np.ones(n, dtype=np.bool_),
+        collision=np.zeros(n, dtype=np.bool_),
+        reward=np.zeros(n),
+        own_reward=undefined.copy(),
+        length=np.zeros(n, dtype=np.int64),
+        flown=np.zeros(n),
+        time_to=dict(zip(arrivals.tolerances, arrivals.time_to, strict=True)),
+        settling_time=dict(zip(arrivals.tolerances, arrivals.settling_time, strict=True)),
+        overshoot=arrivals.overshoot,
+        path_length=np.zeros(n),
+        final_error=state.distance.copy(),
+        final_offset=np.full((n, 3), np.nan),
+        recovery_time=motion.recovery_time,
+        cross_track_error=cross_track_error,
+        waypoint_times=course.times,
+        start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
+        target=state.target.copy(),
+    )
 
-    ``recovery_time`` (n,): s until the tilt has come below 45° and the turning about the body's x and
-    y axes below 2 rad/s, both for 0.2 s at least, of which the beginning counts; NaN if that never
-    was. The thesis reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from
-    the straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1;
-    NaN where both are one point.
+
+def _ask_reward(
+    reward: Reward, state: QuadcopterState, actions: Float32Array
+) -> npt.NDArray[np.float64]:
+    """Return the rewards of a function of the user's, which may do anything, as (n,) numbers."""
+    # Instances of a class have no name of their own.
+    name = f"reward {getattr(reward, '__name__', type(reward).__name__)}"
+    try:
+        values = np.asarray(reward(state, actions), dtype=np.float64)
+    except (Exception, SystemExit) as error:
+        raise ControllerError(f"{name}: fails with {type(error).__name__}: {error}") from error
+    if values.shape != (state.n,):
+        raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
+    if not np.isfinite(values).all():
+        row = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise ControllerError(f"{name}: gives {values[row]} in row {row}, must be finite")
+    return values
+
+
+class Arrivals:
+    """Watches, step by step, when n flights come within T tolerances of their targets.
+
+    ``time_to`` (T, n): s until |r - r_T| is first within each tolerance. ``settling_time`` (T, n):
+    s since when it has stayed within it. ``overshoot`` (n,): the largest |r - r_T|, m, since it was
+    first within :func:`arrival_tolerance`. NaN where that has not happened.
+
+    :param tolerances: m.
+    :param distance: |r - r_T| at the start, (n,), m; infinite before the last waypoint.
+    """
+
+    def __init__(self, tolerances: Sequence[float], distance: FloatArray) -> None:
+        self.tolerances = tolerances
+        self._limits = np.array(tolerances)[:, None]
+        self.time_to = np.where(distance <= self._limits, 0.0, np.nan)
+        self.settling_time = self.time_to.copy()
+        self._first = np.full(len(distance), np.nan)
+        if tolerances:
+            # A view, which shows the arrivals that follow.
+            self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
+        self.overshoot = np.where(np.isnan(self._first), np.nan, distance)
+
+    def see(self, time: float, distance: FloatArray, flying: BoolArray) -> None:
+        """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s."""
+        inside = distance <= self._limits
+        entered = inside & flying
+        self.time_to[np.isnan(self.time_to) & entered] = time
+        # Who is outside has to settle again.
+        self.settling_time[~inside & flying] = np.nan
+        self.settling_time[np.isnan(self.settling_time) & entered] = time
+        arrived = flying & ~np.isnan(self._first)
+        self.overshoot[arrived] = np.fmax(self.overshoot, distance)[arrived]
+
+
+class Waypoints:
+    """The waypoints of n flights: which of them each has reached, and when.
+
+    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet. ``on_last`` (n,):
+    whether the present target is the last one; always without waypoints.
+    """
+
+    def __init__(self, plan: Plan, n: int) -> None:
+        self._plan = plan
+        self._next = np.zeros(n, dtype=np.int64)
+        self.times = np.full((n, len(plan.waypoints)), np.nan)
+        self.on_last = np.full(n, len(plan.waypoints) <= 1)
+
+    def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
+        """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
+        count = len(self._plan.waypoints)
+        near = distance <= self._plan.radius
+        reached = np.flatnonzero(flying & (self._next < count) & near)
+        self.times[reached, self._next[reached]] = time
+        self._next[reached] += 1
+        self.on_last |= self._next >= count - 1
+        return reached[self._next[reached] < count]
+
+    def to_last(self, distance: FloatArray) -> FloatArray:
+        """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
+        return np.where(self.on_last, distance, np.inf)
+
+    def targets(self, rows: IntArray) -> FloatArray:
+        """The present waypoints of some rows, (len(rows), 3), m."""
+        return self._plan.waypoints[self._next[rows]]
+
+
+class Motion:
+    """Watches, step by step, when n flights become stable and how far they deviate from their line.
+
+    ``recovery_time`` (n,): s until the tilt has come below 45° and the body rates about x and y
+    below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never was. The thesis
+    reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from the
+    straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1; NaN
+    where both are one point.
 
     :param state: at the start.
     :param control_step: s.
@@ -295,7 +420,8 @@ class Motion:
     def __init__(self, state: QuadcopterState, control_step: float) -> None:
         way = state.target - state.position
         length = np.linalg.norm(way, axis=1, keepdims=True)
-        self._start, self._control_step = state.position.copy(), control_step
+        self._control_step = control_step
+        self._start = state.position.copy()
         self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
         self._since = np.zeros(state.n)  # when the present stable time began
         self._stable = np.ones(state.n, dtype=np.bool_)
@@ -304,17 +430,20 @@ class Motion:
         self.see(0, state, np.ones(state.n, dtype=np.bool_))
 
     def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
-        """The state after control step ``step``; only flights (n,) that go on count."""
-        time, before = step * self._control_step, self._stable
+        """See the state after control step ``step``; only the flights (n,) that continue count."""
+        time = step * self._control_step
+        was_stable = self._stable
+        # The cosine of the tilt is the z-z element of the rotation matrix.
         x, y = state.quaternion.T[1:3]
         upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
         self._stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
-        self._since[self._stable & ~before] = time
-        held = flying & self._stable & (time - self._since > HOLD - 0.5 * self._control_step)
-        new = held & np.isnan(self.recovery_time)
-        self.recovery_time[new] = self._since[new]
+        self._since[self._stable & ~was_stable] = time
+        # Half a step of tolerance, since times are multiples of steps only up to rounding.
+        held = time - self._since > HOLD - 0.5 * self._control_step
+        recovered = flying & self._stable & held & np.isnan(self.recovery_time)
+        self.recovery_time[recovered] = self._since[recovered]
+        # The part of the way flown that is across the line.
         flown = state.position - self._start
-        beside = np.linalg.norm(
-            flown - (flown * self._direction).sum(axis=1, keepdims=True) * self._direction, axis=1
-        )
-        self.cross_track_error[flying] = np.maximum(self.cross_track_error, beside)[flying]
+        along = (flown * self._direction).sum(axis=1, keepdims=True) * self._direction
+        across = np.linalg.norm(flown - along, axis=1)
+        self.cross_track_error[flying] = np.maximum(self.cross_track_error, across)[flying]

@@ -4,7 +4,7 @@ matplotlib.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays
 
-NAMES = {"timesteps", "seconds", "results"}  # of the arrays that every file has
-SHARES = "successes", "survivals"  # where the environment reports them
+# The arrays of a file, (k, episodes), by what they are called here.
+EPISODES = {"reward": "results", "success": "successes", "survival": "survivals"}
+# Environments of others may not report these.
+OPTIONAL = ("successes", "survivals")
 
 
 class Curve(NamedTuple):
@@ -21,25 +23,22 @@ class Curve(NamedTuple):
 
     timesteps: FloatArray  # (k,)
     seconds: FloatArray  # of training, evaluations along the way included, (k,)
-    success: (
-        FloatArray | None
-    )  # share of successful episodes, (k,); None: the environment reports none, as of survival
-    reward: FloatArray  # mean per episode, (k,)
-    survival: FloatArray | None = None  # share of episodes, (k,)
-    losses: Mapping[
-        str, FloatArray
-    ] = {}  # by name, of the update before each evaluation, (k,); NaN where there was none
+    # By name, (k,): the mean reward, the shares success and survival where the environment reports
+    # them, and losses of the update before each evaluation, NaN where there was none.
+    measures: Mapping[str, FloatArray]
+
+    @property
+    def reward(self) -> FloatArray:
+        """Mean reward per episode, (k,)."""
+        return self.measures["reward"]
 
     def values(self, name: str) -> FloatArray:
-        """What a panel shows: success, survival, reward or the loss of a name, (k,); NaN where
-        there is none.
-        """
-        found: Any = self.losses.get(name) if name.endswith("loss") else getattr(self, name)
-        return np.full(len(self.timesteps), np.nan) if found is None else found
+        """Return a measure, (k,); NaN if the run does not have it."""
+        return self.measures.get(name, np.full(len(self.timesteps), np.nan))
 
 
 def read_curve(run: str | Path, task: str | None = None) -> Curve:
-    """The curve of a run folder, from its ``evaluations.npz``.
+    """Read the curve of a run folder from its ``evaluations.npz``.
 
     :param task: one of the run's ``eval_tasks``; None for its environment's own.
     :raises ConfigError: a folder without evaluations, or a damaged file.
@@ -47,32 +46,27 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
     path = Path(run) / ("evaluations.npz" if task is None else f"evaluations_{task}.npz")
     if not path.is_file():
         reason = "a run that was trained with --eval-episodes 0 has no curve"
-        raise ConfigError(
-            f"{path}: no such file; "
-            + (f"{task} is none of this run's eval_tasks" if task else reason)
-        )
+        if task is not None:
+            reason = f"{task} is not one of this run's eval_tasks"
+        raise ConfigError(f"{path}: no such file; {reason}")
     arrays = read_arrays(path)
-    if missing := NAMES - arrays.keys():
-        raise ConfigError(f"{path}: cannot be read ({', '.join(sorted(missing))}: no such array)")
-    known = {name: array for name, array in arrays.items() if name in NAMES or name in SHARES}
-    count = known["timesteps"].size
-    right = count > 0 and all(
-        array.ndim == (1 if name in ("timesteps", "seconds") else 2)
-        and len(array) == count
-        and array.dtype.kind in "fiub"
-        for name, array in known.items()
-    )
-    if not right:
-        raise ConfigError(
-            f"{path}: cannot be read ({', '.join(sorted(known))} do not fit together)"
-        )
-    timesteps, seconds = (
-        np.asarray(arrays[name], dtype=np.float64) for name in ("timesteps", "seconds")
-    )
-    success, survival = (known[name].mean(axis=1) if name in known else None for name in SHARES)
-    losses = {
-        name.removeprefix("train/"): array
-        for name, array in arrays.items()
-        if name.startswith("train/")
-    }
-    return Curve(timesteps, seconds, success, arrays["results"].mean(axis=1), survival, losses)
+    for name in ("timesteps", "seconds", *EPISODES.values()):
+        if name not in arrays:
+            if name in OPTIONAL:
+                continue
+            raise ConfigError(f"{path}: cannot be read ({name}: no such array)")
+        # A file of another program may hold anything.
+        array = arrays[name]
+        dimensions = 2 if name in EPISODES.values() else 1
+        fits = array.ndim == dimensions and len(array) == arrays["timesteps"].size > 0
+        if not fits or array.dtype.kind not in "fiub":
+            raise ConfigError(f"{path}: cannot be read ({name} does not fit to the other arrays)")
+    measures = {}
+    for name, key in EPISODES.items():
+        if key in arrays:
+            measures[name] = arrays[key].mean(axis=1)
+    for key in arrays:
+        if key.startswith("train/"):
+            measures[key.removeprefix("train/")] = arrays[key]
+    timesteps = arrays["timesteps"].astype(np.float64)
+    return Curve(timesteps, arrays["seconds"].astype(np.float64), measures)

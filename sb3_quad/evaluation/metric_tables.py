@@ -1,8 +1,10 @@
-"""Tables of metrics: a column for each controller, and others' metrics beside them."""
+"""Tables of metrics: a column for each controller, then columns of others' metrics."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
+
+import numpy as np
 
 from sb3_quad.evaluation.flights import arrival_tolerance
 from sb3_quad.evaluation.metrics import Metrics, Moment
@@ -13,256 +15,253 @@ from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 
 # The rows, without their cells:
-SUCCESS, SURVIVAL = Row("success", "%"), Row("survival", "%")
-REWARD, FLOWN = Row("mean reward"), Row("time flown", "s")
-PATH, MEDIAN, QUANTILE = (
-    Row("mean path", "m"),
-    Row("final error, median", "m"),
-    Row("final error, 95 %", "m"),
-)
-RECOVERY_TIME, CROSS_TRACK_ERROR = (
-    Row("mean time until stable", "s"),
-    Row("beside the straight way", "m"),
-)
-REACHED, COMPLETED, COURSE_TIME = (
-    Row("waypoints reached"),
-    Row("courses completed", "%"),
-    Row("time of the course", "s"),
-)
-TIME = "mean time to"  # begins the names of the rows with times to a tolerance
-LIMIT = Row("physical limit of that time", "s")
-OVERSHOOT_RATE, OVERSHOOT = Row("leave it again", "%"), Row("overshoot, median", "m")
-ALWAYS_COMPARABLE = {
-    SUCCESS,
-    SURVIVAL,
-    REACHED,
-    COMPLETED,
-}  # also where flights are lost, which end early
-HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
-MOST_TOLERANCES, MAIN_TOLERANCES = 6, (0.1, 0.2, 0.5, 1.0)  # m
+SUCCESS = Row("success", "%")
+SURVIVAL = Row("survival", "%")
+REWARD = Row("mean reward")
+OWN_REWARD = Row("mean own reward")
+FLOWN = Row("time flown", "s")
+LIMIT = Row("physical limit of the settling time", "s")
+OVERSHOOT_RATE = Row("overshoot rate", "%")
+OVERSHOOT = Row("overshoot, median", "m")
+PATH = Row("mean path", "m")
+MEDIAN = Row("final error, median", "m")
+QUANTILE = Row("final error, 95 %", "m")
+RECOVERY_TIME = Row("recovery time", "s")
+CROSS_TRACK_ERROR = Row("cross-track error", "m")
+REACHED = Row("waypoints reached")
+COMPLETED = Row("courses completed", "%")
+COURSE_TIME = Row("time of the course", "s")
+# The names of rows with times begin like this; in them less is better.
+TIME = "mean time to"
+SETTLING = "settling time"
+# Flights that are lost end early, which makes other rows incomparable.
+ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}
+HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD, OWN_REWARD}
+MOST_TOLERANCES = 6
+MAIN_TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
 
 Cells = Mapping[Row, Cell]  # by the rows they stand in
 
 
 def time_row(tolerance: float | str) -> Row:
-    """The row with the time to a tolerance."""
+    """Return the row with the time to a tolerance, m."""
     return Row(f"{TIME} {float(tolerance):g} m", "s")
 
 
 def settling_row(tolerance: float) -> Row:
-    """The row with the time after which a tolerance is not left again."""
-    return Row(f"{TIME} stay within {tolerance:g} m", "s")
+    """Return the row with the settling time of a tolerance, m."""
+    return Row(f"{SETTLING} ({tolerance:g} m)", "s")
+
+
+def estimate_cell(
+    estimate: Estimate | None, factor: float = 1.0, decimals: int = 2, none: str = "–"
+) -> Cell:
+    """Return an estimate with its interval, both times ``factor``; the words ``none`` for None."""
+    if estimate is None:
+        return Cell(words=none)
+    ends = factor * estimate.low, factor * estimate.high
+    return Cell(factor * estimate.value, ends, decimals)
+
+
+def share_cell(share: Estimate | None) -> Cell:
+    """Return a share in percent, with as many digits as a single flight takes to show."""
+    if share is None:
+        return Cell(words="–")
+    return estimate_cell(share, 100.0, decimals=len(str(share.n // 200)))
 
 
 def metric_cells(metrics: Metrics) -> Cells:
-    """Everything that was measured of a controller in a scenario."""
-    near = arrival_tolerance(each.tolerance for each in metrics.arrivals)
-    arrival = next(each for each in metrics.arrivals if each.tolerance == near)
+    """Return all that was measured of a controller in a scenario."""
     cells = {
-        SUCCESS: _share(metrics.success),
-        SURVIVAL: _share(metrics.survival),
-        REWARD: _mean(metrics.reward),
-        FLOWN: _mean(metrics.flown),
-        settling_row(near): _moment(arrival.settling, "do"),
-        **{time_row(each.tolerance): _moment(each) for each in metrics.arrivals},
-        OVERSHOOT_RATE: Cell(words="–")
-        if arrival.overshoot_rate is None
-        else _share(arrival.overshoot_rate),
+        SUCCESS: share_cell(metrics.success),
+        SURVIVAL: share_cell(metrics.survival),
+        REWARD: estimate_cell(metrics.reward),
+        FLOWN: estimate_cell(metrics.flown),
         OVERSHOOT: Cell(metrics.overshoot, words="–"),
-        PATH: _mean(metrics.path),
+        PATH: estimate_cell(metrics.path),
         MEDIAN: Cell(metrics.final_error_median, decimals=3, words="–"),
-        QUANTILE: replace(_mean(metrics.final_error_95), decimals=3),
-        RECOVERY_TIME: _moment(metrics.recovery_time, "are"),
+        QUANTILE: estimate_cell(metrics.final_error_95, decimals=3),
+        RECOVERY_TIME: _moment(metrics.recovery_time, "recover"),
     }
+    near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
+    for arrival in metrics.arrivals:
+        cells[time_row(arrival.tolerance)] = _moment(arrival, "arrive")
+        # Settling and overshoot are shown of one tolerance only.
+        if arrival.tolerance == near:
+            cells[settling_row(near)] = _moment(arrival.settling, "settle")
+            cells[OVERSHOOT_RATE] = share_cell(arrival.overshoot_rate)
+    # These exist only of some flights.
+    if metrics.own_reward is not None:
+        cells[OWN_REWARD] = estimate_cell(metrics.own_reward)
     if metrics.cross_track_error is not None:
-        cells[CROSS_TRACK_ERROR] = _mean(metrics.cross_track_error)
+        cells[CROSS_TRACK_ERROR] = estimate_cell(metrics.cross_track_error)
     if metrics.course is not None:
-        cells[REACHED], cells[COMPLETED] = (
-            _mean(metrics.course.reached),
-            _share(metrics.course.completed),
-        )
-        cells[COURSE_TIME] = _mean(metrics.course.time, "never")
+        cells[REACHED] = estimate_cell(metrics.course.reached)
+        cells[COMPLETED] = share_cell(metrics.course.completed)
+        cells[COURSE_TIME] = estimate_cell(metrics.course.time, none="never")
     return cells
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
-    """As :func:`metric_cells`, of the controller with that label, beside what its vehicle could do;
-    None if it failed.
-    """
+    """Return the :func:`metric_cells` of a label and its vehicle's limit; None if it failed."""
     entry = results.entry(controller, scenario.name)
-    return (
-        None
-        if entry is None
-        else {**metric_cells(entry.metrics), LIMIT: Cell(entry.physical_limit)}
-    )
+    if entry is None:
+        return None
+    return {**metric_cells(entry.metrics), LIMIT: Cell(entry.physical_limit)}
 
 
 def reference_cells(reference: Reference) -> Cells:
-    """Others' metrics."""
-    values = {
+    """Return others' metrics."""
+    numbers = {
         REWARD: reference.reward,
         PATH: reference.path,
         MEDIAN: reference.final_error,
         FLOWN: reference.flown,
+        RECOVERY_TIME: reference.recovery_time,
     }
-    values |= {RECOVERY_TIME: reference.recovery_time}
-    cells = {row: _printed(value) for row, value in values.items() if value is not None}
     shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
-    cells |= {
-        row: replace(_printed(share, 100.0), note=reference.note)
-        for row, share in shares.items()
-        if share is not None
-    }
-    return cells | {
-        time_row(tolerance): _printed(time) for tolerance, time in reference.time_to.items()
-    }
+    cells = {row: _printed(number) for row, number in numbers.items() if number is not None}
+    for row, share in shares.items():
+        if share is not None:
+            cells[row] = replace(_printed(share, 100.0), note=reference.note)
+    # Here None has a meaning: never within the tolerance.
+    for tolerance, time in reference.time_to.items():
+        cells[time_row(tolerance)] = _printed(time)
+    return cells
 
 
 def metric_rows(
     scenario: Scenario, measured: Sequence[Cells | None], references: Iterable[Reference] = ()
 ) -> list[Row]:
-    """The rows of a scenario, the best of each marked: first the cells of the controllers, then
-    those from elsewhere.
+    """Return the rows of a scenario, the best of each marked: controllers first, then references.
 
     :param measured: of each controller; None: it failed.
     """
-    others = [reference_cells(reference) for reference in references]
-    none_lost = all(cells is None or cells[SURVIVAL].value == 100.0 for cells in measured)
+    # A controller that failed has one cell, which says so.
+    failed = {SUCCESS: Cell(words="failed")}
+    ours = [failed if cells is None else cells for cells in measured]
+    others = [*map(reference_cells, references)]
+    none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells is not None)
     rows = []
     for row in _rows_of(scenario):
-        failed = Cell(words="failed") if row == SUCCESS else Cell()
-        own = [failed if cells is None else cells.get(row, Cell()) for cells in measured]
-        if all(cell == Cell() for cell in own):
+        own = [cells.get(row, Cell()) for cells in ours]
+        # A row without any number of ours is left out, whatever others measured.
+        if not any(cell != Cell() for cell in own):
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        rows.append(replace(row, cells=[*own, *(cells.get(row, Cell()) for cells in others)]))
+        for cells in others:
+            own.append(cells.get(row, Cell()))
+        rows.append(replace(row, cells=own))
     return rows
 
 
 def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
-    """The cells of a row, the best of them marked, if its interval is apart from all others'."""
-    higher = row in HIGHER_IS_BETTER
-    if not (higher or row == COURSE_TIME or row.name.startswith(TIME)):
+    """Return the cells of a row, the best marked if its interval is apart from all others'."""
+    if row in HIGHER_IS_BETTER:
+        sign = 1.0
+    elif row == COURSE_TIME or row.name.startswith((TIME, SETTLING)):
+        sign = -1.0
+    else:
         return list(cells)
-    measured = [cell for cell in cells if cell.value is not None]
+    # The intervals, turned so that more is better; without a number a cell cannot win.
+    ends = np.full((2, len(cells)), -np.inf)
+    for number, cell in enumerate(cells):
+        if cell.value is not None:
+            ends[:, number] = sorted(np.multiply(sign, cell.ends or (cell.value, cell.value)))
     marked = []
-    for cell in cells:
-        others = [other for other in measured if other is not cell]
-        best = (
-            cell.value is not None
-            and bool(others)
-            and all(_beats(cell, other, higher) for other in others)
-        )
+    for number, cell in enumerate(cells):
+        best_of_others = np.delete(ends[1], number).max(initial=-np.inf)
+        # A cell that is alone is not the best.
+        best = bool(ends[0, number] > best_of_others > -np.inf)
         marked.append(replace(cell, best=best))
     return marked
 
 
 def overview(results: Results, controllers: Sequence[str]) -> Table:
-    """All scenarios in one table: a section each, a column per controller, reference metrics in the
-    last column.
+    """Return all scenarios in one table: a section each, references in the last column.
 
     :param controllers: labels, in the order of their columns.
     """
-    columns = [*map(Column, controllers), Column(results.source, align="left")]
-    if not any(scenario.reference for scenario in results.scenarios):
-        columns.pop()
+    columns = [*map(Column, controllers)]
     rows = []
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
         for scenario in scenarios:
-            measured = [measured_cells(results, label, scenario) for label in controllers]
-            found = metric_rows(scenario, measured, scenario.reference.values())
-            varied = ", ".join(
-                f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items()
-            )
-            for row in found:
-                name = f"{varied}, {row.name}" if varied and len(found) > 1 else varied or row.name
-                others = zip(scenario.reference, row.cells[len(controllers) :], strict=True)
-                beside = "; ".join(
-                    f"{who} {replace(cell, note='').text}" for who, cell in others if cell != Cell()
-                )
-                cells = [*row.cells[: len(controllers)], Cell(words=beside)]
-                rows.append(Row(f"  {name}", row.unit, cells[: len(columns)]))
+            rows += _section(results, controllers, scenario)
+            if scenario.reference and len(columns) == len(controllers):
+                columns.append(Column(results.source, align="left"))
     return Table(columns, rows, title=results.suite, caption=CAPTION)
 
 
+def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -> list[Row]:
+    """The rows of a scenario in the overview."""
+    measured = [measured_cells(results, label, scenario) for label in controllers]
+    rows = metric_rows(scenario, measured, scenario.reference.values())
+    section = []
+    for row in rows:
+        names = [f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items()]
+        # The values of a cell are name enough for its only row.
+        if len(rows) > 1 or not names:
+            names.append(row.name)
+        cells = [*row.cells[: len(controllers)]]
+        # All references share a column.
+        words = []
+        for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
+            if cell != Cell():
+                words.append(f"{who} {replace(cell, note='').text}")
+        if words:
+            cells.append(Cell(words="; ".join(words)))
+        section.append(Row(f"  {', '.join(names)}", row.unit, cells))
+    return section
+
+
 def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
-    """Each scenario, or the cells that ``vary`` makes of one, with its heading."""
+    """Return each scenario, or the cells that ``vary`` makes of one, with its heading."""
     groups = []
     for _, members in groupby(results.scenarios, lambda scenario: scenario.group or scenario.name):
         scenarios = list(members)
-        heading = (
-            scenarios[0].heading.rsplit(":", 1)[0] if scenarios[0].group else scenarios[0].heading
-        )
+        heading = scenarios[0].heading
+        if scenarios[0].group:
+            heading = heading.rsplit(":", 1)[0]  # without the values of the cell
         groups.append((heading[:1].upper() + heading[1:], scenarios))
     return groups
 
 
 def _rows_of(scenario: Scenario) -> list[Row]:
-    """The rows that mean something in a scenario; only the main ones of many tolerances, a plot
-    shows the others.
-    """
+    """The rows that mean something in a scenario."""
+    common = [SUCCESS, SURVIVAL]
     if scenario.target.waypoints is not None:
-        return [SUCCESS, SURVIVAL, REACHED, COMPLETED, COURSE_TIME]
+        return [*common, REACHED, COMPLETED, COURSE_TIME]
+    if len(scenario.cell) > 1:
+        return [SUCCESS]
     if scenario.group is not None:
-        return [SUCCESS, SURVIVAL, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
+        return [*common, MEDIAN]
+    rewards = [REWARD, OWN_REWARD]
+    if scenario.target.distance == 0.0:
+        if scenario.is_fixed:
+            common.append(FLOWN)
+        # An episode that starts at its target has no way to it.
+        return [*common, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = scenario.tolerances
     if len(tolerances) > MOST_TOLERANCES:
-        referenced = {
-            float(key) for reference in scenario.reference.values() for key in reference.time_to
-        }
-        kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
-        tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
-    if (
-        scenario.target.distance == 0.0
-    ):  # where an episode starts at its target there is no way to it
-        return [
-            SUCCESS,
-            SURVIVAL,
-            *([FLOWN] if scenario.is_fixed else []),
-            REWARD,
-            RECOVERY_TIME,
-            MEDIAN,
-            QUANTILE,
-        ]
-    times = [
-        settling_row(arrival_tolerance(tolerances)),
-        LIMIT,
-        OVERSHOOT_RATE,
-        OVERSHOOT,
-        *map(time_row, tolerances),
-    ]
-    return [SUCCESS, SURVIVAL, REWARD, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
+        # Only the main ones and those of references; a plot shows the others.
+        kept = {tolerances[0], *MAIN_TOLERANCES}
+        for reference in scenario.reference.values():
+            kept |= {*map(float, reference.time_to)}
+        tolerances = tuple(sorted(kept & {*tolerances}))
+    settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
+    times = map(time_row, tolerances)
+    return [*common, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
-def _beats(cell: Cell, other: Cell, higher: bool) -> bool:
-    (low, high), (other_low, other_high) = (
-        each.ends or (each.value or 0.0,) * 2 for each in (cell, other)
-    )
-    return low > other_high if higher else high < other_low
-
-
-def _share(estimate: Estimate) -> Cell:
-    """In percent, with as many digits as a single flight takes to show."""
-    digits = len(str(estimate.n // 200))
-    return Cell(100 * estimate.value, (100 * estimate.low, 100 * estimate.high), decimals=digits)
-
-
-def _mean(estimate: Estimate | None, none: str = "–") -> Cell:
-    return (
-        Cell(words=none)
-        if estimate is None
-        else Cell(estimate.value, (estimate.low, estimate.high))
-    )
-
-
-def _moment(moment: Moment, verb: str = "arrive") -> Cell:
-    some = moment.time is not None and moment.share.value < 1.0
-    return replace(
-        _mean(moment.time, "never"), note=f"{100 * moment.share.value:.3g} % {verb}" if some else ""
-    )
+def _moment(moment: Moment, verb: str) -> Cell:
+    """The mean time of an event; the note says how many flights reach it, unless all or none do."""
+    note = ""
+    if moment.time is not None and moment.share.value < 1.0:
+        note = f"{100 * moment.share.value:.3g} % {verb}"
+    return replace(estimate_cell(moment.time, none="never"), note=note)
 
 
 def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:
@@ -270,5 +269,6 @@ def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:
     if value is None:
         return Cell(words="never")
     if isinstance(value, tuple):
+        # Tables have a proper minus sign.
         return Cell(words=" to ".join(f"{factor * end:g}" for end in value).replace("-", "−"))
     return Cell(factor * value, decimals=len(f"{factor * value:g}".partition(".")[2]))

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
@@ -12,119 +11,143 @@ from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
 
 
-class Moment(Frozen):
-    """Something that a flight comes to, or never does."""
+class Moment(Frozen, use_attribute_docstrings=True):
+    """An event that a flight reaches at some time, or never."""
 
-    share: Estimate = Field(description="of the flights that came to it")
-    time: Estimate | None = Field(
-        description="mean time until then of those flights, s; None: no flight did"
-    )
+    share: Estimate
+    """share of the flights that reach it"""
+    time: Estimate | None
+    """mean time until then of those flights, s; None: no flight reaches it"""
 
 
 class Arrival(Moment):
-    """Arrival within one tolerance: when it is first touched, and after which time it is not left
-    again.
-    """
+    """Arrival within one tolerance: when a flight is first within it, and when it stays there."""
 
-    tolerance: float = Field(description="m")
-    settling: Moment = Field(
-        description="flights that end within it, and after which time they stay"
-    )
-    overshoot_rate: Estimate | None = Field(
-        description="share that leaves it again, of the flights that came to it"
-    )
+    tolerance: float
+    """m"""
+    settling: Moment
+    """settling time: flights that end within the tolerance, and when they leave it no more"""
+    overshoot_rate: Estimate | None
+    """share of the flights that arrived and left the tolerance again"""
 
 
-class Course(Frozen):
+class Course(Frozen, use_attribute_docstrings=True):
     """A course of waypoints."""
 
-    reached: Estimate = Field(description="mean number of waypoints reached")
-    completed: Estimate = Field(description="share of the flights that reached all")
-    time: Estimate | None = Field(
-        description="mean time until the last waypoint of those flights, s"
-    )
+    reached: Estimate
+    """mean number of waypoints reached"""
+    completed: Estimate
+    """share of the flights that reached all"""
+    time: Estimate | None
+    """mean time until the last waypoint of those flights, s"""
 
 
-class Metrics(Frozen):
-    """What one controller reached in one scenario; path and errors are of the flights that were not
-    lost.
-    """
+class Metrics(Frozen, use_attribute_docstrings=True):
+    """The metrics of one controller in one scenario; path and errors are means over survivors."""
 
-    n: int = Field(description="flights")
-    success: Estimate = Field(description="share that survived and ended at the target")
-    survival: Estimate = Field(
-        description="share that neither touched the ground nor left the range"
-    )
-    collisions: int = Field(description="flights that touched the ground")
-    out_of_range: int = Field(description="flights that left the range")
-    reward: Estimate = Field(description="mean sum of rewards (Eqs. 4.5-4.9)")
-    flown: Estimate = Field(description="mean time flown, until lost or the end, s")
-    arrivals: list[Arrival] = Field(description="by tolerance, the tightest first")
-    overshoot: float | None = Field(description="median of the largest |r - r_T| since arrival, m")
-    path: Estimate | None = Field(description="mean length of the path over the whole episode, m")
-    final_error: Estimate | None = Field(description="mean |r - r_T| at the end, m")
-    final_error_median: float | None = Field(description="m")
-    final_error_95: Estimate | None = Field(description="its 95 % quantile, m")
-    final_error_max: float | None = Field(description="m")
-    final_offset: Vector | None = Field(description="mean r - r_T at the end, world frame, m")
-    recovery_time: Moment = Field(description="which flights got stable again, and when")
-    cross_track_error: Estimate | None = Field(
-        description="mean largest distance from the straight way, m; None: there is none"
-    )
-    course: Course | None = Field(description="of scenarios with waypoints")
+    n: int
+    """flights"""
+    success: Estimate
+    """share that survived and ended at the target"""
+    survival: Estimate
+    """share that neither touched the ground nor left the range"""
+    collisions: int
+    """flights that touched the ground"""
+    out_of_range: int
+    """flights that left the range"""
+    reward: Estimate
+    """mean sum of rewards (Eqs. 4.5-4.9)"""
+    own_reward: Estimate | None
+    """mean sum of your own reward; None: no own reward was given"""
+    flown: Estimate
+    """mean time flown, until lost or the end, s"""
+    arrivals: list[Arrival]
+    """by tolerance, the tightest first"""
+    overshoot: float | None
+    """median of the largest |r - r_T| since arrival, m"""
+    path: Estimate | None
+    """mean length of the path over the whole episode, m"""
+    final_error: Estimate | None
+    """mean |r - r_T| at the end, m"""
+    final_error_median: float | None
+    """m"""
+    final_error_95: Estimate | None
+    """95 % quantile of the final error, m"""
+    final_error_max: float | None
+    """m"""
+    final_offset: Vector | None
+    """mean r - r_T at the end, world frame, m"""
+    recovery_time: Moment
+    """flights that became stable again, and when"""
+    cross_track_error: Estimate | None
+    """mean largest distance from the straight line to the target, m; None: there is no line"""
+    course: Course | None
+    """only of scenarios with waypoints"""
 
 
 def summarise(flights: Flights) -> Metrics:
-    """The metrics of some flights, at least one."""
-    done = flights.survival
-    error, offset = flights.final_error[done], flights.final_offset[done]
-    some, reached = bool(done.any()), np.isfinite(flights.waypoint_times)
-    course = None
-    if reached.shape[1]:
-        count, time = (
-            bootstrap(reached.sum(axis=1, dtype=np.float64)),
-            mean(flights.waypoint_times[:, -1]),
-        )
-        course = Course(reached=count, completed=share(reached.all(axis=1)), time=time)
+    """Return the metrics of some flights, at least one."""
+    survived = flights.survival
+    error = flights.final_error[survived]
+    # These need a survivor: a quantile of nothing has no value.
+    errors: dict[str, Any] = dict.fromkeys(
+        ("final_error_median", "final_error_95", "final_error_max", "final_offset")
+    )
+    if error.size:
+        errors = {
+            "final_error_median": float(np.median(error)),
+            "final_error_95": bootstrap(error, _quantile_95),
+            "final_error_max": float(error.max()),
+            "final_offset": tuple(flights.final_offset[survived].mean(axis=0).tolist()),
+        }
+    overshoot = flights.overshoot[np.isfinite(flights.overshoot)]
     return Metrics(
         n=flights.n,
         success=share(flights.success),
-        survival=share(done),
+        survival=share(survived),
         collisions=int(flights.collision.sum()),
-        out_of_range=int((~done & ~flights.collision).sum()),
+        out_of_range=int((~survived & ~flights.collision).sum()),
         reward=bootstrap(flights.reward),
+        own_reward=mean(flights.own_reward),
         flown=bootstrap(flights.flown),
-        arrivals=[
-            _arrival(each, times, flights.settling_time[each])
-            for each, times in sorted(flights.time_to.items())
-        ],
-        overshoot=float(np.nanmedian(flights.overshoot))
-        if np.isfinite(flights.overshoot).any()
-        else None,
-        path=mean(flights.path_length[done]),
+        arrivals=[_arrival(flights, tolerance) for tolerance in sorted(flights.time_to)],
+        overshoot=float(np.median(overshoot)) if overshoot.size else None,
+        path=mean(flights.path_length[survived]),
         final_error=mean(error),
-        final_error_median=float(np.median(error)) if some else None,
-        final_error_95=bootstrap(error, lambda values, axis: np.quantile(values, 0.95, axis=axis))
-        if some
-        else None,
-        final_error_max=float(error.max()) if some else None,
-        final_offset=tuple(offset.mean(axis=0).tolist()) if some else None,
+        **errors,
         recovery_time=Moment(**_moment(flights.recovery_time)),
-        cross_track_error=mean(flights.cross_track_error[done]),
-        course=course,
+        cross_track_error=mean(flights.cross_track_error[survived]),
+        course=_course(flights.waypoint_times),
     )
 
 
-def _arrival(tolerance: float, times: FloatArray, stays: FloatArray) -> Arrival:
+def _arrival(flights: Flights, tolerance: float) -> Arrival:
+    times = flights.time_to[tolerance]
+    settled = flights.settling_time[tolerance]
     arrived = np.isfinite(times)
-    overshoot_rate = share((stays != times)[arrived]) if arrived.any() else None
     return Arrival(
         tolerance=tolerance,
-        settling=Moment(**_moment(stays)),
-        overshoot_rate=overshoot_rate,
+        settling=Moment(**_moment(settled)),
+        overshoot_rate=share((settled != times)[arrived]) if arrived.any() else None,
         **_moment(times),
+    )
+
+
+def _course(waypoint_times: FloatArray) -> Course | None:
+    """The course of flights whose times at W waypoints are (n, W), NaN where not reached."""
+    if waypoint_times.shape[1] == 0:
+        return None
+    reached = np.isfinite(waypoint_times)
+    return Course(
+        reached=bootstrap(reached.sum(axis=1, dtype=np.float64)),
+        completed=share(reached.all(axis=1)),
+        time=mean(waypoint_times[:, -1]),
     )
 
 
 def _moment(times: FloatArray) -> dict[str, Any]:
     return {"share": share(np.isfinite(times)), "time": mean(times)}
+
+
+def _quantile_95(values: FloatArray, axis: int) -> FloatArray:
+    return np.asarray(np.quantile(values, 0.95, axis=axis))

@@ -1,4 +1,4 @@
-"""What an evaluation leaves behind in its folder; every file appears whole or not at all.
+"""The results of an evaluation in its folder; every file appears whole or not at all.
 
 - ``results.json``, a :class:`Results`: scenarios, controllers, metrics with their intervals;
 - ``flights/<controller>/<scenario>.npz``, the flights as arrays, with sampled trajectories
@@ -22,48 +22,52 @@ from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
-RESULTS, EPISODES, FLIGHTS = "results.json", "episodes.csv", "flights"
-WRITTEN = (
-    RESULTS,
-    EPISODES,
-    "report.html",
-    "report.md",
-)  # what does not outlast the results; the last two by a report
+RESULTS = "results.json"
+EPISODES = "episodes.csv"
+FLIGHTS = "flights"
+# Files that are removed together with the results; a report writes the last two.
+WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
+# Columns of episodes.csv that are one array each, and those that are several numbers.
+_COLUMNS = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
 _AXES = {
-    "target": ("x", "y", "z"),
-    "start": (
-        *("x", "y", "z", "qw", "qx", "qy", "qz"),
-        *("vx", "vy", "vz", "rate_x", "rate_y", "rate_z"),
-    ),
+    "target": "x y z",
+    "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",
 }
 
 
-class ControllerRecord(Frozen):
-    """Who flew."""
+class ControllerRecord(Frozen, use_attribute_docstrings=True):
+    """A controller that flew."""
 
-    label: str = Field(description="column title; unique in a folder")
-    spec: str = Field(
-        description="as given: pid, geometric, the file name of a zip, package.module:factory"
-    )
+    label: str
+    """column title; unique in a folder"""
+    spec: str
+    """as given: pid, geometric, the file name of a zip, package.module:factory"""
     kind: Literal["expert", "model", "factory"]
-    algorithm: str | None = Field(default=None, description="SB3 class that loaded a zip")
-    content: str | None = Field(default=None, description="SHA-256 of the zip")
+    algorithm: str | None = None
+    """SB3 class that loaded a zip"""
+    content: str | None = None
+    """SHA-256 of the zip"""
 
 
-class Entry(Frozen):
+class Entry(Frozen, use_attribute_docstrings=True):
     """One controller in one scenario."""
 
-    controller: str = Field(description="label")
-    scenario: str = Field(description="name")
-    seed: int = Field(description="of the scenario; the files tell that of each episode")
+    controller: str
+    """label"""
+    scenario: str
+    """name"""
+    seed: int
+    """of the scenario; the files hold that of each episode"""
     backend: str
-    seconds: float = Field(description="wall-clock time it took")
-    date: str = Field(description="day on which it was flown, UTC, year-month-day")
+    seconds: float
+    """wall-clock time of the flights"""
+    date: str
+    """day of the flights, UTC, year-month-day"""
     metrics: Metrics
-    physical_limit: float | None = Field(
-        default=None, description="Scenario.physical_limit, beside the time to stay, s"
-    )
-    flights: str = Field(description="path of the .npz, relative to the folder")
+    physical_limit: float | None = None
+    """Scenario.physical_limit of the settling time, s"""
+    flights: str
+    """path of the .npz, relative to the folder"""
 
     @property
     def name(self) -> tuple[str, str]:
@@ -71,41 +75,45 @@ class Entry(Frozen):
         return self.scenario, self.controller
 
 
-class Failure(Frozen):
+class Failure(Frozen, use_attribute_docstrings=True):
     """A controller that could not be loaded, or did not get through a scenario."""
 
     controller: str
-    scenario: str | None = Field(description="None: it could not be loaded")
+    scenario: str | None
+    """None: it could not be loaded"""
     message: str
 
 
-class Results(Frozen):
+class Results(Frozen, use_attribute_docstrings=True):
     """A folder of results."""
 
-    schema_version: Literal[4] = 4
+    schema_version: Literal[5] = 5
     suite: str
     description: str
-    source: str = Field(
-        default="reference", description="where the scenarios' reference comes from"
-    )
+    source: str = "reference"
+    """where the scenarios' reference comes from"""
+    reward: str = ""
+    """your own reward, as given; empty: none"""
     package_version: str
     controllers: list[ControllerRecord]
     scenarios: list[Scenario]
     entries: list[Entry]
     failures: list[Failure] = Field(default_factory=list)
-    digest: str = Field(
-        default="",
-        description="SHA-256 of all that the evaluation depends on: only the same one goes on",
-    )
-    finished: bool = Field(default=True, description="whether it has come to its end")
+    digest: str = ""
+    """hash of all inputs; an interrupted evaluation resumes only if it is unchanged"""
+    finished: bool = True
+    """whether all flights were flown"""
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
-        """The entry of a controller's label and a scenario's name, None if there is none."""
-        return next((each for each in self.entries if each.name == (scenario, controller)), None)
+        """Return the entry of a controller's label and a scenario's name; None if it failed."""
+        for entry in self.entries:
+            if entry.name == (scenario, controller):
+                return entry
+        return None
 
 
 def load_results(folder: str | Path) -> Results:
-    """The ``results.json`` of a folder.
+    """Read the ``results.json`` of a folder.
 
     :raises ConfigError: no such file, a damaged one, or one of another version.
     """
@@ -116,12 +124,12 @@ def load_results(folder: str | Path) -> Results:
 
 
 def file_name(label: str) -> str:
-    """A label as part of file names."""
+    """Return a label as part of file names."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", label).strip("_.") or "_"
 
 
 def flights_path(controller: str, scenario: str) -> str:
-    """Where the flights of a controller's label and a scenario's name lie, relative to the folder."""
+    """Return the path of a controller's flights in a scenario, relative to the folder."""
     return f"{FLIGHTS}/{file_name(controller)}/{scenario}.npz"
 
 
@@ -130,43 +138,45 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
     """
-    rows = [
-        row
-        for entry in entries
-        for row in _rows(entry, read_arrays(folder / entry.flights, "episode_"))
-    ]
-    write_csv(folder / EPISODES, dict.fromkeys(name for row in rows for name in row), rows)
+    rows: list[dict[str, Any]] = []
+    columns: dict[str, None] = {}
+    for entry in entries:
+        rows += _rows(entry, read_arrays(folder / entry.flights, "episode_"))
+        columns |= dict.fromkeys(rows[-1])  # scenarios differ in tolerances and waypoints
+    write_csv(folder / EPISODES, columns, rows)
 
 
 def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
-    """A line of the table for each flight."""
-    columns = {
-        name: arrays[f"episode_{name}"]
-        for name in ("seed", "outcome", "flown", "reward", "path", "final_error")
-    }
-    columns["waypoints_reached"] = np.isfinite(arrays["episode_waypoints"]).sum(axis=1)
+    """The lines of a scenario's flights, one each."""
+    columns: dict[str, Any] = {name: arrays[f"episode_{name}"] for name in _COLUMNS}
+    waypoints = arrays["episode_waypoints"]
+    # Arrays of several numbers become a column for each of them.
+    columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
     for name, axes in _AXES.items():
-        columns |= {
-            f"{name}_{axis}": values
-            for axis, values in zip(axes, arrays[f"episode_{name}"].T, strict=True)
-        }
+        for axis, values in zip(axes.split(), arrays[f"episode_{name}"].T, strict=True):
+            columns[f"{name}_{axis}"] = values
     for name in ("time_to", "settling_time"):
-        times = zip(arrays["episode_tolerances"], arrays[f"episode_{name}"].T, strict=True)
-        columns |= {f"{name}_{tolerance:g}": values for tolerance, values in times}
+        by_tolerance = zip(arrays["episode_tolerances"], arrays[f"episode_{name}"].T, strict=True)
+        for tolerance, values in by_tolerance:
+            columns[f"{name}_{tolerance:g}"] = values
     columns["overshoot"] = arrays["episode_overshoot"]
-    columns |= {
-        f"waypoint_{number}": values
-        for number, values in enumerate(arrays["episode_waypoints"].T, 1)
-    }
-    return [
-        {"controller": entry.controller, "scenario": entry.scenario, "episode": episode}
-        | {
-            name: str(value)
-            if not isinstance(value, np.floating)
-            else f"{value:.9g}"
-            if np.isfinite(value)
-            else ""
-            for name, value in zip(columns, row, strict=True)
+    for number, values in enumerate(waypoints.T, 1):
+        columns[f"waypoint_{number}"] = values
+    rows = []
+    for episode in range(entry.metrics.n):
+        row: dict[str, Any] = {
+            "controller": entry.controller,
+            "scenario": entry.scenario,
+            "episode": episode,
         }
-        for episode, row in enumerate(zip(*columns.values(), strict=True))
-    ]
+        for name, values in columns.items():
+            row[name] = _written(values[episode])
+        rows.append(row)
+    return rows
+
+
+def _written(value: Any) -> str:
+    # Nine digits tell any two float32 apart; a number that does not exist stays empty.
+    if not isinstance(value, np.floating):
+        return str(value)
+    return f"{value:.9g}" if np.isfinite(value) else ""

@@ -8,55 +8,66 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
 
-Z = 1.959963984540054  # 97.5 % of the normal distribution lie below
+Z = 1.959963984540054  # the 97.5 % quantile of the normal distribution
 RESAMPLES = 1000
+BLOCK = 2**21  # values that a bootstrap holds at once, 16 MiB
 
 
-class Estimate(Frozen):
+class Estimate(Frozen, use_attribute_docstrings=True):
     """A statistic of a sample with its 95 % interval."""
 
     value: float
     low: float
     high: float
-    n: int = Field(description="size of the sample")
+    n: int
+    """size of the sample"""
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
-    """The share of True with Wilson's score interval (Wilson, JASA 22, 1927).
+    """Estimate the share of True with Wilson's score interval (Wilson, JASA 22, 1927).
 
     :param hits: bool, (n,), n at least 1.
     """
     array = np.asarray(hits, dtype=np.bool_)
     n = array.size
     p = float(array.mean())
-    centre, half = p + Z * Z / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
     scale = 1 + Z * Z / n
-    return Estimate(
-        value=p, low=min(p, (centre - half) / scale), high=max(p, (centre + half) / scale), n=n
-    )
+    centre = p + Z * Z / (2 * n)
+    half = Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
+    low = (centre - half) / scale
+    high = (centre + half) / scale
+    return Estimate(value=p, low=min(p, low), high=max(p, high), n=n)
 
 
 def mean(values: npt.ArrayLike) -> Estimate | None:
-    """The mean of the finite values with its bootstrap interval; None if there are none."""
+    """Estimate the mean of the finite values with its bootstrap interval; None without any."""
     array = np.asarray(values, dtype=np.float64)
     finite = array[np.isfinite(array)]
     return bootstrap(finite) if finite.size else None
 
 
 def bootstrap(values: FloatArray, statistic: Callable[..., Any] = np.mean) -> Estimate:
-    """A statistic with the percentile bootstrap's interval (Efron, 1979).
+    """Estimate a statistic with the percentile bootstrap's interval (Efron, 1979).
 
     The same values give the same interval: the resamples are those of a fixed seed.
 
     :param values: finite, (n,), n at least 1.
     :param statistic: a function of an array (..., n) and ``axis``.
     """
-    n, middle = values.size, float(statistic(values, axis=-1))
-    rows = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
-    low, high = np.percentile(statistic(values[rows], axis=-1), [2.5, 97.5])
-    return Estimate(value=middle, low=min(middle, float(low)), high=max(middle, float(high)), n=n)
+    n = values.size
+    value = float(statistic(values, axis=-1))
+    random = np.random.default_rng(0)
+    resampled = np.empty(RESAMPLES)
+    # A million values would make arrays of 7.5 GiB: take as many resamples at once as fit into a
+    # block. The generator draws the same numbers however they are divided.
+    rows = max(1, BLOCK // n)
+    for first in range(0, RESAMPLES, rows):
+        last = min(first + rows, RESAMPLES)
+        chosen = random.integers(0, n, (last - first, n))
+        resampled[first:last] = statistic(values[chosen], axis=-1)
+    low, high = np.percentile(resampled, [2.5, 97.5])
+    return Estimate(value=value, low=min(value, float(low)), high=max(value, float(high)), n=n)

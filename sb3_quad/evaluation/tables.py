@@ -2,14 +2,19 @@
 intervals, or words.
 """
 
+import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape as escape_html
 from typing import Literal
 
+import rich.console
 import rich.table
 from rich.markup import escape
 from rich.text import Text
+
+Align = Literal["left", "right"]
+WIDTH = 200  # characters of a line of a table as plain text, at most
 
 
 @dataclass(frozen=True)
@@ -17,7 +22,7 @@ class Cell:
     """A metric with the ends of its 95 % interval, or words in its place.
 
     :param ends: of the interval; an infinite upper end is an unknown one.
-    :param note: small print beside it.
+    :param note: small print after it.
     :param best: better than all others of its row, and the intervals are apart.
     """
 
@@ -30,13 +35,15 @@ class Cell:
 
     @property
     def number(self) -> str:
-        """The value, with a proper minus sign; empty if there is none."""
+        """The value, with a proper minus sign; empty without a value."""
         return "" if self.value is None else self._rounded(self.value)
 
     @property
     def interval(self) -> str:
         """The interval in words; empty where it is narrower than the last digit."""
-        low, high = ("", "") if self.ends is None else map(self._rounded, self.ends)
+        if self.ends is None:
+            return ""
+        low, high = map(self._rounded, self.ends)
         if low == high:
             return ""
         return f"above {low}" if high == "inf" else f"{low} to {high}"
@@ -44,21 +51,22 @@ class Cell:
     @property
     def text(self) -> str:
         """The number or the words, the interval in brackets, the note."""
-        interval, note = (
-            (f" ({self.interval})" if self.interval else ""),
-            (f", {self.note}" if self.note else ""),
-        )
-        return (self.number or self.words) + interval + note
+        text = self.number or self.words
+        if self.interval:
+            text += f" ({self.interval})"
+        if self.note:
+            text += f", {self.note}"
+        return text
 
     def _rounded(self, value: float) -> str:
-        return f"{round(value, self.decimals) + 0.0:.{self.decimals}f}".replace(
-            "-", "−"
-        )  # + 0.0: zero without a sign
+        # Adding 0.0 turns a negative zero into one without a sign.
+        rounded = round(value, self.decimals) + 0.0
+        return f"{rounded:.{self.decimals}f}".replace("-", "−")
 
 
 @dataclass(frozen=True)
 class Column:
-    """What heads a column of cells.
+    """The head of a column of cells.
 
     :param colour: of the controller it stands for, ``#rrggbb``.
     :param source: where the metrics come from, if they were not measured here.
@@ -67,17 +75,17 @@ class Column:
     name: str
     colour: str = ""
     source: str = ""
-    align: Literal["left", "right"] = "right"
+    align: Align = "right"
 
     @property
     def heading(self) -> str:
-        """The name, the source before it."""
+        """The source and the name."""
         return f"{self.source}: {self.name}" if self.source else self.name
 
 
 @dataclass(frozen=True)
 class Row:
-    """A metric with its unit, and a cell for each column. Without cells it heads the rows below it."""
+    """A metric with its unit, and a cell for each column; without cells it is a heading."""
 
     name: str
     unit: str = ""
@@ -85,7 +93,7 @@ class Row:
 
     @property
     def heading(self) -> str:
-        """The name, the unit after it."""
+        """The name and the unit."""
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
 
@@ -104,22 +112,28 @@ class Table:
     caption: str = ""
 
     def markdown(self) -> str:
-        """The lines of the table; the best of a row is bold. Names of any characters make no HTML."""
+        """Return the lines of the table in Markdown; the best of a row is bold.
+
+        Names are escaped, so that none becomes HTML.
+        """
         lines = [
-            [self.corner, *(column.heading for column in self.columns)],
-            ["---"] * (1 + len(self.columns)),
+            _markdown([self.corner, *self._headings]),
+            _markdown(["---"] * (1 + len(self.columns))),
         ]
         for row in self.rows:
-            lines.append(
-                [
-                    row.heading,
-                    *(f"**{cell.text}**" if cell.best else cell.text for cell in row.cells),
-                ]
-            )
-        return "\n".join(
-            f"| {' | '.join(escape_html(cell.replace('|', '/'), False) for cell in line)} |"
-            for line in lines
-        )
+            texts = [f"**{cell.text}**" if cell.best else cell.text for cell in row.cells]
+            lines.append(_markdown([row.heading, *texts]))
+        return "\n".join(lines)
+
+    @property
+    def _headings(self) -> list[str]:
+        return [column.heading for column in self.columns]
+
+    def __str__(self) -> str:
+        """The table as plain text."""
+        console = rich.console.Console(file=io.StringIO(), width=WIDTH, color_system=None)
+        console.print(self)
+        return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
     def __rich__(self) -> rich.table.Table:
         """The table as ``rich`` prints it; the best of a row is bold."""
@@ -127,29 +141,36 @@ class Table:
             title=escape(self.title) or None, caption=escape(self.caption) or None
         )
         table.title_justify = table.caption_justify = "left"
-        table.show_header = any([self.corner, *(column.heading for column in self.columns)])
+        table.show_header = any([self.corner, *self._headings])
         table.add_column(Text(self.corner), no_wrap=True)
         for column in self.columns:
             table.add_column(Text(column.heading), justify=column.align)
         for row in self.rows:
             if not row.cells:
                 table.add_section()
-            texts = (Text(cell.text, "bold" if cell.best else "") for cell in row.cells)
-            table.add_row(Text(row.heading, "" if row.cells else "bold"), *texts)
+                table.add_row(Text(row.heading, "bold"))
+                continue
+            texts = [Text(cell.text, "bold" if cell.best else "") for cell in row.cells]
+            table.add_row(row.heading, *texts)
         return table
 
 
 def text_table(
-    title: str,
-    heads: Sequence[str],
-    rows: Iterable[Sequence[str]],
-    align: Literal["left", "right"] = "right",
+    title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], align: Align = "right"
 ) -> Table:
-    """A table of words.
+    """Return a table of words.
 
     :param heads: of all columns, that of the rows' names first.
     :param rows: each begins with its name.
     """
     columns = [Column(head, align=align) for head in heads[1:]]
-    filled = [Row(name, "", [Cell(words=text) for text in texts]) for name, *texts in rows]
+    filled = []
+    for name, *texts in rows:
+        filled.append(Row(name, "", [Cell(words=text) for text in texts]))
     return Table(columns, filled, heads[0], title)
+
+
+def _markdown(texts: Iterable[str]) -> str:
+    """A line of a table; the bar that divides its cells may not be in them."""
+    cells = [escape_html(text.replace("|", "/"), False) for text in texts]
+    return f"| {' | '.join(cells)} |"

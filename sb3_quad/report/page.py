@@ -1,12 +1,11 @@
-"""The one maker of pages: sections as ``report.md``, their plots as files, and all of it as one
-file, ``report.html``.
+"""Write pages: sections as ``report.md``, their plots as files, and all of it as one file,
+``report.html``.
 """
 
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jinja2
 
@@ -14,7 +13,9 @@ from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.report.plots import Plot
 
-PAGE, MARKDOWN, PICTURES = "report.html", "report.md", "figures"
+PAGE = "report.html"
+MARKDOWN = "report.md"
+PICTURES = "figures"
 
 
 @dataclass(frozen=True)
@@ -45,38 +46,37 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
     """
     folder = Path(folder)
     write_text(folder / MARKDOWN, _markdown(title, sections))
-    for plot in (plot for section in sections for plot in section.plots):
-        write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
+    for section in sections:
+        for plot in section.plots:
+            write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
     write_text(folder / PAGE, render(title, facts, sections))
     return folder / PAGE
 
 
 def render(title: str, facts: str, sections: Sequence[Section]) -> str:
-    """The page as text, which expects its plots as files in ``figures/``."""
-    loader = jinja2.PackageLoader("sb3_quad.report", "templates")
-    options: Any = {
-        "autoescape": True,
-        "undefined": jinja2.StrictUndefined,
-        "trim_blocks": True,
-        "lstrip_blocks": True,
-    }
-    template = jinja2.Environment(loader=loader, **options).get_template("page.html.j2")
+    """Return the page as text, which expects its plots as files in ``figures/``."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sb3_quad.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    template = environment.get_template("page.html.j2")
     return template.render(title=title, facts=facts, sections=sections, pictures=PICTURES)
 
 
 def _markdown(title: str, sections: Sequence[Section]) -> str:
-    """The tables as text, for the pages of a repository: a heading, what it is about, and a table
-    for each section.
-    """
-    blocks = [f"# {html.escape(title, False)}"]
-    for part in sections:
-        heading, *texts = (
-            html.escape(" ".join(text.split()), False)
-            for text in (part.heading, part.description, part.facts)
-        )
-        blocks += [
-            f"## {heading}",
-            *filter(None, texts),
-            *(table.markdown() for table in part.tables),
-        ]
-    return "\n\n".join(blocks) + "\n"
+    """Return headings, descriptions and tables as text, for the pages of a repository."""
+    blocks = [f"# {_escape(title)}"]
+    for section in sections:
+        texts = (section.heading, section.description, section.facts)
+        heading, *paragraphs = map(_escape, texts)
+        blocks += [f"## {heading}", *paragraphs]
+        blocks += [table.markdown() for table in section.tables]
+    return "\n\n".join(filter(None, blocks)) + "\n"
+
+
+def _escape(text: str) -> str:
+    """Return a text as one line that holds no HTML."""
+    return html.escape(" ".join(text.split()), False)

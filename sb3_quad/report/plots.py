@@ -1,6 +1,4 @@
-"""How the plots of a page look, which matplotlib draws, and how they come into the page and into
-files.
-"""
+"""The style of a page's plots, and their way into the page and into files."""
 
 import io
 import re
@@ -16,18 +14,17 @@ from matplotlib.figure import Figure
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.statistics import Estimate
 
-INK, QUIET, GRID, PAPER = (
-    "#1c2430",
-    "#5c6672",
-    "#dfe3e8",
-    "#ffffff",
-)  # of text, small print, grid and background
-WIDTH, HEIGHT = (
-    5.0,
-    3.3,
-)  # inches: two stand side by side in the page, and one can be read on a telephone
+INK = "#1c2430"  # of text
+QUIET = "#5c6672"  # of small print
+GRID = "#dfe3e8"
+PAPER = "#ffffff"  # of the background
+# Inches: two stand side by side in the page, and one can be read on a telephone.
+WIDTH = 5.0
+HEIGHT = 3.3
 DPI = 150
-LETTERS = 13  # of a legend, per inch
+# A legend takes an inch for so many letters, and each name has a mark of so many before it.
+LETTERS = 13
+MARK = 8
 POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
 STYLE: Any = {
     "font.size": 9,
@@ -48,9 +45,8 @@ STYLE: Any = {
     **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), QUIET),
 }
 styled = matplotlib.rc_context(STYLE)
-METADATA: Any = dict.fromkeys(
-    ("Date", "Creator", "Format", "Type")
-)  # left out: the same results give the same file
+# None removes these from the file, so that the same results give the same bytes.
+METADATA: Any = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,25 +64,22 @@ class Plot:
 
     @property
     def inline(self) -> str:
-        """The plot as a part of the page: an ``svg`` element in the page's colours, which may be
-        dark.
-        """
+        """The plot as an ``svg`` element in the page's colours, which may be dark."""
         text = picture(self.figure, "svg", bbox_inches="tight", metadata=METADATA).decode("utf-8")
         text = text[text.index("<svg") :]
         for colour, name in ((INK, "ink"), (QUIET, "quiet"), (GRID, "grid"), (PAPER, "paper")):
             text = text.replace(colour, f"var(--{name})")
-        text = re.sub(
-            r' id="[a-zA-Z0-9]+_\d+"', "", text
-        )  # names of groups, which others have, too
-        return re.sub(
-            r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text
-        )  # to 0.01 of a point
+        # Groups have the same names in every plot, and names must be unique in a page.
+        text = re.sub(r' id="[a-zA-Z0-9]+_\d+"', "", text)
+        # Paths to 0.01 of a point keep the page small.
+        return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text)
 
 
 @styled
 def picture(figure: Figure, kind: str, **options: Any) -> bytes:
-    """A figure of matplotlib as a file of some kind, such as ``png``; ``options`` are those of its
-    ``savefig``.
+    """Return a figure of matplotlib as a file of some kind, such as ``png``.
+
+    :param options: of the figure's ``savefig``.
     """
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, **options)
@@ -94,17 +87,18 @@ def picture(figure: Figure, kind: str, **options: Any) -> bytes:
 
 
 def legend(figure: Figure) -> None:
-    """Every name in the figure, once outside of its axes, in as many columns as have room."""
-    pairs = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in figure.axes]
-    found = {name: handle for pair in pairs for handle, name in pair}
-    room = (
-        LETTERS * figure.get_figwidth() / (max(map(len, found), default=0) + 8)
-    )  # 8: the mark before a name
-    figure.legend([*found.values()], [*found], loc="outside upper left", ncols=max(1, int(room)))
+    """Write every name in the figure once, outside of its axes, in as many columns as have room."""
+    handles = {}
+    for axes in figure.axes:
+        for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles[name] = handle
+    longest = max(map(len, handles), default=0) + MARK
+    columns = max(1, int(LETTERS * figure.get_figwidth() / longest))
+    figure.legend([*handles.values()], [*handles], loc="outside upper left", ncols=columns)
 
 
 def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
-    """A figure as wide as one of two side by side, and its axes."""
+    """Return a figure of the width of one of two side by side, and its axes."""
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     axes = figure.subplots()
     axes.set(xlabel=x_label, ylabel=y_label)
@@ -112,16 +106,17 @@ def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 
 def interval_ends(estimates: Sequence[Estimate | None], factor: float = 1.0) -> FloatArray:
-    """Values and both ends of their intervals, (3, n); NaN where there is none."""
-    rows = [
-        [each and getattr(each, name) for each in estimates] for name in ("value", "low", "high")
-    ]
-    return factor * np.array(rows, dtype=np.float64)
+    """Return values and both ends of their intervals, (3, n); NaN for None."""
+    ends = np.full((3, len(estimates)), np.nan)
+    for column, estimate in enumerate(estimates):
+        if estimate is not None:
+            ends[:, column] = estimate.value, estimate.low, estimate.high
+    return factor * ends
 
 
 def band(
     axes: Axes, colour: str, label: str, x: FloatArray, ends: FloatArray, **style: Any
 ) -> None:
-    """A line and the band around it; ``ends`` are values, low and high, (3, n)."""
+    """Draw a line and the band around it; ``ends`` are values, low and high, (3, n)."""
     axes.plot(x, ends[0], color=colour, label=label, **{"linewidth": 1.6, **style})
     axes.fill_between(x, ends[1], ends[2], color=colour, alpha=0.16, linewidth=0)

@@ -34,13 +34,14 @@ from sb3_quad.report.scenario_plots import (
 from sb3_quad.simulation.settings import in_words
 
 OVERVIEW = (
-    "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, within 0.25 m and tilted by at"
-    " most 10°. Survival: it neither touches the ground nor leaves the range. Where a scenario is varied: least to greatest."
+    "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, within"
+    " 0.25 m and tilted by at most 10°. Survival: it neither touches the ground nor leaves the"
+    " range. Where a scenario is varied, you see the least and the greatest share."
 )
 SMALL_PRINT = (
-    "Small numbers are 95 % intervals, Wilson's for shares, bootstrap for means; they are left out where they are narrower"
-    " than the last digit. Bold: better than all others of the row, with the intervals apart; times and rewards are compared"
-    " only where no flight is lost."
+    "Small numbers are 95 % intervals, Wilson's for shares, bootstrap for means; an interval"
+    " narrower than the last digit is not shown. Bold: better than all others of the row, with the"
+    " intervals apart; times and rewards are compared only where no flight is lost."
 )
 
 
@@ -61,94 +62,121 @@ def write_report(folder: str | Path, overwrite: bool = False) -> Path:
 
 
 def facts(results: Results) -> str:
-    """What was flown, when and by which version, and how to read the numbers."""
+    """Return how many flights there are, when and by which version, and how to read numbers."""
     flights = sum(entry.metrics.n for entry in results.entries)
     backends = " and ".join(sorted({entry.backend for entry in results.entries}))
-    dates = sorted({entry.date for entry in results.entries} - {""})
-    about = f"{results.description.rstrip('.')}. " if results.description else ""
-    return (
-        f"{about}{flights:,} flights of {len(results.controllers)} controllers in {len(results.scenarios)}"
-        f" scenarios, {backends} backend, flown {' to '.join(dict.fromkeys([*dates[:1], *dates[-1:]]))} by sb3_quad"
-        f" {results.package_version}. {SMALL_PRINT}"
-    )
+    dates = {entry.date for entry in results.entries}
+    days = " to ".join(sorted({min(dates), max(dates)}))
+    sentences = [
+        f"{flights:,} flights of {len(results.controllers)} controllers in"
+        f" {len(results.scenarios)} scenarios, {backends} backend, flown {days} by sb3_quad"
+        f" {results.package_version}.",
+        SMALL_PRINT,
+    ]
+    # Only evaluations with an own reward have a row of it.
+    if results.reward:
+        sentences.insert(1, f"Own reward: {results.reward}.")
+    if results.description:
+        sentences.insert(0, f"{results.description.rstrip('.')}.")
+    return " ".join(sentences)
 
 
 def sections(results: Results, folder: str | Path) -> list[Section]:
-    """All sections of a folder of results.
+    """Return all sections of a folder of results.
 
     :raises ConfigError: a missing or damaged file.
     """
     colours = colours_of([record.label for record in results.controllers])
     groups = scenario_groups(results)
-    shares = [
-        _share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)
-    ]
-    parts = [
-        Section(
-            "overview", "Success and survival", OVERVIEW, [table for table in shares if table.rows]
-        )
-    ]
+    shares = []
+    for row in (SUCCESS, SURVIVAL):
+        table = _share_table(row, results, groups, colours, row.heading)
+        if table.rows:
+            shares.append(table)
+    parts = [Section("overview", "Success and survival", OVERVIEW, shares)]
     for heading, scenarios in groups:
-        first, each_of = scenarios[0], ""
-        if first.group is None:
-            measured = [measured_cells(results, label, first) for label in colours]
-            rows = metric_rows(first, measured, first.reference.values())
-            tables = [Table(_columns(colours, first.reference, results.source), rows)]
-            plots: Sequence[Plot] = _scenario_plots(results, first, colours, folder)
+        if scenarios[0].group is None:
+            parts.append(_scenario_section(results, heading, scenarios[0], colours, folder))
         else:
-            each_of = f" in each of {len(scenarios)} cells"
-            tables, plots = [], group_plots(results, scenarios, colours)
-            if len(first.cell) == 1:
-                cells = [
-                    (f"{value:g}", [scenario])
-                    for scenario in scenarios
-                    for value in scenario.cell.values()
-                ]
-                corner = f"{axis_label(next(iter(first.cell)), first)}: success (%)"
-                tables.append(_share_table(SUCCESS, results, cells, colours, corner))
-        how = (
-            f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
-            f"observation noise {in_words(first.noise)}; seed {first.seed}."
+            parts.append(_group_section(results, heading, scenarios, colours))
+    rows = []
+    for record in results.controllers:
+        rows.append(
+            (record.label, record.spec, record.algorithm or "", (record.content or "")[:12])
         )
-        parts.append(
-            Section(first.group or first.name, heading, first.description, tables, plots, how)
-        )
-    known = [
-        (each.label, each.spec, each.algorithm or "", (each.content or "")[:12])
-        for each in results.controllers
-    ]
-    table = text_table("", ("name", "controller", "algorithm", "SHA-256"), known, align="left")
-    parts.append(Section("controllers", "Controllers", tables=[table]))
+    heads = ("name", "controller", "algorithm", "SHA-256")
+    parts.append(
+        Section("controllers", "Controllers", tables=[text_table("", heads, rows, align="left")])
+    )
     if results.failures:
-        failures = [
-            (each.controller, each.scenario or "", each.message) for each in results.failures
-        ]
-        table = text_table("", ("controller", "scenario", "what happened"), failures, align="left")
+        lines = []
+        for failure in results.failures:
+            lines.append((failure.controller, failure.scenario or "", failure.message))
+        table = text_table("", ("controller", "scenario", "what happened"), lines, align="left")
         parts.append(Section("failures", "Failures", tables=[table]))
     return parts
+
+
+def _scenario_section(
+    results: Results,
+    heading: str,
+    scenario: Scenario,
+    colours: Mapping[str, str],
+    folder: str | Path,
+) -> Section:
+    measured = [measured_cells(results, label, scenario) for label in colours]
+    rows = metric_rows(scenario, measured, scenario.reference.values())
+    table = Table(_columns(colours, scenario.reference, results.source), rows)
+    plots = _scenario_plots(results, scenario, colours, folder)
+    how = f"{scenario.episodes} flights of each controller, {_conditions(scenario)}"
+    return Section(scenario.name, heading, scenario.description, [table], plots, how)
+
+
+def _group_section(
+    results: Results, heading: str, scenarios: Sequence[Scenario], colours: Mapping[str, str]
+) -> Section:
+    first = scenarios[0]
+    tables = []
+    # A grid of several quantities has too many cells for a table.
+    if len(first.cell) == 1:
+        cells = []
+        for scenario in scenarios:
+            (value,) = scenario.cell.values()
+            cells.append((f"{value:g}", [scenario]))
+        corner = f"{axis_label(next(iter(first.cell)), first)}: success (%)"
+        tables.append(_share_table(SUCCESS, results, cells, colours, corner))
+    how = (
+        f"{first.episodes} flights of each controller in each of {len(scenarios)} cells,"
+        f" {_conditions(first)}"
+    )
+    plots = group_plots(results, scenarios, colours)
+    return Section(first.group or first.name, heading, first.description, tables, plots, how)
+
+
+def _conditions(scenario: Scenario) -> str:
+    noise = in_words(scenario.noise)
+    return f"{scenario.duration:g} s; observation noise {noise}; seed {scenario.seed}."
 
 
 def _scenario_plots(
     results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path
 ) -> list[Plot]:
-    found = {label: results.entry(label, scenario.name) for label in colours}
-    entries = {label: entry for label, entry in found.items() if entry is not None}
-    tracks = {label: read_tracks(Path(folder) / entry.flights) for label, entry in entries.items()}
-    recorded = [
-        ControllerFlights(label, colours[label], each) for label, each in tracks.items() if each
-    ]
-    plots = [paths_plot(scenario, recorded)] if recorded else []
-    if (
-        entries
-        and scenario.target.waypoints is None
-        and scenario.target.distance != 0.0
-        and len(scenario.tolerances) > 2
-    ):
-        plots.append(
-            arrivals_plot(
-                scenario, {label: entry.metrics for label, entry in entries.items()}, colours
-            )
-        )
+    metrics = {}
+    recorded = []
+    for label, colour in colours.items():
+        entry = results.entry(label, scenario.name)
+        if entry is not None:
+            metrics[label] = entry.metrics
+            tracks = read_tracks(Path(folder) / entry.flights)
+            if tracks:
+                recorded.append(ControllerFlights(label, colour, tracks))
+    plots = []
+    # Controllers that failed have no flights to draw.
+    if recorded:
+        plots.append(paths_plot(scenario, recorded))
+    has_way = scenario.target.waypoints is None and scenario.target.distance != 0.0
+    if metrics and has_way and len(scenario.tolerances) > 2:
+        plots.append(arrivals_plot(scenario, metrics, colours))
     if recorded:
         plots.append(errors_plot(scenario, recorded))
     return plots
@@ -157,42 +185,45 @@ def _scenario_plots(
 def _share_table(
     row: Row,
     results: Results,
-    groups: Sequence[tuple[str, Sequence[Scenario]]],
+    groups: Iterable[tuple[str, Sequence[Scenario]]],
     colours: Mapping[str, str],
     corner: str,
 ) -> Table:
-    """Success or survival in each group of scenarios; where there are several in one, from the
-    worst to the best.
-    """
-    references = [scenarios[0].reference for _, scenarios in groups]
-    others = dict.fromkeys(
-        name for given in references for name in given if row in reference_cells(given[name])
-    )
-    rows = []
-    for (heading, scenarios), given in zip(groups, references, strict=True):
+    """Success or survival in each group of scenarios; of several, from the worst to the best."""
+    lines = {}
+    others: dict[str, None] = {}
+    for heading, scenarios in groups:
         own = mark_best(row, [_share(row, results, label, scenarios) for label in colours])
-        beside = [
-            reference_cells(given[name]).get(row, Cell()) if name in given else Cell()
-            for name in others
-        ]
+        given = {}
+        for name, reference in scenarios[0].reference.items():
+            given[name] = reference_cells(reference).get(row, Cell())
+            if given[name] != Cell():
+                others[name] = None
         if any(cell != Cell() for cell in own):
-            rows.append(Row(heading, "", [*own, *beside]))
+            lines[heading] = own, given
+    # The columns of references are known only now.
+    rows = []
+    for heading, (own, given) in lines.items():
+        rows.append(Row(heading, "", [*own, *(given.get(name, Cell()) for name in others)]))
     return Table(_columns(colours, others, results.source), rows, corner)
 
 
 def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
-    found = [measured_cells(results, label, scenario) for scenario in scenarios]
-    shares = [cells.get(row, Cell()) for cells in found if cells is not None]
-    if not shares:
-        return Cell(words="failed")
-    if len(scenarios) == 1:
-        return shares[0]
-    values = [share.value for share in shares if share.value is not None]
-    return Cell(words=f"{min(values):.0f} to {max(values):.0f}") if values else Cell()
+    """The share of a controller in some scenarios; of several, the least and the greatest."""
+    shares = []
+    cell = Cell(words="failed")
+    for scenario in scenarios:
+        cells = measured_cells(results, label, scenario)
+        if cells is not None:
+            cell = cells[row]
+            shares.append(cell.value or 0.0)
+    if len(scenarios) == 1 or not shares:
+        return cell
+    return Cell(words=f"{min(shares):.0f} to {max(shares):.0f}")
 
 
 def _columns(colours: Mapping[str, str], others: Iterable[str], source: str) -> list[Column]:
-    return [
-        *(Column(*each) for each in colours.items()),
-        *(Column(name, source=source) for name in others),
-    ]
+    columns = [*map(Column, colours.keys(), colours.values())]
+    for name in others:
+        columns.append(Column(name, source=source))
+    return columns

@@ -23,6 +23,7 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_csv, write_text
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
+from sb3_quad.evaluation.metric_tables import estimate_cell
 from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.curves import plot_curves
@@ -276,9 +277,7 @@ def _rows(record: RunRecord) -> list[dict[str, Any]]:
 
 def _cell(estimate: Estimate | None, measure: str) -> Cell:
     _, factor, decimals = ROWS[measure]
-    if estimate is None:
-        return Cell()
-    return Cell(factor * estimate.value, (factor * estimate.low, factor * estimate.high), decimals)
+    return estimate_cell(estimate, factor, decimals, none="")
 
 
 def write_report(

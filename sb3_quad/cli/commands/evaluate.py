@@ -22,6 +22,8 @@ examples:
   sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
   # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
+  # the mean of your own reward next to the task's
+  sb3-quad evaluate pid agent.zip --reward my_package.rewards:calm
   # the same episodes on PyBullet
   sb3-quad evaluate pid --suite quick --backend pybullet
   # two scenarios with another vehicle
@@ -64,6 +66,11 @@ def add_arguments(parser: Parser) -> None:
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--workers", type=whole, default=1, help="number of parallel processes (1)")
     add("--overwrite", action="store_true", help="remove the results that the folder holds")
+    add(
+        "--reward",
+        metavar="MODULE:FUNCTION",
+        help="show the mean of a reward of your own, function(state, actions) per control step",
+    )
     add("--report", default=True, help="update report.html and its plots (yes)", **YES_OR_NO)
     add_common(parser, "executor", "trust", "progress")
 
@@ -92,10 +99,11 @@ def run(options: argparse.Namespace) -> int:
             options.backend,
             options.workers,
             options.overwrite,
-            show,
-            warn,
-            options.executor,
-            options.address,
+            progress=show,
+            report=warn,
+            executor=options.executor,
+            address=options.address,
+            reward=options.reward,
         )
     # The folder may hold the results of further controllers, from an earlier command.
     flown = {entry.controller for entry in results.entries}

@@ -22,10 +22,9 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 
 PANELS = ("success", "survival", "reward", "losses")
-# The scenario of each task in the suite "thesis".
-THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}
 
 
 def add_arguments(parser: Parser) -> None:
@@ -46,9 +45,9 @@ def add_arguments(parser: Parser) -> None:
     )
     add(
         "--thesis",
-        choices=[*THESIS],
+        choices=[*THESIS_SCENARIOS],
         metavar="TASK",
-        help=f"draw the thesis's results for {' or '.join(THESIS)} as horizontal lines",
+        help=f"draw the thesis's results for {' or '.join(THESIS_SCENARIOS)} as horizontal lines",
     )
     add(
         "--show",
@@ -99,16 +98,15 @@ def run(options: argparse.Namespace) -> int:
     kind = Path(options.output).suffix.removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
         raise ConfigError(f"--output {options.output}: must end in .png, .svg or .pdf")
-    show = options.show
-    lines: dict[str, Any] = {}
-    if options.thesis:
-        # The thesis calls survival success.
-        show = show or ["survival", "reward"]
-        scenario = load_suite("thesis").scenario(THESIS[options.thesis])
+    lines = {}
+    if options.thesis:  # its success is our survival
+        scenario = load_suite("thesis").scenario(THESIS_SCENARIOS[options.thesis])
         for name, reference in scenario.reference.items():
-            numbers = reference.model_dump(include={"survival", "reward"}, exclude_none=True)
-            lines[f"thesis: {name}"] = numbers
-    lines.update(options.line)
+            lines[f"thesis: {name}"] = reference.model_dump(
+                include={"survival", "reward"}, exclude_none=True
+            )
+    show = options.show or (["survival", "reward"] if options.thesis else [])
+    curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
     refuse_existing(options.output, options.overwrite)
     curves = plot_curves(groups, lines, options.title, show)
     write_bytes(options.output, picture(curves, kind, dpi=130))

@@ -1,4 +1,4 @@
-"""Suites of scenarios from YAML files: those of the package by name, one's own by path.
+"""Suites of scenarios from YAML files: those of the package by name, your own by path.
 
 With ``vary``, one scenario is written down and a grid of them is flown, for heat maps and sweeps.
 """
@@ -18,37 +18,37 @@ from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 from sb3_quad.vehicles.vehicle import VEHICLES
 
 SUITES = YamlFolder("suite", "sb3_quad.evaluation.scenarios.suites")
-UNITS = dict(
-    {
-        "tilt": "deg",
-        "velocity": "m/s",
-        "body_rates": "rad/s",
-        "force": "N",
-        "torque": "N m",
-        "distance": "m",
-        "start": "s",
-    },
-    **dict.fromkeys(("mass", "inertia", "motor_gain"), "× the vehicle's own"),
-    delay="control steps",
-    thrust_to_weight="greatest thrust by weight",
-    torque_to_inertia="rad/s²",
-    motor_time_constant="s",
-    noise="relative std",
-    factor="× the wrench",
-    gusts="std, N",
-    wind="m/s",
-    wind_gusts="std, m/s",
-    duration="s",
-)
-WEIGHTS = {
-    "force": "weights",
-    "torque": "weights × arm length",
-}  # units of wrenches whose unit is weight
+OF_VEHICLE = "× the vehicle's own"
+UNITS = {
+    "tilt": "deg",
+    "velocity": "m/s",
+    "body_rates": "rad/s",
+    "force": "N",
+    "torque": "N m",
+    "distance": "m",
+    "start": "s",
+    "duration": "s",
+    "factor": "× the wrench",
+    "mass": OF_VEHICLE,
+    "inertia": OF_VEHICLE,
+    "motor_gain": OF_VEHICLE,
+    "delay": "control steps",
+    "thrust_to_weight": "greatest thrust by weight",
+    "torque_to_inertia": "rad/s²",
+    "motor_time_constant": "s",
+    "noise": "relative std",
+    "gusts": "std, N",
+    "wind": "m/s",
+    "wind_gusts": "std, m/s",
+}
+# The units of wrenches with `unit: weight`.
+WEIGHTS = {"force": "weights", "torque": "weights × arm length"}
+# Parts of a key that its short name does not need.
 _SILENT = {"magnitude", "std", "value"}
 
 
 def load_suite(source: str | Path) -> Suite:
-    """A suite by name (``"thesis"``) or by the path of a YAML file.
+    """Read a suite by name (``"thesis"``) or by the path of a YAML file.
 
     :raises ConfigError: an unknown name, a missing or unreadable file, an unknown key (the nearest
         valid one is named), or a value that is impossible: a target below ground, say.
@@ -58,7 +58,7 @@ def load_suite(source: str | Path) -> Suite:
 
 
 def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
-    """A suite from YAML text.
+    """Read a suite from YAML text.
 
     :param where: what messages call the text.
     :param folder: what the paths of vehicle files are relative to.
@@ -72,69 +72,84 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         )
     scenarios: list[Scenario] = []
     for number, entry in enumerate(entries):
-        place, vehicle = f"{where}: scenario {entry.get('name', number)}", entry.get("vehicle")
+        place = f"{where}: scenario {entry.get('name', number)}"
+        vehicle = entry.get("vehicle")
         if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
-            entry = {**entry, "vehicle": str(folder / vehicle)}
-        scenarios += [validate(Scenario, cell, place) for cell in expand(entry, place)]
+            entry["vehicle"] = str(folder / vehicle)
+        # A cell of a grid is a scenario like any other.
+        for cell in grid(entry, place):
+            scenarios.append(validate(Scenario, cell, place))
     return validate(Suite, {**data, "scenarios": scenarios}, where)
 
 
-def expand(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
-    """The scenarios that one entry of a suite stands for: itself, or a cell for each combination of
-    ``vary``'s values.
+def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
+    """Return the scenarios of one entry: a cell for each combination of the values in ``vary``.
+
+    Without ``vary`` it is the entry alone.
 
     :param entry: as YAML gives it; ``vary`` maps keys such as ``start.attitude.tilt`` to lists of
         numbers.
-    :raises ConfigError: ``vary`` is no such mapping, or names no place in the entry.
+    :raises ConfigError: ``vary`` is not such a mapping, or names no place in the entry.
     """
-    plain = {key: value for key, value in entry.items() if key != "vary"}
     if "vary" not in entry:
-        return [plain]
-    if not isinstance(entry["vary"], Mapping) or not entry["vary"]:
+        return [dict(entry)]
+    plain = dict(entry)
+    axes = plain.pop("vary")
+    if not isinstance(axes, Mapping) or not axes:
         raise ConfigError(
             f"{where}: vary must map keys to lists of numbers, such as 'noise: [0, 0.05, 0.1]'"
         )
-    axes = {str(key): values for key, values in entry["vary"].items()}
     for key, values in axes.items():
-        numbers = isinstance(values, list) and all(
-            type(each) in (int, float) and math.isfinite(each) for each in values
-        )
-        if not numbers or not values or len(set(values)) != len(values):
+        if not _are_different_numbers(values):
             raise ConfigError(
                 f"{where}: vary.{key} must be a list of different numbers, not {values!r}"
             )
     cells = []
     for values in itertools.product(*axes.values()):
-        cell, varied = copy.deepcopy(plain), dict(zip(axes, values, strict=True))
-        for key, value in varied.items():
+        # Keys may lead into nested parts, which the cells must not share.
+        cell = copy.deepcopy(plain)
+        cell["cell"] = dict(zip(map(str, axes), values, strict=True))
+        titles = []
+        for key, value in cell["cell"].items():
             put_key(cell, key, value, f"{where}: vary.{key}")
-        title = ", ".join(f"{axis_name(key)} {value:g}" for key, value in varied.items())
-        cell["title"] = f"{plain.get('title') or plain.get('name')}: {title}"
-        cell["group"] = plain.get("name")
-        cell["name"] = f"{plain.get('name')}.{'_'.join(f'{value:g}' for value in values)}"
-        cell["cell"] = varied
+            titles.append(f"{axis_name(key)} {value:g}")
+        name = plain.get("name")
+        cell["group"] = name
+        cell["title"] = f"{plain.get('title') or name}: {', '.join(titles)}"
+        cell["name"] = f"{name}.{'_'.join(map('{:g}'.format, values))}"
         cells.append(cell)
     return cells
 
 
+def _are_different_numbers(values: Any) -> bool:
+    if not isinstance(values, list) or not values:
+        return False
+    for value in values:
+        # A bool is an int to Python, but no number to a reader.
+        if type(value) not in (int, float) or not math.isfinite(value):
+            return False
+    return len(set(values)) == len(values)
+
+
 def axis_name(key: str) -> str:
-    """The short name of a varied key: ``start.body_rates.magnitude`` is ``body_rates``."""
+    """Return the short name of a varied key: ``start.body_rates.magnitude`` is ``body_rates``."""
     parts = [part for part in key.split(".") if part not in _SILENT and not part.isdigit()]
     return parts[-1]
 
 
 def axis_label(key: str, scenario: Scenario | None = None) -> str:
-    """The name of a varied key with its unit, as the axes of plots carry it.
+    """Return the name of a varied key with its unit, for the axes of plots.
 
-    :param scenario: one of those that vary, which says the unit of its wrenches; None: they are in
-        SI units.
+    :param scenario: one of those that vary, which says the unit of its wrenches; None: SI.
     """
     name = axis_name(key)
-    words, unit = name.replace("_", " "), UNITS.get(name)
-    if (
-        name in WEIGHTS
-        and scenario is not None
-        and scenario.wrenches[int(key.split(".")[1])].unit == "weight"
-    ):
-        unit = WEIGHTS[name]
-    return f"{words} ({unit})" if unit else words
+    unit = UNITS.get(name)
+    # The unit of a wrench may differ from scenario to scenario.
+    if name in WEIGHTS and scenario is not None and key.startswith("wrenches."):
+        wrench = scenario.wrenches[int(key.split(".")[1])]
+        if wrench.unit == "weight":
+            unit = WEIGHTS[name]
+    label = name.replace("_", " ")
+    if unit is not None:
+        label += f" ({unit})"
+    return label

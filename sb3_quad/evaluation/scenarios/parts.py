@@ -1,10 +1,11 @@
-"""What a scenario is made of: start, target, wrenches, the vehicle's changes. Units SI, angles in
-degrees where said.
+"""The parts of a scenario: start, target, wrenches, the vehicle's changes. SI units, angles in
+degrees where they say so.
 """
 
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
 
 from sb3_quad.base.errors import unknown
@@ -16,10 +17,8 @@ Frame = Literal["world", "body"]
 Factor = Annotated[float, Field(ge=0.1, le=10)]
 
 
-class OneOf(Frozen):
-    """A part with several ways to be given, of which a file uses exactly one; a list alone is the
-    first way.
-    """
+class OneOf(Frozen, use_attribute_docstrings=True):
+    """A part with several ways to give it; a file uses exactly one. A list is the first way."""
 
     ways: ClassVar[tuple[str, ...]]
 
@@ -38,7 +37,7 @@ class OneOf(Frozen):
 
 
 class VectorDistribution(OneOf):
-    """A vector: fixed, written as ``[x, y, z]``, or sampled anew for each episode.
+    """A vector: fixed, written as ``[x, y, z]``, or sampled for each episode.
 
     ``{std: 2}`` is normal in each component, ``{magnitude: 3}`` has that length and a uniformly
     random direction.
@@ -46,15 +45,12 @@ class VectorDistribution(OneOf):
 
     ways = ("value", "std", "magnitude")
 
-    value: Vector | None = Field(
-        default=None, description="the vector itself, in the unit of what it is for"
-    )
-    std: NonNegativeFloat | None = Field(
-        default=None, description="standard deviation of each component, in the same unit"
-    )
-    magnitude: NonNegativeFloat | None = Field(
-        default=None, description="length, in the same unit; the direction is random"
-    )
+    value: Vector | None = None
+    """the vector itself, in the unit of the quantity"""
+    std: NonNegativeFloat | None = None
+    """standard deviation of each component, in the same unit"""
+    magnitude: NonNegativeFloat | None = None
+    """length, in the same unit; the direction is random"""
 
     @property
     def largest(self) -> float:
@@ -63,11 +59,9 @@ class VectorDistribution(OneOf):
         """
         if self.value is not None:
             return math.hypot(*self.value)
-        return (
-            self.magnitude
-            if self.magnitude is not None
-            else 3.0 * math.sqrt(3.0) * (self.std or 0.0)
-        )
+        if self.magnitude is not None:
+            return self.magnitude
+        return 3.0 * math.sqrt(3.0) * (self.std or 0.0)
 
 
 ZERO = VectorDistribution(value=(0.0, 0.0, 0.0))
@@ -80,16 +74,12 @@ class Attitude(OneOf):
 
     ways = ("quaternion", "tilt", "distribution")
 
-    quaternion: tuple[float, float, float, float] | None = Field(
-        default=None, description="w, x, y, z, body to world; is normalised"
-    )
-    tilt: Annotated[float, Field(ge=0, le=180)] | None = Field(
-        default=None,
-        description="angle between body z and world z, deg; about a random horizontal axis",
-    )
-    distribution: Literal["uniform"] | None = Field(
-        default=None, description="uniform on SO(3), as in state recovery"
-    )
+    quaternion: tuple[float, float, float, float] | None = None
+    """w, x, y, z, body to world; is normalised"""
+    tilt: Annotated[float, Field(ge=0, le=180)] | None = None
+    """angle between body z and world z, deg; about a random horizontal axis"""
+    distribution: Literal["uniform"] | None = None
+    """uniform on SO(3), as in state recovery"""
 
     @model_validator(mode="before")
     @classmethod
@@ -99,9 +89,8 @@ class Attitude(OneOf):
         if data == "uniform":
             return {"distribution": "uniform"}
         if isinstance(data, str):
-            raise ValueError(
-                f"{unknown('attitude', data, ('level', 'uniform'))}, or {{quaternion: …}}, or {{tilt: …}}"
-            )
+            names = unknown("attitude", data, ("level", "uniform"))
+            raise ValueError(f"{names}, or {{quaternion: …}}, or {{tilt: …}}")
         return data
 
     @field_validator("quaternion")
@@ -114,30 +103,26 @@ class Attitude(OneOf):
         return value
 
 
-class Start(Frozen):
+class Start(Frozen, use_attribute_docstrings=True):
     """Where and how an episode starts; rotors turn at hover speed."""
 
-    position: Vector = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
-    attitude: Attitude = Field(
-        default=Attitude(tilt=0.0), description="level, uniform, {quaternion: …} or {tilt: deg}"
-    )
-    velocity: VectorDistribution = Field(
-        default=ZERO, description="m/s: [x, y, z], {std: …} or {magnitude: …}"
-    )
-    velocity_frame: Frame = Field(
-        default="world", description="world or body: the axes of velocity"
-    )
-    body_rates: VectorDistribution = Field(
-        default=ZERO, description="body frame, rad/s: given as velocity is"
-    )
+    position: Vector = (0.0, 0.0, 15.0)
+    """r0, world frame, m"""
+    attitude: Attitude = Attitude(tilt=0.0)
+    """level, uniform, {quaternion: …} or {tilt: deg}"""
+    velocity: VectorDistribution = ZERO
+    """m/s: [x, y, z], {std: …} or {magnitude: …}"""
+    velocity_frame: Frame = "world"
+    """world or body: the axes of velocity"""
+    body_rates: VectorDistribution = ZERO
+    """body frame, rad/s: given as velocity is"""
 
     @model_validator(mode="after")
     def _turnable(self) -> "Start":
-        if self.velocity_frame == "body" and (
-            self.velocity.value is None or self.attitude.distribution is not None
-        ):
+        fixed = self.velocity.value is not None and self.attitude.distribution is None
+        if self.velocity_frame == "body" and not fixed:
             raise ValueError(
-                "velocity_frame: body goes with a fixed velocity and an attitude that is not uniform"
+                "velocity_frame: body needs a fixed velocity and an attitude that is not uniform"
             )
         return self
 
@@ -149,77 +134,65 @@ class Target(OneOf):
 
     ways = ("position", "distance", "waypoints")
 
-    position: Vector | None = Field(default=None, description="r_T, world frame, m")
-    distance: NonNegativeFloat | None = Field(
-        default=None,
-        description="from the start in a uniformly random direction above ground, m; 0: the start itself",
-    )
-    waypoints: tuple[Vector, ...] | None = Field(
-        default=None, min_length=1, description="targets one after the other, world frame, m"
-    )
-    radius: PositiveFloat | None = Field(
-        default=None, description="a waypoint counts as reached within this, m (0.5)"
-    )
+    position: Vector | None = None
+    """r_T, world frame, m"""
+    distance: NonNegativeFloat | None = None
+    """from the start in a uniformly random direction above ground, m; 0: the start itself"""
+    waypoints: tuple[Vector, ...] | None = Field(default=None, min_length=1)
+    """targets one after the other, world frame, m"""
+    radius: PositiveFloat | None = None
+    """a waypoint counts as reached within this, m (0.5)"""
 
     @property
     def points(self) -> tuple[Vector, ...]:
         """The fixed targets, in order; none if the target is random."""
-        return (
-            self.waypoints
-            if self.waypoints is not None
-            else ()
-            if self.position is None
-            else (self.position,)
-        )
+        if self.position is not None:
+            return (self.position,)
+        return self.waypoints or ()
 
 
-class Wrench(Frozen):
-    """An external force and torque at the centre of mass for some time; those that overlap add up."""
+class Wrench(Frozen, use_attribute_docstrings=True):
+    """An external force and torque at the centre of mass for some time; several add up."""
 
-    start: NonNegativeFloat = Field(default=0.0, description="when it begins, s")
-    duration: PositiveFloat | None = Field(
-        default=None, description="how long it acts, s; left out: to the end"
-    )
-    force: VectorDistribution = Field(
-        default=ZERO, description="N, or as unit says: [x, y, z], {std: …} or {magnitude: …}"
-    )
-    torque: VectorDistribution = Field(
-        default=ZERO, description="N m, or as unit says: as force is given"
-    )
-    unit: Literal["SI", "weight"] = Field(
-        default="SI",
-        description="weight: force in weights m g of the vehicle, torque in weights times its arm length",
-    )
-    factor: float = Field(
-        default=1.0, description="multiplies force and torque alike; to vary the size of a hit"
-    )
-    force_frame: Frame = Field(default="world", description="world or body: the axes of force")
-    torque_frame: Frame = Field(default="body", description="world or body: the axes of torque")
+    start: NonNegativeFloat = 0.0
+    """when it begins, s"""
+    duration: PositiveFloat | None = None
+    """how long it acts, s; default: to the end"""
+    force: VectorDistribution = ZERO
+    """N, or as unit says: [x, y, z], {std: …} or {magnitude: …}"""
+    torque: VectorDistribution = ZERO
+    """N m, or as unit says: as force is given"""
+    unit: Literal["SI", "weight"] = "SI"
+    """weight: force in weights m g of the vehicle, torque in weights times its arm length"""
+    factor: float = 1.0
+    """multiplies force and torque alike; to vary the size of a hit"""
+    force_frame: Frame = "world"
+    """world or body: the axes of force"""
+    torque_frame: Frame = "body"
+    """world or body: the axes of torque"""
 
     def units(self, vehicle: Vehicle) -> tuple[float, float]:
         """The units of force, N, and torque, N m, on a vehicle before its changes."""
         weight = vehicle.mass * vehicle.gravity
-        return (weight, weight * vehicle.arm_length) if self.unit == "weight" else (1.0, 1.0)
+        if self.unit == "SI":
+            return 1.0, 1.0
+        return weight, weight * vehicle.arm_length
 
 
-class VehicleChanges(Frozen):
-    """How the vehicle that flies differs from the one its controller was made for; motors and
-    limits stay what they are.
+class VehicleChanges(Frozen, use_attribute_docstrings=True):
+    """Differences of the vehicle that flies from the one its controller was made for.
+
+    Motors and limits stay as they are.
     """
 
-    mass: Factor = Field(
-        default=1.0, description="is a factor: 1.3 is 30 % more; thrust limits in N stay"
-    )
-    inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
-        default=1.0, description="factor of Ixx, Iyy and Izz, or one for each"
-    )
-    motor_gain: Factor = Field(
-        default=1.0, description="is a factor of k_m (Eq. 4.1): 1.3 is 30 % more"
-    )
-    delay: Annotated[int, Field(ge=0, le=100)] | None = Field(
-        default=None,
-        description="control steps from a command to its effect; left out: the vehicle's own",
-    )
+    mass: Factor = 1.0
+    """is a factor: 1.3 is 30 % more; thrust limits in N stay"""
+    inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = 1.0
+    """factor of Ixx, Iyy and Izz, or one for each"""
+    motor_gain: Factor = 1.0
+    """is a factor of k_m (Eq. 4.1): 1.3 is 30 % more"""
+    delay: Annotated[int, Field(ge=0, le=100)] | None = None
+    """control steps from a command to its effect; default: the vehicle's own"""
 
     def apply(self, vehicle: Vehicle) -> Vehicle:
         """The changed vehicle.
@@ -232,14 +205,11 @@ class VehicleChanges(Frozen):
         """
         if self == VehicleChanges():
             return vehicle
-        factors = (self.inertia,) * 3 if isinstance(self.inertia, float) else self.inertia
         low, high = vehicle.thrust_limits
         return vehicle.model_copy(
             update={
                 "mass": vehicle.mass * self.mass,
-                "inertia": tuple(
-                    own * factor for own, factor in zip(vehicle.inertia, factors, strict=True)
-                ),
+                "inertia": tuple((np.array(vehicle.inertia) * self.inertia).tolist()),
                 "thrust_limits": (low / self.mass, high / self.mass),
                 "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
                 "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,

@@ -1,5 +1,5 @@
-"""What happens in the episodes of a scenario, sampled from their seeds; the same for every
-controller and backend.
+"""Sample the events of a scenario's episodes from their seeds, the same for every controller and
+backend.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,12 +19,11 @@ Generators = Sequence[np.random.Generator]  # one for each episode
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What happens to n episodes whoever flies them.
+    """The events of n episodes, whoever flies them.
 
-    :param start: what replaces the environments' own sample: any of position, quaternion, velocity,
+    :param start: replaces the environments' own sample: any of position, quaternion, velocity,
         body_rates, target; (n, 3) or (n, 4).
-    :param wrenches: from the control steps before which the external wrench changes to the new one,
-        (n, WRENCH_SIZE).
+    :param wrenches: by control step, the external wrench from that step on, (n, WRENCH_SIZE).
     :param waypoints: targets one after the other, (W, 3), m; ``start`` holds the first as its
         target.
     :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
@@ -37,13 +36,15 @@ class Plan:
 
 
 def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
-    """What happens in some episodes of a scenario, beyond what its task samples.
+    """Sample the events of some episodes of a scenario, beyond those that its task samples.
 
     :param seeds: of the episodes, (n,).
     """
     generators = [np.random.default_rng([SCENARIO_STREAM, seed]) for seed in seeds]
-    attitude, target = scenario.start.attitude, scenario.target
+    attitude = scenario.start.attitude
+    target = scenario.target
     start: dict[str, FloatArray] = {}
+    # The task samples uniform attitudes and normal velocities itself.
     if attitude.distribution is None:
         start["quaternion"] = _quaternions(attitude, generators)
     for name in ("velocity", "body_rates"):
@@ -51,17 +52,14 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
         if distribution.std is None:
             start[name] = _vectors(distribution, generators)
     if scenario.start.velocity_frame == "body":
-        start["velocity"] = np.einsum(
-            "nij,nj->ni", rotation_matrices(start["quaternion"]), start["velocity"]
-        )
+        rotation = rotation_matrices(start["quaternion"])
+        start["velocity"] = np.einsum("nij,nj->ni", rotation, start["velocity"])
     if target.points:
         start["target"] = np.tile(np.array(target.points[0]), (len(seeds), 1))
-    wrenches = sample_wrenches(
-        scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators
-    )
+    vehicle = scenario.nominal_vehicle()
     return Plan(
         start,
-        wrenches,
+        sample_wrenches(scenario.wrenches, vehicle, scenario.steps, generators),
         np.array(target.waypoints or np.zeros((0, 3))),
         target.radius or Plan.radius,
     )
@@ -70,42 +68,44 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
 def sample_wrenches(
     wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, generators: Generators
 ) -> dict[int, FloatArray]:
-    """The sum of some wrenches over the time of n episodes, as a :class:`Plan` holds it.
+    """Sum some wrenches over the time of n episodes, for a :class:`Plan`.
 
-    :param vehicle: gives the control step, and weights their size.
+    :param vehicle: its control step divides the time, and its weight is the unit of some wrenches.
     :param steps: control steps of an episode.
     """
     acting = []
+    times = set[int]()
     for wrench in wrenches:
+        # A wrench acts for whole control steps, at least one.
         first = round(wrench.start / vehicle.control_step)
-        length = (
-            steps
-            if wrench.duration is None
-            else max(1, round(wrench.duration / vehicle.control_step))
-        )
+        last = first + steps
+        if wrench.duration is not None:
+            last = first + max(1, round(wrench.duration / vehicle.control_step))
         newton, newton_metre = wrench.units(vehicle)
-        vectors = (
-            newton * _vectors(wrench.force, generators),
-            newton_metre * _vectors(wrench.torque, generators),
-        )
-        values = make_wrench(*vectors, wrench.force_frame, wrench.torque_frame).T
-        acting.append((first, first + length, wrench.factor * values))
-    times = sorted({time for first, last, _ in acting for time in (first, last) if time < steps})
-    none = np.zeros((len(generators), WRENCH_SIZE))
-    return {
-        time: sum((values for first, last, values in acting if first <= time < last), none)
-        for time in times
-    }
+        force = newton * _vectors(wrench.force, generators)
+        torque = newton_metre * _vectors(wrench.torque, generators)
+        values = make_wrench(force, torque, wrench.force_frame, wrench.torque_frame).T
+        acting.append((first, last, wrench.factor * values))
+        times |= {first, last}
+    # The sum changes only where a wrench begins or ends.
+    sums = {}
+    for time in sorted(times):
+        if time < steps:
+            sums[time] = np.zeros((len(generators), WRENCH_SIZE))
+            for first, last, values in acting:
+                if first <= time < last:
+                    sums[time] = sums[time] + values
+    return sums
 
 
 def _vectors(distribution: VectorDistribution, generators: Generators) -> FloatArray:
     if distribution.value is not None:
         return np.tile(np.array(distribution.value), (len(generators), 1))
-    if distribution.magnitude is None:
-        return (distribution.std or 0.0) * _normals(generators, 3)
-    return distribution.magnitude * (
-        _directions(generators, 3) if distribution.magnitude else np.zeros((len(generators), 3))
-    )
+    if distribution.std is not None:
+        return distribution.std * _normals(generators, 3)
+    if not distribution.magnitude:
+        return np.zeros((len(generators), 3))
+    return distribution.magnitude * _directions(generators, 3)
 
 
 def _quaternions(attitude: Attitude, generators: Generators) -> FloatArray:
@@ -113,9 +113,10 @@ def _quaternions(attitude: Attitude, generators: Generators) -> FloatArray:
     if attitude.quaternion is not None:
         quaternion = np.array(attitude.quaternion)
         return np.tile(quaternion / np.linalg.norm(quaternion), (n, 1))
-    half = np.deg2rad(attitude.tilt or 0.0) / 2.0
-    if half == 0.0:
+    if not attitude.tilt:
         return np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    # A turn by the tilt about a random horizontal axis.
+    half = np.deg2rad(attitude.tilt) / 2.0
     axis = _directions(generators, 2)
     return np.column_stack([np.full(n, np.cos(half)), np.sin(half) * axis, np.zeros(n)])
 

@@ -1,6 +1,5 @@
 """A scenario: one way to judge a controller, flown many times; and a suite of them."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -18,117 +17,93 @@ from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
-TOLERANCES = (
-    0.05,
-    0.1,
-    0.2,
-    0.3,
-    0.4,
-    0.5,
-    0.6,
-    0.7,
-    0.8,
-    0.9,
-    1.0,
-)  # m: Figs. 4.6 and 4.7, and below
+# m: those of Figs. 4.6 and 4.7, and a tighter one.
+TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
 DEFAULT_VEHICLE = "itm"
 NumberOrRange = float | tuple[float, float]
 
 
-class Reference(Frozen):
-    """What others measured, printed beside our own metrics; a pair is a range."""
+class Reference(Frozen, use_attribute_docstrings=True):
+    """Metrics that others measured, printed next to our own; a pair is a range."""
 
-    success: NumberOrRange | None = Field(
-        default=None, description="share of flights that end at their target, 0 to 1"
-    )
-    survival: NumberOrRange | None = Field(
-        default=None, description="share that neither crash nor get lost: the thesis's success"
-    )
-    reward: NumberOrRange | None = Field(default=None, description="mean per episode")
-    time_to: dict[str, NumberOrRange | None] = Field(
-        default_factory=dict,
-        description="from tolerances in m to mean times in s; null: never within it",
-    )
-    path: NumberOrRange | None = Field(default=None, description="mean path, m")
-    final_error: NumberOrRange | None = Field(default=None, description="|r - r_T| at the end, m")
-    flown: NumberOrRange | None = Field(default=None, description="until the flight ended, s")
-    recovery_time: NumberOrRange | None = Field(
-        default=None, description="until the vehicle was stable again, s"
-    )
-    note: str = Field(default="", description="what the source says in words")
+    success: NumberOrRange | None = None
+    """share of flights that end at their target, 0 to 1"""
+    survival: NumberOrRange | None = None
+    """share that neither crash nor leave the range: the thesis's success"""
+    reward: NumberOrRange | None = None
+    """mean per episode"""
+    time_to: dict[str, NumberOrRange | None] = Field(default_factory=dict)
+    """from tolerances in m to mean times in s; null: never within it"""
+    path: NumberOrRange | None = None
+    """mean path, m"""
+    final_error: NumberOrRange | None = None
+    """|r - r_T| at the end, m"""
+    flown: NumberOrRange | None = None
+    """until the flight ended, s"""
+    recovery_time: NumberOrRange | None = None
+    """until the vehicle was stable again, s"""
+    note: str = ""
+    """the source's own words"""
 
     @field_validator("time_to", mode="before")
     @classmethod
     def _as_text(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             raise ValueError("must map tolerances in m to times in s")
-        return {
-            f"{key:g}" if isinstance(key, float) else str(key): time for key, time in value.items()
-        }
+        # Text, since JSON has no numbers as keys.
+        return {f"{key:g}" if type(key) is float else str(key): value[key] for key in value}
 
 
-class Scenario(Frozen):
-    """What is flown, how often, and what others measured there. Units m, s, rad, N, N m, kg."""
+class Scenario(Frozen, use_attribute_docstrings=True):
+    """One way to judge a controller: the episodes, their number, and others' metrics.
 
-    name: str = Field(pattern=NAME, description="letters, digits, _ . -; unique in its suite")
-    title: str = Field(default="", description="heading of tables and plots; left out: the name")
-    description: str = Field(default="", description="what it is, and where it comes from")
-    start: Start = Field(
-        default=Start(), description="where an episode starts; left out: hovering at (0, 0, 15) m"
-    )
-    target: Target = Field(
-        default=Target(distance=0.0), description="where to fly; left out: to the start"
-    )
-    wrenches: tuple[Wrench, ...] = Field(default=(), description="external forces and torques")
-    noise: Noise | Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.05,
-        description="relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}",
-    )
-    duration: Annotated[float, Field(gt=0, le=600)] = Field(
-        default=15.0, description="of an episode; the unit is s"
-    )
-    max_distance: PositiveFloat = Field(
-        default=30.0, description="farther than this from the target ends an episode, m"
-    )
-    vehicle: str | Vehicle | None = Field(
-        default=None,
-        description="name, or path of a YAML file (relative to the suite's); left out: the agent's own, or itm",
-    )
-    vehicle_changes: VehicleChanges = Field(
-        default=VehicleChanges(), description="unknown to the controller"
-    )
-    vehicles: VehicleDistribution | None = Field(
-        default=None,
-        description="each episode has a vehicle of it, unknown to the controller, such as {distribution: raptor}",
-    )
-    randomize: Randomization | None = Field(
-        default=None,
-        description="what differs by episode, unknown to the controller, such as {gusts: {std: 1}}",
-    )
-    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
-        default=240, description="how many are flown"
-    )
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(
-        default=0, description="from which every episode gets its own"
-    )
-    tolerances: tuple[PositiveFloat, ...] = Field(
-        default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m"
-    )
-    reference: dict[str, Reference] = Field(
-        default_factory=dict, description="from a column's title to others' metrics"
-    )
-    group: str | None = Field(
-        default=None, description="the scenario that this one is a cell of; set by vary"
-    )
-    cell: dict[str, float] = Field(
-        default_factory=dict, description="this cell's values, by key; set by vary"
-    )
+    Units m, s, rad, N, N m, kg.
+    """
+
+    name: str = Field(pattern=NAME)
+    """letters, digits, _ . -; unique in its suite"""
+    title: str = ""
+    """heading of tables and plots; default: the name"""
+    description: str = ""
+    """what it tests, and its source"""
+    start: Start = Start()
+    """where an episode starts; default: hovering at (0, 0, 15) m"""
+    target: Target = Target(distance=0.0)
+    """where to fly; default: to the start"""
+    wrenches: tuple[Wrench, ...] = ()
+    """external forces and torques"""
+    noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
+    """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
+    duration: Annotated[float, Field(gt=0, le=600)] = 15.0
+    """of an episode; the unit is s"""
+    max_distance: PositiveFloat = 30.0
+    """farther than this from the target ends an episode, m"""
+    vehicle: str | Vehicle | None = None
+    """name, or path of a YAML file (relative to the suite's); default: the agent's own, or itm"""
+    vehicle_changes: VehicleChanges = VehicleChanges()
+    """unknown to the controller"""
+    vehicles: VehicleDistribution | None = None
+    """each episode has one of these, unknown to the controller, such as {distribution: raptor}"""
+    randomize: Randomization | None = None
+    """what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"""
+    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 240
+    """number of episodes"""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """every episode derives its own from it"""
+    tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1)
+    """of arrival, |r - r_T|, m"""
+    reference: dict[str, Reference] = Field(default_factory=dict)
+    """from a column's title to others' metrics"""
+    group: str | None = None
+    """the scenario that this one is a cell of; set by vary"""
+    cell: dict[str, float] = Field(default_factory=dict)
+    """this cell's values, by key; set by vary"""
 
     @field_validator("vehicle")
     @classmethod
     def _read(cls, value: str | Vehicle | None) -> str | Vehicle | None:
-        # From here on, no file matters.
+        # Load the file now; nothing below reads it again.
         return load_vehicle(value) if isinstance(value, str) and VEHICLES.is_path(value) else value
 
     @field_validator("tolerances")
@@ -139,8 +114,11 @@ class Scenario(Frozen):
     @model_validator(mode="after")
     def _possible(self) -> "Scenario":
         vehicle = self.flown_vehicle()
-        vehicle = self.vehicles.weakest(vehicle) if self.vehicles is not None else vehicle
+        # Of a distribution, the vehicle that can do least decides.
+        if self.vehicles is not None:
+            vehicle = self.vehicles.weakest(vehicle)
         self._check_way(vehicle)
+        # The task checks the ranges of its own fields.
         try:
             _ = self.task
         except ValidationError as error:
@@ -157,11 +135,14 @@ class Scenario(Frozen):
         for number, wrench in enumerate(self.wrenches):
             if wrench.duration is not None and wrench.duration < step * (1 - 1e-9):
                 raise ValueError(
-                    f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control step, {step:g} s"
+                    f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control"
+                    f" step, {step:g} s"
                 )
             if wrench.start >= self.duration:
-                over = f"when the episode of {self.duration:g} s is over"
-                raise ValueError(f"wrenches.{number}: starts at {wrench.start:g} s, {over}")
+                raise ValueError(
+                    f"wrenches.{number}: starts at {wrench.start:g} s, when the episode of"
+                    f" {self.duration:g} s is over"
+                )
         return self
 
     def nominal_vehicle(self) -> Vehicle:
@@ -169,26 +150,22 @@ class Scenario(Frozen):
 
         :raises ConfigError: it cannot be loaded.
         """
-        return (
-            self.vehicle
-            if isinstance(self.vehicle, Vehicle)
-            else _by_name(self.vehicle or DEFAULT_VEHICLE)
-        )
+        if isinstance(self.vehicle, Vehicle):
+            return self.vehicle
+        return _by_name(self.vehicle or DEFAULT_VEHICLE)
 
     def flown_by(self, own: Any) -> "Scenario":
-        """The scenario with an agent's ``own`` vehicle (None: it has none), unless it names one
-        itself.
+        """Return the scenario with an agent's vehicle, unless it names one itself.
+
+        :param own: the agent's vehicle, or several; None: it has none.
 
         :raises ConfigError: it is impossible for that vehicle.
         """
         if own is None or self.vehicle is not None:
             return self
         vehicle = first_vehicle(own)
-        return validate(
-            Scenario,
-            {**self.model_dump(), "vehicle": vehicle},
-            f"scenario {self.name}, flown by {vehicle.name}",
-        )
+        where = f"scenario {self.name}, flown by {vehicle.name}"
+        return validate(Scenario, {**self.model_dump(), "vehicle": vehicle}, where)
 
     def flown_vehicle(self) -> Vehicle:
         """The vehicle that flies, changes included.
@@ -200,9 +177,8 @@ class Scenario(Frozen):
         try:
             return self.vehicle_changes.apply(nominal)
         except ValidationError as error:
-            raise ValueError(
-                f"vehicle_changes: no such vehicle can fly ({explain(error, Vehicle)})"
-            ) from None
+            reason = explain(error, Vehicle)
+            raise ValueError(f"vehicle_changes: no such vehicle can fly ({reason})") from None
 
     def episode_seeds(self) -> list[int]:
         """The seeds of the episodes, for ``reset(seed=…)`` of one environment."""
@@ -220,9 +196,7 @@ class Scenario(Frozen):
 
     @property
     def task(self) -> Task:
-        """What the environments sample themselves, so that random targets and attitudes are those
-        of training.
-        """
+        """The task that samples random targets and attitudes, as in training."""
         elsewhere = self.target.distance or any(
             point != self.start.position for point in self.target.points
         )
@@ -239,7 +213,7 @@ class Scenario(Frozen):
 
     @property
     def flown_as(self) -> FlightSettings:
-        """How the episodes are flown."""
+        """The settings of the episodes."""
         return FlightSettings(
             task=self.task,
             vehicle=self.flown_vehicle(),
@@ -251,73 +225,67 @@ class Scenario(Frozen):
 
     @property
     def physical_limit(self) -> float | None:
-        """The least mean time, s, after which the vehicle could stay within 0.1 m of its targets;
-        None: it is not known.
-        """
-        if (
-            self.start != Start()
-            or self.wrenches
-            or self.randomize
-            or self.vehicles
-            or 0.1 not in self.tolerances
-        ):
+        """The least possible mean settling time (0.1 m) of the vehicle, s; None: unknown."""
+        # It is known of undisturbed flights from the tasks' own start.
+        changed = self.start != Start() or self.wrenches or self.randomize or self.vehicles
+        if changed or 0.1 not in self.tolerances:
             return None
         return (self.flown_vehicle().time_optimal or {}).get(self.target.distance or 0.0)
 
     @property
     def is_fixed(self) -> bool:
-        """Whether every episode has the same start, target and wrenches, so that only noise tells
-        them apart.
-        """
+        """Whether all episodes have one start, target and wrench, and differ only in noise."""
         vectors = [self.start.velocity, self.start.body_rates]
-        vectors += [vector for wrench in self.wrenches for vector in (wrench.force, wrench.torque)]
+        for wrench in self.wrenches:
+            vectors += [wrench.force, wrench.torque]
+        for vector in vectors:
+            if vector.value is None and vector.largest > 0.0:
+                return False
         attitude = self.start.attitude
-        random = (
-            attitude.distribution,
-            attitude.tilt,
-            self.target.distance,
-            self.randomize,
-            self.vehicles,
-        )
-        return not any(random) and all(
-            vector.value is not None or vector.largest == 0.0 for vector in vectors
-        )
+        random = [attitude.distribution, attitude.tilt, self.target.distance]
+        return not any([*random, self.randomize, self.vehicles])
 
     def _check_way(self, vehicle: Vehicle) -> None:
-        """See that start and targets lie above ground, within ``max_distance`` of each other."""
-        start, points, least = self.start.position, self.target.points, vehicle.collision_radius
-        for place, point in (("start.position", start), *(("target", point) for point in points)):
+        """Check that start and targets lie above ground, within ``max_distance`` of each other."""
+        least = vehicle.collision_radius
+        distance = self.target.distance or 0.0
+        place, before = "start.position", self.start.position
+        for point in (before, *self.target.points):
             if point[2] <= least:
                 raise ValueError(
                     f"{place}: {list(point)} touches the ground; z must exceed {least:g} m"
                 )
-        legs = list(itertools.starmap(math.dist, itertools.pairwise([start, *points]))) or [
-            self.target.distance or 0.0
-        ]
-        if max(legs) > self.max_distance:
-            limit = f"an episode ends beyond max_distance {self.max_distance:g} m"
-            raise ValueError(f"target: {max(legs):.3g} m away, and {limit}")
+            distance = max(distance, math.dist(before, point))
+            place, before = "target", point
+        if distance > self.max_distance:
+            raise ValueError(
+                f"target: {distance:.3g} m away, and an episode ends beyond max_distance"
+                f" {self.max_distance:g} m"
+            )
 
 
-class Suite(Frozen):
+class Suite(Frozen, use_attribute_docstrings=True):
     """Scenarios that belong together."""
 
-    name: str = Field(pattern=NAME, description="what the suite is called")
-    description: str = Field(default="", description="what it is for")
-    source: str = Field(
-        default="reference", description="where the reference comes from; heads its column"
-    )
+    name: str = Field(pattern=NAME)
+    """letters, digits, _ . -"""
+    description: str = ""
+    """its purpose"""
+    source: str = "reference"
+    """where the reference comes from; heads its column"""
     scenarios: tuple[Scenario, ...] = Field(min_length=1)
 
     def scenario(self, name: str) -> Scenario:
-        """The scenario of that name.
+        """Return the scenario of a name.
 
-        :raises ConfigError: there is none.
+        :raises ConfigError: an unknown name.
         """
-        scenarios = {scenario.name: scenario for scenario in self.scenarios}
-        if name not in scenarios:
-            raise ConfigError(unknown("scenario", name, scenarios))
-        return scenarios[name]
+        names = []
+        for scenario in self.scenarios:
+            if scenario.name == name:
+                return scenario
+            names.append(scenario.name)
+        raise ConfigError(unknown("scenario", name, names))
 
     def with_changes(
         self,
@@ -326,48 +294,49 @@ class Suite(Frozen):
         seed: int | None = None,
         vehicle: str | None = None,
     ) -> "Suite":
-        """A suite with some of these scenarios, other numbers of episodes or seeds, or another
-        vehicle.
+        """Return a suite of some of these scenarios, with other numbers, seeds or another vehicle.
 
         :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
-        :param vehicle: name, or path of a YAML file, that flies all scenarios; forces and torques
-            stay what they are, in N and N m, and references, which are of another vehicle, go.
+        :param vehicle: name, or path of a YAML file, that flies all scenarios. Forces and torques
+            stay the same, in N and N m; references, which are of another vehicle, are removed.
         :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible
             for the vehicle.
         """
-        known = {
-            name
-            for scenario in self.scenarios
-            for name in (scenario.name, scenario.group)
-            if name is not None
-        }
+        known = set[str]()
+        for scenario in self.scenarios:
+            known |= {scenario.name, scenario.group or scenario.name}
         for name in names:
             if name not in known:
                 raise ConfigError(unknown("scenario", name, known))
-        changes: dict[str, Any] = {"episodes": episodes, "seed": seed}
-        changes = {key: value for key, value in changes.items() if value is not None}
+        changes: dict[str, Any] = {}
+        flown_by = ""
+        if episodes is not None:
+            changes["episodes"] = episodes
+        if seed is not None:
+            changes["seed"] = seed
         if vehicle is not None:
             changes |= {"vehicle": vehicle, "reference": {}}
+            flown_by = f", flown by {vehicle}"
         changed = []
         for scenario in self.scenarios:
-            if names and scenario.name not in names and scenario.group not in names:
-                continue
-            where = f"scenario {scenario.name}" + (
-                "" if vehicle is None else f", flown by {vehicle}"
-            )
-            changed.append(validate(Scenario, {**scenario.model_dump(), **changes}, where))
+            if not names or scenario.name in names or scenario.group in names:
+                where = f"scenario {scenario.name}{flown_by}"
+                changed.append(validate(Scenario, {**scenario.model_dump(), **changes}, where))
         return self.model_copy(update={"scenarios": tuple(changed)})
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = [scenario.name for scenario in self.scenarios]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
+        names = set[str]()
+        for scenario in self.scenarios:
+            if scenario.name in names:
+                raise ValueError(
+                    f"scenarios: {scenario.name!r} is there twice; names must be unique"
+                )
+            names.add(scenario.name)
         return self
 
 
 @cache
 def _by_name(vehicle: str) -> Vehicle:
-    """A vehicle of the package, read once: suites have many scenarios."""
+    """Load a vehicle of the package, once for the many scenarios of a suite."""
     return load_vehicle(vehicle)

@@ -1,0 +1,96 @@
+"""``compare``: all fly the same episodes, each agent as it was trained; the numbers are those of
+``fly``.
+"""
+
+import numpy as np
+import pytest
+
+from sb3_quad import PIDExpert, env_kwargs, load_pretrained, pretrained
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
+from sb3_quad.evaluation.compare import compare
+from sb3_quad.evaluation.flights import fly, fly_settings
+from sb3_quad.simulation.settings import FlightSettings
+
+
+def hover(observation):
+    return np.zeros((len(observation), 4), dtype=np.float32)
+
+
+def action_cost(state, actions):
+    return -np.square(actions).sum(axis=1)
+
+
+def test_each_flies_as_it_was_trained_through_the_same_episodes():
+    controllers = {
+        "hover": hover,
+        "agent": "crazyflie-recovery",
+        "zip": pretrained("crazyflie-recovery"),
+        "model": load_pretrained("crazyflie-recovery"),
+        "other": "itm-robust",
+        "PID": "pid",
+        "object": PIDExpert("crazyflie"),
+    }
+    result = compare(controllers, ["state_recovery"], n_flights=6, seed=3, reward=action_cost)
+    metrics = {label: result[label]["state_recovery"] for label in controllers}
+    assert metrics["agent"] == metrics["zip"] == metrics["model"] != metrics["other"]
+    # Those that do not say how they fly take the vehicle of the first agent.
+    assert metrics["PID"] == metrics["object"]
+    for label, name in (("agent", "crazyflie-recovery"), ("other", "itm-robust")):
+        settings = FlightSettings(task="state_recovery", **env_kwargs(name))
+        flights = fly_settings(load_pretrained(name), settings, row_seeds(3, 6), reward=action_cost)
+        assert metrics[label].reward.value == pytest.approx(flights.reward.mean(), abs=1e-12)
+        assert metrics[label].own_reward.value == pytest.approx(
+            flights.own_reward.mean(), abs=1e-12
+        )
+    pid = fly(PIDExpert("crazyflie"), "state_recovery", 6, 3, vehicle="crazyflie")
+    assert metrics["PID"].reward.value == pytest.approx(pid.reward.mean(), abs=1e-12)
+    assert "hover flies crazyflie" in result.tables[0].caption
+    assert "other flies itm" in result.tables[0].caption
+
+
+def test_settings_for_all_override_those_of_the_agents():
+    controllers = {"agent": "crazyflie-recovery", "PID": "pid"}
+    result = compare(
+        controllers, n_flights=4, seed=1, vehicle="itm", noise=0.0, max_episode_steps=50
+    )
+    pid = fly(PIDExpert(), "target_tracking", 4, 1, noise=0.0, max_steps=50)
+    assert result["PID"]["target_tracking"].reward.value == pytest.approx(pid.reward.mean())
+    assert [*result["agent"]] == ["target_tracking", "state_recovery"]
+    assert "true state" in result.tables[0].title and "flies" not in result.tables[0].caption
+
+
+def test_a_comparison_is_plain_text_and_a_table_in_notebooks():
+    mixture = {"target_tracking": 1, "state_recovery": 3}
+    result = compare(
+        {"still": hover, "PID": "pid"}, ["target_tracking", mixture], 4, reward=action_cost
+    )
+    text = str(result)
+    for part in (
+        "target_tracking: 4 fresh",
+        "75% state_recovery",
+        "survival, %",
+        "mean own reward",
+    ):
+        assert part in text
+    assert "\x1b" not in text
+    assert result._repr_markdown_().count("| mean reward |") == 2
+    thesis = compare({"PID": "pid"}, ["target_tracking"], 2, thesis_columns=["expert"])
+    assert "thesis: expert" in str(thesis) and "thesis" not in text
+
+
+@pytest.mark.parametrize(
+    ("controllers", "keywords", "message"),
+    [
+        ({"PID": "pidd"}, {}, "did you mean 'pid'"),
+        ({"PID": "pid"}, {"vehicel": "itm"}, "did you mean 'vehicle'"),
+        ({"PID": "pid"}, {"tasks": ["recovery"]}, "unknown task 'recovery'"),
+        ({"PID": "pid"}, {"n_flights": 0}, "n_flights is 0, must be at least 1"),
+        ({}, {}, "give at least one controller"),
+        ({"PID": "pid"}, {"reward": "no_such_module:reward"}, "reward no_such_module:reward"),
+        ({"gone": "missing.zip"}, {}, "missing.zip: no such file"),
+    ],
+)
+def test_bad_input_is_named(controllers, keywords, message):
+    with pytest.raises(ConfigError, match=message):
+        compare(controllers, **keywords)
