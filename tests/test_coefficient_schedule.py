@@ -13,8 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.training.config import build_config
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import train
 
 NUMBER = st.floats(-1e3, 1e3)

@@ -133,7 +133,7 @@ def folder(tmp_path_factory, trained_runs):
 
 
 def shorter(content):
-    """Settings with one small rollout and small grids; no requirement and no trim, which an agent
+    """Settings with one small rollout and small grids; no requirement and no offset correction, which an agent
     of one rollout fails.
     """
     if not isinstance(content, dict):
@@ -142,14 +142,7 @@ def shorter(content):
         key: shorter(value)
         for key, value in content.items()
         if key
-        not in (
-            "require",
-            "correct_offset",
-            "position_scale",
-            "overshoot_cost",
-            "correction_env_kwargs",
-            "correction_rounds",
-        )
+        not in ("require", "correct_offset")
     }
     if isinstance(kept.get("vary"), dict):
         kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}

@@ -19,11 +19,22 @@ from sb3_quad.cli.commands.train import DEFAULT_PIPELINE, THESIS
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.training.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
-from sb3_quad.training.config import SETTINGS, build_config, check_environment, load_config
-from sb3_quad.training.job import TrainingJob, describe
+from sb3_quad.training.algorithms import (
+    ALGORITHMS,
+    constructor_parameters,
+    convert,
+    get_algorithm,
+    takes_whole,
+)
+from sb3_quad.training.config import (
+    SETTINGS,
+    TrainingJob,
+    build_config,
+    check_environment,
+    describe,
+    load_config,
+)
 from sb3_quad.training.pipeline import load_pipeline
-from sb3_quad.training.values import convert, takes_whole
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}
@@ -145,7 +156,7 @@ def test_unknown_names_come_with_the_nearest():
         check_environment("QuadStateRecovry-v0")
     with pytest.raises(ConfigError, match=r"did you mean 'thesis/dagger.yml'"):
         load_config("dagger", ENV, "thesis/dager.yml")
-    with pytest.raises(ConfigError, match="learns from no expert"):
+    with pytest.raises(ConfigError, match="does not learn from an expert"):
         build("ppo", expert="pid")
     with pytest.raises(ConfigError, match="no batched form"):
         build("ppo", "Pendulum-v1", vec_env="batch")

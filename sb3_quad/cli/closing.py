@@ -15,7 +15,7 @@ from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.compare import SCENARIOS, task_table
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
 from sb3_quad.training.trainer import TrainingResult

@@ -17,8 +17,7 @@ from sb3_quad.base.files import locked
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli import main
 from sb3_quad.training import snapshots
-from sb3_quad.training.config import build_config
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import resume, train
 
 ENV = "QuadTargetTracking-v0"

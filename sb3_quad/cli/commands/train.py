@@ -131,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.cli.closing import close_pipeline, close_run
     from sb3_quad.cli.output import shows_progress
     from sb3_quad.training import pipeline as stages
-    from sb3_quad.training.job import TrainingJob, describe
+    from sb3_quad.training.config import TrainingJob, describe
     from sb3_quad.training.trainer import resume, train
 
     if options.thesis and (options.conf_file or options.resume):
