@@ -192,7 +192,7 @@ class _Evaluations:
     def __init__(self, env: VecEnv, path: Path) -> None:
         self.env = env
         self.path = path
-        self.rows: dict[str, list[Any]] = {}
+        self.rows: dict[str, Any] = {}
 
     def read(self, n_episodes: int) -> None:
         """Continue the file, if it exists.

@@ -23,6 +23,7 @@ from sb3_quad.algorithms.offset_correction import (
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
+from sb3_quad.callbacks.progress import ProgressLine
 from sb3_quad.cli import main
 from sb3_quad.cli.parser import PAIRS
 from sb3_quad.controllers.pretrained import load_pretrained
@@ -81,6 +82,24 @@ def quiet(line):
 
 def policy(path):
     return PPO.load(path).policy.state_dict()
+
+
+def test_lines_say_how_far_the_pipeline_is_unless_a_bar_does(tmp_path, job, monkeypatch):
+    monkeypatch.setattr(
+        "sb3_quad.training.trainer.ProgressLine", partial(ProgressLine, seconds=0.0)
+    )
+    lines = []
+    result = run_pipeline(tiny(tmp_path), job, "stages", lines.append)
+    stages = [line for line in lines if line.startswith("stage ")]
+    assert [line.split(" on ")[0] for line in stages] == [
+        "stage 1 of 2, one: dagger",
+        "stage 2 of 2, two: ppo_bc",
+    ]
+    assert sum("256 of 256 timesteps (100 %)" in line for line in lines) == 2
+    assert result.exit_code == 0
+    lines.clear()
+    run_pipeline(tiny(tmp_path), {**job, "progress": True}, "stages", lines.append)
+    assert lines and not [line for line in lines if "of 256 timesteps (" in line]
 
 
 def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):

@@ -4,7 +4,6 @@ import inspect
 import math
 import pkgutil
 import typing
-from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -28,7 +27,6 @@ ALGORITHMS = {
 }
 # A training job gives these itself, so they are no settings of an algorithm.
 _SET_BY_JOB = (
-    "self",
     "policy",
     "env",
     "expert",
@@ -65,37 +63,23 @@ def takes_expert(algorithm: type[BaseAlgorithm]) -> bool:
     return "expert" in inspect.signature(algorithm.__init__).parameters
 
 
-def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
-    """Return the keywords of an algorithm's constructor that its settings may give.
+def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
+    """Return the keywords of a constructor, an algorithm's or a policy's, that settings may give.
 
-    The annotation of each is a type. It is Any where there is none, or where a name in the
-    annotations cannot be resolved.
+    Each annotation is a type. It is Any where an annotation is missing or has a name that cannot be
+    resolved.
     """
     # SB3's GymEnv holds "VecEnv" as a string, which only some of its modules can resolve.
     try:
-        types = typing.get_type_hints(algorithm.__init__, localns={"VecEnv": VecEnv})
+        types = typing.get_type_hints(algorithm.__init__, localns={"VecEnv": VecEnv})  # type: ignore[misc]
     except NameError:
         types = {}
     parameters = {}
-    for name, parameter in inspect.signature(algorithm.__init__).parameters.items():
+    for name, parameter in inspect.signature(algorithm).parameters.items():
         is_setting = name not in _SET_BY_JOB and not name.startswith("_")
         if is_setting and parameter.kind is not parameter.VAR_KEYWORD:
             parameters[name] = parameter.replace(annotation=types.get(name, Any))
     return parameters
-
-
-def check_arguments(function: Any, given: Mapping[str, Any], what: str) -> None:
-    """Check that a constructor takes the keywords that it is to be given.
-
-    :param what: names the keywords in the message.
-    :raises ConfigError: it does not take one of them.
-    """
-    parameters = inspect.signature(function).parameters
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-        return
-    for name in given:
-        if name not in parameters:
-            raise ConfigError(unknown(what, name, parameters))
 
 
 def convert(
@@ -164,7 +148,7 @@ def check(kind: Any, value: Any, where: str) -> Any:
     elif "int" in messages:
         expected = "a whole number"
     else:
-        expected = [*messages.values()][0].removeprefix("Input should be ")
+        expected = next(iter(messages.values())).removeprefix("Input should be ")
     raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 

@@ -50,8 +50,8 @@ KEPT = 0.3
 N_FLIGHTS = 120
 # Flights of the agent before and after.
 N_CHECKED = 480
-# Seconds that a flight costs that leaves its target again, does not succeed, or crashes or flies
-# out of range (which does not succeed, either).
+# Costs of a flight in seconds: for leaving its target after reaching it, for not succeeding, and
+# for crashing or flying out of range, which costs that of not succeeding, too.
 OVERSHOOT_COST = 0.25
 MISS_COST = 0.2
 CRASH_COST = 10.0
@@ -73,7 +73,7 @@ def correct_arrival(
     :param seed: of the flights.
     :param settings: how evaluations fly it.
     :param trained: how it was trained, or with other vehicles and disturbances that are to count.
-    :param overshoot_cost: s that it costs to leave a target again.
+    :param overshoot_cost: cost in s of leaving a target after reaching it.
     :return: the cost before and after, s: the mean settling time within 0.1 m of targets 10 m away,
         0.3 times the same with the randomized dynamics of the training, and the costs of leaving a
         target, missing it and crashing, also in twice as many recoveries.

@@ -69,6 +69,9 @@ Classes: TypeAlias = Annotated[
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
 Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
+# Units of the layers of all networks, or of each by name; the last form is that of older versions.
+Layers: TypeAlias = list[PositiveInt]
+NetArch: TypeAlias = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
 
 
 class TrainingConfig(Frozen):
@@ -187,16 +190,10 @@ class TrainingConfig(Frozen):
             return value
         policy = get_algorithm(info.data["algo"]).policy_aliases[info.data["policy"]]
         parameters = constructor_parameters(policy)
-        for name, entry in value.items():
+        for name in value:
             if name not in parameters:
                 raise ConfigError(unknown(f"keyword of {policy.__name__}", name, parameters))
-            # SB3 still takes the old form of net_arch, [{"pi": …, "vf": …}].
-            is_old_form = name == "net_arch" and isinstance(entry, list) and len(entry) == 1
-            if is_old_form and isinstance(entry[0], dict):
-                entry = entry[0]
-            entry = check(parameters[name].annotation, entry, f"policy_kwargs.{name}")
-            if name == "net_arch" and entry is not None:
-                _check_layers(entry)
+        check(NetArch, value.get("net_arch"), "net_arch")
         return value
 
     @field_validator("env_kwargs", "eval_env_kwargs")
@@ -253,14 +250,6 @@ class TrainingConfig(Frozen):
 
 # Keys of a settings file that are not the algorithm's.
 JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams", "settings"}
-
-
-def _check_layers(net_arch: list[int] | dict[str, list[int]]) -> None:
-    """Check that each layer of one network, or of several by name, has units."""
-    networks = net_arch.values() if isinstance(net_arch, dict) else [net_arch]
-    for layers in networks:
-        if any(units < 1 for units in layers):
-            raise ConfigError(f"net_arch {net_arch}: every layer needs at least 1 unit")
 
 
 class TrainingJob(JobOptions):

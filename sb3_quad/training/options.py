@@ -1,4 +1,4 @@
-"""The options of a training: flags of ``train``, ``tune`` and ``sweep``, and keys of a sweep's file.
+"""The options of a training: flags of ``train``, ``tune`` and ``sweep``, keys of a sweep's file.
 
 Cheap to import, so that ``--help`` is quick.
 """
@@ -26,7 +26,7 @@ def option(default: Any, description: str, *flags: str, metavar: str | None = "N
 
 
 def _check_device(device: str) -> str:
-    """Refuse CUDA where there is none; SB3 would take the CPU without a warning."""
+    """Refuse CUDA on a machine without it; SB3 would take the CPU without a warning."""
     import torch
 
     if device.startswith("cuda") and not torch.cuda.is_available():

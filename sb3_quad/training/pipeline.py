@@ -52,7 +52,7 @@ _KEYS = {"position": ("scale",), "hover": (), "arrival": ("rounds", "overshoot_c
 
 
 class Requirement(Frozen):
-    """What the best evaluation of a stage must reach before the next stage begins."""
+    """The least that a stage must reach in its best evaluation before the next stage begins."""
 
     success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
     mean_reward: float | None = None

@@ -76,7 +76,7 @@ class RunFolder:
     def latest_checkpoint(self) -> Path:
         """Return the path of the checkpoint after most timesteps.
 
-        :raises ConfigError: there is none.
+        :raises ConfigError: the run has no checkpoint.
         """
         steps = []
         for checkpoint in self.path.glob(self.checkpoint("*").name):

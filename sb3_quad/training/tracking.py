@@ -1,4 +1,4 @@
-"""What TensorBoard and Weights & Biases show of a training: its settings, and a run there."""
+"""Settings of a training in TensorBoard, and runs of Weights & Biases."""
 
 import time
 from collections.abc import Iterator

@@ -93,8 +93,7 @@ def train(
             with locked(run.path, "run folder"):
                 run.write_yaml(job.config.settings, job.arguments() | made_with())
                 on_start(run)
-                training = _Training(job, run, model, signals, report)
-                training.add_evaluations(eval_envs, should_continue)
+                training = _Training(job, run, model, eval_envs, signals, report, should_continue)
                 return training.run_to_end(callbacks)
 
 
@@ -130,8 +129,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"resuming after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         with tracked(job):
-            training = _Training(job, run, model, signals, report)
-            training.add_evaluations(eval_envs)
+            training = _Training(job, run, model, eval_envs, signals, report)
             return training.run_to_end(_user_callbacks(config))
 
 
@@ -140,10 +138,9 @@ def _read_job(run: RunFolder, changes: dict[str, Any]) -> TrainingJob:
     settings, options = run.read_yaml()
     if not {"algo", "env"} <= options.keys():
         raise ConfigError(f"{run.arguments}: algo or env is missing")
-    names = [str(options.pop(name)) for name in ("algo", "env")]
-    config = build_config(*names, settings, str(run.config))
-    # These are in args.yml for its readers; they are no options.
-    for name in ("env_kwargs", *MADE_WITH):
+    config = build_config(str(options["algo"]), str(options["env"]), settings, str(run.config))
+    # These are in args.yml for its readers; they are not options.
+    for name in ("algo", "env", "env_kwargs", *MADE_WITH):
         options.pop(name, None)
     return validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
 
@@ -152,26 +149,22 @@ def _read_job(run: RunFolder, changes: dict[str, Any]) -> TrainingJob:
 def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str | None, VecEnv]]]:
     """Make the environments to train in and those to evaluate in, and close them in the end.
 
-    The latter are by task; the job's own comes first, under the name None. There are none without
-    evaluations.
+    The latter are by task; the job's own comes first, under the name None. Without
+    evaluations, there are only the former.
     """
     config = job.config
     eval_envs: dict[str | None, VecEnv] = {}
     with ExitStack() as stack:
-
-        def make(
-            config: TrainingConfig, n_envs: int, purpose: str, staggered: bool = False
-        ) -> VecEnv:
-            env = make_environments(config, n_envs, seed_for(purpose, job.seed), staggered)
-            return stack.enter_context(closing(env))
-
-        env = make(config, config.n_envs, "training", staggered=True)
+        seed = seed_for("training", job.seed)
+        env = make_environments(config, config.n_envs, seed, staggered=True)
+        stack.enter_context(closing(env))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
-            n_envs = min(n_envs, job.eval_episodes)
-            eval_envs[None] = make(job.for_evaluation(), n_envs, "evaluation")
-            for task in config.eval_tasks:
-                eval_envs[task] = make(job.for_evaluation(task=task), n_envs, "evaluation")
+            seed = seed_for("evaluation", job.seed)
+            for task in (None, *config.eval_tasks):
+                judged = job.for_evaluation() if task is None else job.for_evaluation(task=task)
+                eval_envs[task] = make_environments(judged, min(n_envs, job.eval_episodes), seed)
+                stack.enter_context(closing(eval_envs[task]))
         yield env, eval_envs
 
 
@@ -251,46 +244,43 @@ def _construct(config: TrainingConfig, env: VecEnv, keywords: dict[str, Any]) ->
         ) from None
 
 
+@dataclass
 class _Training:
-    """The training of a model in a run folder: what watches it, and how it ends."""
+    """The training of a model in a run folder: what watches it, and how it ends.
 
-    def __init__(
-        self,
-        job: TrainingJob,
-        run: RunFolder,
-        model: BaseAlgorithm,
-        signals: StopSignals,
-        report: Report,
-    ) -> None:
-        self.job = job
-        self.run = run
-        self.model = model
-        self.signals = signals
-        self.report = report
+    :param eval_envs: by task, the job's own under None; empty: no evaluations.
+    """
+
+    job: TrainingJob
+    run: RunFolder
+    model: BaseAlgorithm
+    eval_envs: dict[str | None, VecEnv]
+    signals: StopSignals
+    report: Report
+    should_continue: ShouldContinue = lambda success, reward: True
+
+    def __post_init__(self) -> None:
         self.snapshots = SnapshotFile(
-            run, job.snapshot_every, report, hurry=lambda: signals.received is not None
+            self.run,
+            self.job.snapshot_every,
+            self.report,
+            lambda: self.signals.received is not None,
         )
-        self.best: BestModel | None = None
+        self.best = self._best_model() if self.eval_envs else None
 
-    def add_evaluations(
-        self,
-        envs: dict[str | None, VecEnv],
-        should_continue: ShouldContinue = lambda success, reward: True,
-    ) -> None:
-        """Evaluate in these environments, by task; without any, do not evaluate."""
-        if not envs:
-            return
-        self.best = BestModel(
-            envs[None],
-            every=self.job.eval_freq if self.job.eval_freq > 0 else NEVER,
-            n_episodes=self.job.eval_episodes,
-            seed=seed_for("evaluation", self.job.seed),
+    def _best_model(self) -> BestModel:
+        job = self.job
+        return BestModel(
+            self.eval_envs[None],
+            every=job.eval_freq if job.eval_freq > 0 else NEVER,
+            n_episodes=job.eval_episodes,
+            seed=seed_for("evaluation", job.seed),
             best_model=self.run.best_model,
             evaluations=self.run.evaluations,
             report=self.report,
-            others={task: env for task, env in envs.items() if task is not None},
-            should_continue=should_continue,
-            by=self.job.config.best_by,
+            others={task: env for task, env in self.eval_envs.items() if task is not None},
+            should_continue=self.should_continue,
+            by=job.config.best_by,
         )
 
     def run_to_end(self, user_callbacks: list[BaseCallback]) -> TrainingResult:
@@ -390,20 +380,20 @@ class _Training:
             )
 
     def _save_after(self, error: BaseException) -> None:
-        """Save the last good model and the traceback after an error.
+        """Save the last good model, and the traceback of an error that was not expected.
 
-        An error that has an explanation is raised again with where the model and the traceback are.
+        An error that has an explanation is raised again; the message says where they are.
         """
-        write_text(self.run.error, "".join(traceback.format_exception(error)))
-        where = f"; traceback in {self.run.error}"
+        where = ""
         snapshot = self.snapshots.snapshot
         if snapshot is not None:
             write_bytes(self.run.model, snapshot.model)
-            where = (
-                f"; the model after {snapshot.timesteps:,} timesteps is in {self.run.model}{where}"
-            )
+            where = f"; the model after {snapshot.timesteps:,} timesteps is in {self.run.model}"
+        # An error of this package says what is wrong; the place in the code adds nothing.
         if isinstance(error, SB3QuadError):
             raise type(error)(f"{error}{where}") from error
+        write_text(self.run.error, "".join(traceback.format_exception(error)))
+        where += f"; the traceback is in {self.run.error}"
         if isinstance(error, (EOFError, ConnectionError)):
             raise TrainingError(f"{WORKER_ENDED}{where}") from error
         parameters = self.model.policy.parameters()
@@ -412,8 +402,7 @@ class _Training:
                 f"the policy's parameters are no longer finite; lower learning_rate{where}"
             ) from error
         # The command line prints the notes of an error that no check foresaw.
-        notes = [*getattr(error, "__notes__", ()), where.removeprefix("; ")]
-        error.__notes__ = notes  # type: ignore[union-attr]
+        error.__notes__ = [*getattr(error, "__notes__", ()), where.removeprefix("; ")]
 
 
 def trained_seconds(run: RunFolder) -> float:

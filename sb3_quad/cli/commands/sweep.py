@@ -3,7 +3,7 @@
 examples:
   sb3-quad sweep my_sweep.yaml --dry-run                   lists the runs
   sb3-quad sweep my_sweep.yaml --workers 4                 four worker processes, one core each
-  sb3-quad sweep pid                                       a sweep of the package, such as nominal or random_worlds
+  sb3-quad sweep pid                                       a sweep of the package, such as nominal or domain_randomization
   sb3-quad sweep --seed 0 1 2 --conf-file two_stage.yml thesis.yml
   sb3-quad sweep --seed 0 1 2 --algo dagger --env QuadStateRecovery-v0 -n 240000 --suite quick
   sb3-quad sweep my_sweep.yaml --executor ray --address auto
