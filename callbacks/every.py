@@ -1,12 +1,15 @@
-"""Callbacks that do something every so many timesteps: their base class, and the simplest one."""
+"""Callbacks that do something at regular intervals, of timesteps or of seconds."""
 
+import time
+from collections.abc import Callable
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import EventCallback
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
+from stable_baselines3.common.utils import safe_mean
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import save_model
@@ -68,6 +71,56 @@ class Checkpoint(EveryTimesteps):
     def _on_event(self) -> bool:
         save_model(self.model, self._path.replace("{steps}", str(self.num_timesteps)))
         return True
+
+
+class ProgressLine(BaseCallback):
+    """Reports once a minute how far the training is, where there is no terminal for a progress bar.
+
+    >>> from stable_baselines3 import PPO
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> env = QuadcopterVecEnv(8, max_episode_steps=50, seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
+    >>> lines = []
+    >>> _ = model.learn(800, callback=ProgressLine(lines.append, seconds=0.0))
+    >>> lines[-1].split(",")[0].strip()
+    '800 of 800 timesteps (100 %)'
+
+    :param report: called with each line.
+    :param seconds: between two lines.
+    """
+
+    def __init__(
+        self, report: Callable[[str], None] = print, seconds: float = 60.0, verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        self._report = report
+        self._seconds = seconds
+
+    def _on_training_start(self) -> None:
+        self._start = time.monotonic()
+        self._next_line = self._start + self._seconds
+        self._first_timestep = self.num_timesteps
+        self._last_timestep = last_timestep(self.model)
+
+    def _on_step(self) -> bool:
+        now = time.monotonic()
+        if now >= self._next_line:
+            self._next_line = now + self._seconds
+            self._report(self._line(now - self._start))
+        return True
+
+    def _line(self, elapsed: float) -> str:
+        total = self._last_timestep
+        line = f"{self.num_timesteps:>12,} of {total:,} timesteps"
+        line += f" ({100 * self.num_timesteps / total:.0f} %)"
+        # Monitor fills this buffer where an episode ends.
+        episodes = self.model.ep_info_buffer
+        if episodes:
+            line += f", mean reward {safe_mean([episode['r'] for episode in episodes]):.2f}"
+        # A resumed training is timed from where it continues.
+        seconds_per_step = elapsed / (self.num_timesteps - self._first_timestep)
+        minutes = seconds_per_step * (total - self.num_timesteps) / 60
+        return f"{line}, {minutes:.0f} min left"
 
 
 def last_timestep(model: BaseAlgorithm) -> int:

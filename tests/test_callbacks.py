@@ -17,11 +17,10 @@ from stop_on_signal import StopOnSignal
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.callbacks import best_model, progress
+from sb3_quad.callbacks import best_model, every
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.progress import ProgressLine
+from sb3_quad.callbacks.every import Checkpoint, ProgressLine
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.training.snapshots import random_state, set_random_state
@@ -207,7 +206,7 @@ def test_the_episode_log_is_a_monitor_file(tmp_path):
 
 def test_a_line_a_minute_says_how_far_the_training_is(monkeypatch):
     clock = iter(range(0, 10_000, 20))  # each control step of both environments takes 20 s
-    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    monkeypatch.setattr(every, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     lines = []
     model = make_model()
     model.learn(150, callback=ProgressLine(lines.append))

@@ -23,7 +23,7 @@ from sb3_quad.algorithms.offset_correction import (
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
-from sb3_quad.callbacks.progress import ProgressLine
+from sb3_quad.callbacks.every import ProgressLine
 from sb3_quad.cli import main
 from sb3_quad.cli.parser import PAIRS
 from sb3_quad.controllers.pretrained import load_pretrained

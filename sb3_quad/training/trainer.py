@@ -30,8 +30,7 @@ from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.progress import ProgressLine
+from sb3_quad.callbacks.every import Checkpoint, ProgressLine
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
