@@ -106,7 +106,8 @@ def _print_next(run: RunFolder) -> None:
     agent = shlex.quote(str(run.result))
     label = shlex.quote(f"{run.path.parent.name}_{run.path.name}")
     # An agent of many vehicles has none that export could take by itself.
-    vehicle = " --vehicle itm" if agent_settings(run.result)[0].vehicles else ""
+    settings, _ = agent_settings(run.result)
+    vehicle = " --vehicle itm" if settings.vehicles else ""
     print(f"next:\n  sb3-quad enjoy {agent} --env {run.name} -o {label}.png")
     print(f"  sb3-quad demo {agent} pid -o {label}.html")
     print(f"  sb3-quad evaluate {agent} --suite quick -o evaluations/{label}")

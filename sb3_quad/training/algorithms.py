@@ -105,8 +105,9 @@ def convert(
         if isinstance(converted, str) or not math.isfinite(converted):
             raise ConfigError(f"{where} is {value!r}, must be lin_ and a number, such as lin_1e-3")
     else:
-        literal = parse_value(value) if isinstance(value, str) else value
-        converted = check(parameter.annotation, literal, where)
+        if isinstance(value, str):
+            value = parse_value(value)
+        converted = check(parameter.annotation, value, where)
     if isinstance(converted, (int, float)):
         if converted < least:
             raise ConfigError(f"{where} is {value!r}, must be at least {least:g}")

@@ -160,10 +160,10 @@ class TrainingConfig(Frozen):
         if not self.is_off_policy:
             return int(self.keyword("n_steps"))
         train_freq = self.keyword("train_freq")
-        if isinstance(train_freq, (tuple, list)):
-            number, unit = train_freq
-            return int(number) if unit == "step" else 1
-        return int(train_freq)
+        if isinstance(train_freq, int):
+            return train_freq
+        number, unit = train_freq
+        return number if unit == "step" else 1
 
     def shorter_rollout(self) -> dict[str, int]:
         """Return the settings that fit a rollout to a budget of less than one.

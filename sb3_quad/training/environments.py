@@ -92,7 +92,9 @@ def _make_single(config: TrainingConfig, n_envs: int, seed: int, staggered: bool
     # A worker process could not say that PyBullet is missing.
     if config.task is not None:
         importlib.import_module("sb3_quad.base.bullet")
-    phases = n_envs if staggered else 1
+    phases = 1
+    if staggered:
+        phases = n_envs
     makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [
         partial(_make_row, config, row, phases) for row in range(n_envs)
     ]

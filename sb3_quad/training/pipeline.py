@@ -308,7 +308,7 @@ def _train_stages(
                     seconds = trained_seconds(run)
                 else:
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
-                    # A run that was removed, or that is damaged, is trained from scratch.
+                    # A run that has a model and no snapshot cannot be resumed.
                     if run is not None and (run.not_begun or run.resume_state.is_file()):
                         trained = resume(runs[number], report, **changes)
                     else:
@@ -349,15 +349,19 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
         success = np.nan_to_num(curve.values("success"))
         # Ordered as BestModel orders models: by the rate, then by the reward.
         scores = list(zip(rate, curve.reward, success, strict=True))
-        _, reward, success_rate = max(scores) if stage.pass_on == "best" else scores[-1]
-        wanted = -np.inf if stage.require.mean_reward is None else stage.require.mean_reward
-        if success_rate < stage.require.success_rate or reward < wanted:
+        if stage.pass_on == "best":
+            scores.sort()
+        _, reward, success_rate = scores[-1]
+        required = stage.require
+        misses_reward = required.mean_reward is not None and reward < required.mean_reward
+        if success_rate < required.success_rate or misses_reward:
             raise TrainingError(
                 f"stage {stage.name!r}: success {success_rate:.3f} and mean reward {reward:.2f} "
-                f"miss what it requires (success_rate {stage.require.success_rate:g}, "
-                f"mean_reward {wanted:g}); its run is {run.path}"
+                f"miss what it requires ({required}); its run is {run.path}"
             )
-    return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
+    if stage.pass_on == "best" and run.best_model.is_file():
+        return run.best_model
+    return run.model
 
 
 def _correct(

@@ -127,16 +127,19 @@ class SnapshotFile(BaseCallback):
         the oldest of a full store are replaced; the resumed training adds the same rows again
         before it reads any.
         """
-        episodes = self._run.episodes
-        best_model = self._run.best_model
-        return {
+        state = {
             **random_state(),
             **_environment_state(self.training_env),
             **_counters(self.model),
             "log": log_state(self.logger),
-            "episodes": np.array(episodes.stat().st_size if episodes.is_file() else 0),
-            "best_model": np.fromfile(best_model, np.uint8) if best_model.is_file() else NO_BYTES,
+            "episodes": np.array(0),
+            "best_model": NO_BYTES,
         }
+        if self._run.episodes.is_file():
+            state["episodes"] = np.array(self._run.episodes.stat().st_size)
+        if self._run.best_model.is_file():
+            state["best_model"] = np.fromfile(self._run.best_model, np.uint8)
+        return state
 
     def write(self) -> None:
         """Write the latest snapshot; until that is whole, the file holds the one before.
@@ -249,8 +252,9 @@ def _batch(env: VecEnv) -> Any:
 
 def _environment_state(env: VecEnv) -> Arrays:
     batch = _batch(env)
-    state = {} if batch is None else batch.snapshot()
-    return {f"{ENVIRONMENT}{name}": array for name, array in state.items()}
+    if batch is None:
+        return {}
+    return {f"{ENVIRONMENT}{name}": array for name, array in batch.snapshot().items()}
 
 
 def _stores(model: Any) -> dict[str, Any]:

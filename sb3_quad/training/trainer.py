@@ -45,6 +45,7 @@ from sb3_quad.training.tracking import HyperparameterLog, tracked
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 NEVER = 2**62  # timesteps
+OWN_TASK = ""  # the name of the evaluations on the task of the training
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
 
@@ -145,24 +146,30 @@ def _read_job(run: RunFolder, changes: dict[str, Any]) -> TrainingJob:
 
 
 @contextmanager
-def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str | None, VecEnv]]]:
+def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]]:
     """Make the environments to train in and those to evaluate in, and close them in the end.
 
-    The latter are by task; the job's own comes first, under the name None. Without
-    evaluations, there are only the former.
+    The latter are by task, with the job's own under OWN_TASK; without evaluations, there are only
+    the former.
     """
     config = job.config
-    eval_envs: dict[str | None, VecEnv] = {}
+    eval_envs: dict[str, VecEnv] = {}
     with ExitStack() as stack:
         seed = seed_for("training", job.seed)
         env = make_environments(config, config.n_envs, seed, staggered=True)
         stack.enter_context(closing(env))
         if job.eval_episodes > 0:
-            n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
+            configs = {OWN_TASK: job.for_evaluation()}
+            for task in config.eval_tasks:
+                configs[task] = job.for_evaluation(task=task)
+            n_envs = job.n_eval_envs or 1
+            # The batched environment flies all episodes of an evaluation at once.
+            if config.vec_env == "batch" and job.n_eval_envs is None:
+                n_envs = job.eval_episodes
+            n_envs = min(n_envs, job.eval_episodes)
             seed = seed_for("evaluation", job.seed)
-            for task in (None, *config.eval_tasks):
-                judged = job.for_evaluation() if task is None else job.for_evaluation(task=task)
-                eval_envs[task] = make_environments(judged, min(n_envs, job.eval_episodes), seed)
+            for task, eval_config in configs.items():
+                eval_envs[task] = make_environments(eval_config, n_envs, seed)
                 stack.enter_context(closing(eval_envs[task]))
         yield env, eval_envs
 
@@ -247,13 +254,13 @@ def _construct(config: TrainingConfig, env: VecEnv, keywords: dict[str, Any]) ->
 class _Training:
     """The training of a model in a run folder: what watches it, and how it ends.
 
-    :param eval_envs: by task, the job's own under None; empty: no evaluations.
+    :param eval_envs: by task, the job's own under OWN_TASK; empty: no evaluations.
     """
 
     job: TrainingJob
     run: RunFolder
     model: BaseAlgorithm
-    eval_envs: dict[str | None, VecEnv]
+    eval_envs: dict[str, VecEnv]
     signals: StopSignals
     report: Report
     should_continue: ShouldContinue = lambda success, reward: True
@@ -265,19 +272,21 @@ class _Training:
             self.report,
             lambda: self.signals.received is not None,
         )
-        self.best = self._best_model() if self.eval_envs else None
+        self.best: BestModel | None = None
+        if self.eval_envs:
+            self.best = self._best_model()
 
     def _best_model(self) -> BestModel:
         job = self.job
         return BestModel(
-            self.eval_envs[None],
+            self.eval_envs[OWN_TASK],
             every=job.eval_freq if job.eval_freq > 0 else NEVER,
             n_episodes=job.eval_episodes,
             seed=seed_for("evaluation", job.seed),
             best_model=self.run.best_model,
             evaluations=self.run.evaluations,
             report=self.report,
-            others={task: env for task, env in self.eval_envs.items() if task is not None},
+            others={task: self.eval_envs[task] for task in job.config.eval_tasks},
             should_continue=self.should_continue,
             by=job.config.best_by,
         )
@@ -321,7 +330,10 @@ class _Training:
             path = str(self.run.checkpoint("{steps}"))
             callbacks.append(Checkpoint(self.job.save_freq, path))
         callbacks += user_callbacks
-        callbacks.append(ProgressBarCallback() if self.job.progress else ProgressLine(self.report))
+        if self.job.progress:
+            callbacks.append(ProgressBarCallback())
+        else:
+            callbacks.append(ProgressLine(self.report))
         # A signal ends the training where the snapshot can still be completed.
         callbacks.append(
             ConvertCallback(lambda *_: self.signals.received is None or not self.snapshots.is_fresh)
@@ -330,12 +342,14 @@ class _Training:
 
     def _learn(self, callbacks: list[BaseCallback]) -> None:
         config = self.job.config
-        # An off-policy algorithm counts episodes; about n_envs of them end per environment's one.
-        episodes = config.n_envs if config.is_off_policy else 1
+        log_interval = self.job.log_interval
+        # An off-policy algorithm counts episodes here; n_envs of them end at about the same time.
+        if config.is_off_policy:
+            log_interval *= config.n_envs
         self.model.learn(
             config.n_timesteps - self.model.num_timesteps,
             callback=callbacks,
-            log_interval=self.job.log_interval * episodes,
+            log_interval=log_interval,
             tb_log_name=f"{config.algo}_{self.run.path.name}",
             reset_num_timesteps=self.model.num_timesteps == 0,
         )
