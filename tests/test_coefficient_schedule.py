@@ -124,7 +124,7 @@ def test_any_algorithms_coefficients_follow_the_progress(algorithm, name, kwargs
     assert read(model) == pytest.approx(0.25, abs=1e-9)
 
 
-def test_a_training_that_goes_on_starts_where_it_stopped(tmp_path):
+def test_a_resumed_training_starts_where_it_stopped(tmp_path):
     model = make(DAgger)
     model.learn(
         40,

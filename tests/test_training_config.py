@@ -123,7 +123,10 @@ def test_any_text_on_the_command_line_is_a_value(text):
         ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "did you mean 'nn.Tanh'"),
         ({"policy_kwargs": {"net_arhc": [8]}}, "did you mean 'net_arch'"),
         ({"policy_kwargs": {"net_arch": 8}}, "policy_kwargs: net_arch is 8, must be a valid list"),
-        ({"policy_kwargs": {"net_arch": {"pi": [8, 0]}}}, r"net_arch is \{'pi': \[8, 0\]\}, must be at least 1"),
+        (
+            {"policy_kwargs": {"net_arch": {"pi": [8, 0]}}},
+            r"net_arch is \{'pi': \[8, 0\]\}, must be at least 1",
+        ),
         ({"normalize": True}, "normalize: Input should be False"),
         ({"callback": 3}, "package.module.Class"),
     ],

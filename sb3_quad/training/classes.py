@@ -30,7 +30,7 @@ def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]
 
     These are a name, ``{name: keywords}``, or a list of both.
 
-    :raises ConfigError: another form.
+    :raises ConfigError: another form, or as :func:`import_class`.
     """
     classes = []
     for entry in as_list(value):
@@ -41,6 +41,7 @@ def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]
                 "or {package.module.Class: {…}}"
             )
         for name, keywords in form.items():
+            import_class(str(name), where)
             classes.append((str(name), parse_mapping(keywords, f"{where}.{name}")))
     return classes
 

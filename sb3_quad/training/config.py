@@ -38,7 +38,7 @@ from sb3_quad.training.algorithms import (
     is_off_policy,
     takes_expert,
 )
-from sb3_quad.training.classes import BASES, as_list, import_class, qualified_classes
+from sb3_quad.training.classes import as_list, qualified_classes
 from sb3_quad.training.options import JobOptions
 from sb3_quad.vehicles.vehicle import VEHICLES
 
@@ -208,15 +208,6 @@ class TrainingConfig(Frozen):
             # eval_env_kwargs go over env_kwargs, so they are checked together.
             own = info.data.get("env_kwargs", {})
             FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **own, **value})
-        return value
-
-    @field_validator(*BASES)
-    @classmethod
-    def _known_classes(
-        cls, value: list[tuple[str, dict[str, Any]]], info: ValidationInfo
-    ) -> list[tuple[str, dict[str, Any]]]:
-        for path, _ in value:
-            import_class(path, str(info.field_name))
         return value
 
     @field_validator("eval_tasks")

@@ -6,7 +6,7 @@ The learning problem is the same in all of them.
 import importlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 from gymnasium.wrappers import TimeLimit
@@ -20,6 +20,7 @@ from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.classes import instance
 from sb3_quad.training.config import TrainingConfig
 
+Env: TypeAlias = gymnasium.Env[Any, Any]
 WORKER_ENDED = (
     "a worker process of the environments ended (its error, if it had time for one, is above; "
     "else out of memory?); vec_env dummy needs no worker processes"
@@ -95,7 +96,7 @@ def _make_single(config: TrainingConfig, n_envs: int, seed: int, staggered: bool
     phases = 1
     if staggered:
         phases = n_envs
-    makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [
+    makers: list[Callable[[], Env]] = [
         partial(_make_row, config, row, phases) for row in range(n_envs)
     ]
     env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
@@ -103,7 +104,7 @@ def _make_single(config: TrainingConfig, n_envs: int, seed: int, staggered: bool
     return env
 
 
-def _make_row(config: TrainingConfig, row: int, phases: int) -> gymnasium.Env[Any, Any]:
+def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
     """Make the environment of a row.
 
     Keywords that are lists hold the values of the rows, which start again at the end of the list.
@@ -117,7 +118,7 @@ def _make_row(config: TrainingConfig, row: int, phases: int) -> gymnasium.Env[An
         values = keywords.get(name)
         if isinstance(values, (list, tuple)) and values:
             keywords[name] = values[row % len(values)]
-    env: gymnasium.Env[Any, Any] = gymnasium.make(config.env_id, **keywords)
+    env: Env = gymnasium.make(config.env_id, **keywords)
     limit = env.spec and env.spec.max_episode_steps
     if limit and row % phases:
         env = _FirstEpisode(env, limit - row * limit // phases)

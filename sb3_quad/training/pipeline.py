@@ -4,7 +4,7 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -44,7 +44,7 @@ from sb3_quad.training.config import (
     with_vehicle_path,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import resume, train, trained_seconds
+from sb3_quad.training.trainer import Report, resume, train, trained_seconds
 
 STATUS_FILE = "pipeline.yml"
 # The keys that go with each kind of offset correction.
@@ -207,7 +207,7 @@ def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
 
 
 def run_pipeline(
-    pipeline: Pipeline, job: Mapping[str, Any], name: str, report: Callable[[str], None] = print
+    pipeline: Pipeline, job: Mapping[str, Any], name: str, report: Report = print
 ) -> PipelineResult:
     """Train the stages one after the other, each from the agent that the one before passed on.
 
@@ -227,9 +227,7 @@ def run_pipeline(
     return _train_stages(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
 
 
-def resume_pipeline(
-    folder: Path, report: Callable[[str], None] = print, **changes: Any
-) -> PipelineResult:
+def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:
     """Resume an interrupted or killed pipeline within its present stage, then train the others.
 
     :param changes: options of the jobs to change, as for
@@ -279,7 +277,7 @@ def _train_stages(
     folder: Path,
     status: Status,
     jobs: list[TrainingJob],
-    report: Callable[[str], None],
+    report: Report,
     **changes: Any,
 ) -> PipelineResult:
     """Train the stages that are not complete."""
@@ -329,7 +327,7 @@ def _train_stages(
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
-def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[str], None]) -> Path:
+def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
     """Return the zip that a stage passes on, after the offset correction where it has one."""
     if stage.correct_offset is None:
         return _passed_on(stage, job, run)
@@ -369,7 +367,7 @@ def _correct(
     job: TrainingJob,
     run: RunFolder,
     agent: Path,
-    report: Callable[[str], None],
+    report: Report,
 ) -> None:
     """Write the corrected agent of a run."""
     model = load_zip(get_algorithm(job.config.algo), agent, device=job.device)
