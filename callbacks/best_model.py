@@ -122,6 +122,7 @@ class BestModel(EveryTimesteps):
         super()._on_training_start()
         for evaluations in (self._own, *self._others.values()):
             evaluations.read(self._n_episodes)
+        # A resumed training continues the clock and knows the best model so far.
         rows = self._own.rows
         self._start = time.perf_counter() - rows.get("seconds", [0.0])[-1]
         for number in range(len(rows.get("timesteps", []))):
@@ -221,6 +222,7 @@ class _Evaluations:
         n_before = len(self.rows.get("timesteps", []))
         for name in {**self.rows, **values}:
             example = values[name] if name in values else self.rows[name][-1]
+            # An array that is new has rows for the earlier evaluations, too.
             nothing = np.full(np.shape(example), np.nan)
             self.rows.setdefault(name, [nothing] * n_before).append(values.get(name, nothing))
         write_arrays(self.path, **self.rows)

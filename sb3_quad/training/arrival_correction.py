@@ -102,6 +102,7 @@ def correct_arrival(
         best = candidates[np.argsort(costs)[:BEST]]
         mean = KEPT * mean + (1 - KEPT) * best.mean(axis=0)
         spread = (spread + best.std(axis=0)) / 2
+    # Other flights than those of the search decide whether the scales are kept.
     compared = np.stack([np.zeros_like(mean), mean])
     before, after = _costs(agent, compared, sets, seed, N_CHECKED, overshoot_cost)
     if after < before:

@@ -188,6 +188,7 @@ class TrainingConfig(Frozen):
     def _fits_policy(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         if "policy" not in info.data:
             return value
+        # The constructor of the policy takes these, not that of the algorithm.
         policy = get_algorithm(info.data["algo"]).policy_aliases[info.data["policy"]]
         parameters = constructor_parameters(policy)
         for name in value:
@@ -284,9 +285,11 @@ def describe(job: TrainingJob) -> str:
     config = job.config
     n_steps = config.rollout_steps
     rollout = n_steps * config.n_envs
+    # The last rollout is flown whole.
     n_updates = -(-config.n_timesteps // rollout)
     timesteps = n_updates * rollout
     if config.is_off_policy:
+        # -1 stands for as many as there are timesteps in a rollout.
         gradient_steps = config.keyword("gradient_steps")
         n_updates *= rollout if gradient_steps < 0 else gradient_steps
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
@@ -323,6 +326,7 @@ def load_config(
     :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that
         does not fit.
     """
+    # A misspelt name would otherwise be reported as a missing file.
     get_algorithm(algo)
     check_environment(env_id)
     content, where = SETTINGS.read(f"{algo}.yml" if conf_file is None else conf_file)

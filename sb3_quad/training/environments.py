@@ -113,6 +113,7 @@ def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
     """
     if config.vec_env == "subproc":
         ignore_interrupts()
+    # One environment flies one vehicle, where the batched one takes a list.
     keywords = dict(config.env_kwargs)
     for name in ("vehicle", "max_episode_steps"):
         values = keywords.get(name)
@@ -120,6 +121,7 @@ def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
             keywords[name] = values[row % len(values)]
     env: Env = gymnasium.make(config.env_id, **keywords)
     limit = env.spec and env.spec.max_episode_steps
+    # The rows would otherwise end all their episodes in the same step.
     if limit and row % phases:
         env = _FirstEpisode(env, limit - row * limit // phases)
     env = Monitor(env)

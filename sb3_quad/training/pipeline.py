@@ -252,6 +252,7 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
             _check_correction(stage.correct_offset, config)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
+        # The evaluations of a stage may differ from those of the pipeline.
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
@@ -286,6 +287,7 @@ def _train_stages(
     agent: str | None = None
 
     def write() -> None:
+        # The stages are written, too, since the settings file may change before a resume.
         current = status.model_copy(update={"runs": tuple(runs)})
         content = current.model_dump(mode="json", exclude_defaults=True)
         write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))

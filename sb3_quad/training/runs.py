@@ -96,6 +96,7 @@ class RunFolder:
         """
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
+        # A program of the user's may train, too.
         program = Path(sys.argv[0]).name
         start = ["sb3-quad"] if program in ("sb3-quad", "__main__.py") else ["python", program]
         write_text(self.command, shlex.join([*start, *sys.argv[1:]]) + "\n")
@@ -153,6 +154,7 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     :raises ConfigError: a folder that cannot be made.
     """
     make_folder(parent, "log folder", "-f")
+    # Numbers of removed runs before the last one are not used again.
     number = max(_numbered(parent, name), default=0) + 1
     while True:
         ending = f"_{uuid.uuid4()}" if unique else ""

@@ -176,6 +176,7 @@ def load_snapshot(
         raise ConfigError(message)
     state = read_arrays(path)
     batch = _batch(env)
+    # The model comes first: what else is expected depends on it.
     _check(state, {"model": NO_BYTES}, path)
     model: Any = load_zip(
         get_algorithm(algo),

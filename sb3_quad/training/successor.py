@@ -22,6 +22,7 @@ def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) 
     own, source = agent_settings(path)
     if source is None or config.task is None:
         return changes
+    # A new vehicle may be what the user wants, so this is only a warning.
     notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))
     if notice:
         tell(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
@@ -34,6 +35,7 @@ def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) 
     eval_env_kwargs |= config.eval_env_kwargs
     eval_env_kwargs |= changes.get("eval_env_kwargs", {})
     merged = {**changes, "env_kwargs": env_kwargs, "eval_env_kwargs": eval_env_kwargs}
+    # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
         policy: Any = load_model(path).policy
         merged["policy_kwargs"] = {

@@ -51,6 +51,7 @@ def tracked(job: TrainingJob) -> Iterator[None]:
     if not job.track:
         yield
         return
+    # wandb is an extra, which JobOptions has checked.
     import wandb
 
     config = job.config

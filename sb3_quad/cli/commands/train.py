@@ -123,6 +123,7 @@ def run(options: argparse.Namespace) -> int:
     job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
         return _resume(options, job)
+    # Without any of these, the default is a pipeline rather than a single run.
     if options.conf_file is None and options.algo is None and options.env is None:
         options.conf_file = DEFAULT_PIPELINE
     if options.conf_file is not None and is_pipeline(options.conf_file):
@@ -185,6 +186,7 @@ def prepare(options: argparse.Namespace) -> None:
     from sb3_quad.algorithms.networks.perceptron import use_one_torch_thread
     from sb3_quad.base.imports import import_packages
 
+    # Environments must be registered before the settings are checked.
     import_packages(options.gym_packages, "--gym-packages")
     if options.num_threads is None:
         use_one_torch_thread()
