@@ -2,6 +2,6 @@
 
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint
+from sb3_quad.callbacks.every import Checkpoint, ProgressLine
 
-__all__ = ["BestModel", "Checkpoint", "EpisodeLog"]
+__all__ = ["BestModel", "Checkpoint", "EpisodeLog", "ProgressLine"]

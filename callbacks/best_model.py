@@ -1,6 +1,4 @@
-"""Evaluation along the way, and the best model kept: by success or survival first, then by mean
-reward.
-"""
+"""Evaluation during the training, and the best model kept."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -9,21 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
-from sb3_quad.callbacks.every import EveryTimesteps
+from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
 
-LIVES = (
-    20  # ends that SB3's Monitor does not count, as Atari's wrappers report, in one episode at most
-)
-Score = tuple[float, float]  # share of successes or survivals, mean reward
+# Ends that SB3's Monitor may leave uncounted in one episode: Atari's wrappers report each life.
+LIVES = 20
+# By the name in the log: an array of an evaluation, and its statistic.
 LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "success_rate": ("successes", np.mean),
     "survival_rate": ("survivals", np.mean),
@@ -31,9 +24,10 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "mean_ep_length": ("ep_lengths", np.mean),
     "final_error": ("final_errors", np.nanmedian),
 }
-"""By the name in the log: an array of an evaluation, and its statistic."""
-RATES = {"success": "success_rate", "survival": "survival_rate"}
-SHARES = {name: LOGGED[rate][0] for name, rate in RATES.items()}  # their arrays
+# The array and the name in the log of each rate that may decide.
+RATES = {"success": ("successes", "success_rate"), "survival": ("survivals", "survival_rate")}
+# The rate that decides, and the mean reward.
+Score = tuple[float, float]
 
 
 class BestModel(EveryTimesteps):
@@ -41,29 +35,35 @@ class BestModel(EveryTimesteps):
 
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's
     EvalCallback keeps the model of the highest mean reward; here a model that succeeds more often
-    is better, and reward decides between equals. ``evaluations.npz`` is EvalCallback's, with
-    ``seconds`` of training, ``survivals`` and ``final_errors`` (m, NaN where the flight was lost)
-    where environments report them, and the losses of the latest update, by their names in the log
-    such as ``train/value_loss``. It logs ``eval/mean_reward`` and ``eval/mean_ep_length``, where
-    they are reported ``eval/success_rate``, ``eval/survival_rate`` and ``eval/final_error``, the
-    median, for ``others`` under ``eval_<name>/``, where the evaluation happens. An evaluation that
-    is due with the last timestep is the one after the last update.
+    is better, and reward decides between equals. An evaluation that is due at the last timestep is
+    the one after the last update.
+
+    ``evaluations.npz`` is EvalCallback's with more arrays: ``seconds`` of training; ``survivals``
+    and ``final_errors`` (m, NaN where the vehicle crashed or flew out of range), where environments
+    report them; and the losses of the latest update, by their names in the log such as
+    ``train/value_loss``.
+
+    Logged at each evaluation are ``eval/mean_reward`` and ``eval/mean_ep_length``, and where they
+    are reported ``eval/success_rate``, ``eval/survival_rate`` and the median ``eval/final_error``;
+    for ``others`` they are under ``eval_<name>/``.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad.envs import QuadcopterVecEnv
     >>> tasks = ("state_recovery", "target_tracking")
     >>> recovery, tracking = (QuadcopterVecEnv(4, task, max_episode_steps=50) for task in tasks)
     >>> best = BestModel(recovery, every=800, n_episodes=4, seed=9, others={"tracking": tracking})
-    >>> model = PPO("MlpPolicy", QuadcopterVecEnv(8, "state_recovery"), n_steps=100, batch_size=400, device="cpu")
+    >>> env = QuadcopterVecEnv(8, "state_recovery")
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
     >>> _ = model.learn(1600, callback=best)
     >>> import numpy as np
-    >>> np.load("evaluations.npz")["timesteps"].tolist(), np.load("evaluations_tracking.npz")["results"].shape
-    ([800, 1600], (2, 4))
+    >>> np.load("evaluations.npz")["timesteps"].tolist()
+    [800, 1600]
+    >>> np.load("evaluations_tracking.npz")["results"].shape
+    (2, 4)
     >>> PPO.load("best_model.zip", device="cpu").num_timesteps in (800, 1600)
     True
 
-    :param env: the environments to evaluate in, not those of the training; whoever made them closes
-        them.
+    :param env: the environments to evaluate in, not those of the training; you close them.
     :param every: timesteps between evaluations.
     :param n_episodes: episodes in each.
     :param seed: of the evaluation's episodes.
@@ -73,11 +73,10 @@ class BestModel(EveryTimesteps):
     :param report: called with one line for each evaluation.
     :param others: further environments by name, such as those of another task, which are evaluated
         at the same times. They do not decide which model is best; their results go to
-        ``evaluations_<name>.npz`` beside ``evaluations``.
-    :param should_continue: called after each evaluation with that share and mean reward; False ends
-        the training.
-    :param by: ``success`` or ``survival``: the share of episodes that makes a model the best;
-        reward decides between equals.
+        ``evaluations_<name>.npz`` next to ``evaluations``.
+    :param should_continue: called after each evaluation with the rate and the mean reward that
+        decide; False ends the training.
+    :param by: ``success`` or ``survival``: the rate that decides which model is best.
     :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations``
         that cannot be read or flew another number of episodes.
     :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's
@@ -99,45 +98,35 @@ class BestModel(EveryTimesteps):
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
-        if by not in SHARES:
-            raise ConfigError(unknown("share", by, SHARES))
+        if by not in RATES:
+            raise ConfigError(unknown("share", by, RATES))
         if n_episodes < 1:
             raise ConfigError(f"BestModel: n_episodes is {n_episodes}, must be at least 1")
-        self._n_episodes, self._seed = n_episodes, seed
-        self._best_model, self._report, self._should_continue = best_model, report, should_continue
-        path, others = Path(evaluations), others or {}
-        # By the group of the log: the environments, the file, and its rows; the first group
-        # decides.
-        self._envs = {"eval": env} | {f"eval_{name}": other for name, other in others.items()}
-        self._paths = {"eval": path} | {
-            f"eval_{name}": path.with_name(f"{path.stem}_{name}.npz") for name in others
-        }
-        self._by = SHARES[by]
-        self._rows: dict[str, dict[str, Any]] = {group: {} for group in self._envs}
-        self._start, self._last = 0.0, 0
+        self._n_episodes = n_episodes
+        self._seed = seed
+        self._best_model = best_model
+        self._report = report
+        self._should_continue = should_continue
+        self._by = RATES[by][0]
+        path = Path(evaluations)
+        self._own = _Evaluations(env, path)
+        self._others = {}
+        for name, other in (others or {}).items():
+            self._others[name] = _Evaluations(other, path.with_name(f"{path.stem}_{name}.npz"))
+        self._start = 0.0
+        self._last = 0
         self.stopped = False  # by ``should_continue``
         self.best: Score = (-np.inf, -np.inf)
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        for group, path in self._paths.items():
-            if path.is_file():
-                self._rows[group] = {name: list(array) for name, array in read_arrays(path).items()}
-                if not self._rows[group].get("results"):
-                    raise ConfigError(
-                        f"{path}: cannot be read (results: no such array, or an empty one)"
-                    )
-                flown = len(self._rows[group]["results"][-1])
-                if flown != self._n_episodes:
-                    raise ConfigError(
-                        f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}"
-                    )
-        rows = self._rows["eval"]
+        for evaluations in (self._own, *self._others.values()):
+            evaluations.read(self._n_episodes)
+        # A resumed training continues the clock and knows the best model so far.
+        rows = self._own.rows
         self._start = time.perf_counter() - rows.get("seconds", [0.0])[-1]
-        none: list[list[float]] = [[]] * len(rows.get("results", []))
-        self.best = max(
-            map(_score, rows.get(self._by, none), rows.get("results", [])), default=self.best
-        )
+        for number in range(len(rows.get("timesteps", []))):
+            self.best = max(self.best, self._own.score(self._by, number))
         self._last = last_timestep(self.model)
 
     def _on_event(self) -> bool:
@@ -152,127 +141,148 @@ class BestModel(EveryTimesteps):
     @property
     def latest(self) -> int:
         """Timesteps of the latest evaluation; 0: there was none."""
-        return int(self._rows["eval"].get("timesteps", [0])[-1])
+        return int(self._own.rows.get("timesteps", [0])[-1])
 
     def evaluate(self) -> None:
-        """Evaluate the model as it is now, note the results, and keep it if it is the best so far."""
+        """Evaluate the model as it is now, note the results, and keep it if it is the best."""
         seconds = time.perf_counter() - self._start
-        scores = {group: self._fly(group, seconds) for group in self._envs}
-        words = [
-            f"{group.removeprefix('eval_')}: {self._in_words(group, reward)}"
-            for group, (_, reward) in scores.items()
-        ]
-        line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: " + "; ".join(
-            words
-        ).removeprefix("eval: ")
+        values = {"timesteps": self.num_timesteps, "seconds": seconds}
+        # The log still holds the losses of the latest update.
+        losses = {
+            name: float(value)
+            for name, value in self.logger.name_to_value.items()
+            if fnmatchcase(name, "train/*loss")
+        }
+        text = self._evaluate_in(self._own, "eval", {**values, **losses})
+        for name, evaluations in self._others.items():
+            text += f"; {name}: {self._evaluate_in(evaluations, f'eval_{name}', values)}"
+        line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: {text}"
         if getattr(self.model, "policy_is_idle", False):
             line += " (critic warm-up: the policy does not learn yet)"
-        score = scores["eval"]
+        score = self._own.score(self._by)
         if score > self.best:
             self.best = score
             save_model(self.model, self._best_model)
             line += " (best so far)"
         self._report(line)
-        self.logger.dump(
-            self.num_timesteps
-        )  # as EvalCallback does: a later evaluation of the rollout would replace it
+        # As EvalCallback does; a later evaluation in the same rollout would replace these values.
+        self.logger.dump(self.num_timesteps)
         self.stopped = not self._should_continue(*score)
 
-    def _fly(self, group: str, seconds: float) -> Score:
-        """Evaluate in one group's environments; write and log the results."""
-        env, unreported = self._envs[group], 0  # ends in a row
-        successes, survivals, errors = list[float](), list[float](), list[float]()
+    def _evaluate_in(self, evaluations: "_Evaluations", group: str, values: dict[str, Any]) -> str:
+        """Evaluate in some environments; write, log and return the results.
 
-        def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
-            nonlocal unreported
-            info = local_variables["info"]
-            if not local_variables["done"]:
-                return
-            if (
-                local_variables.get("is_monitor_wrapped") and "episode" not in info
-            ):  # evaluate_policy does not count it
-                unreported += 1
-                if unreported > LIVES * env.num_envs:
-                    raise TrainingError(
-                        "evaluation: a wrapper drops info['episode'], by which SB3 counts episodes"
-                    )
-                return
-            unreported = 0
-            successes.append(float(info.get("is_success", np.nan)))
-            survivals.append(float(info.get("survival", np.nan)))
-            errors.append(float(info.get("distance", np.nan) if info.get("survival") else np.nan))
-
-        env.seed(self._seed)
-        flown = evaluate_policy(
-            self.model,
-            env,
-            self._n_episodes,
-            callback=note,
-            return_episode_rewards=True,
-            warn=False,
-        )
-        rewards, lengths = flown
-        values: dict[str, Any] = {
-            "timesteps": self.num_timesteps,
-            "results": rewards,
-            "ep_lengths": lengths,
-            "seconds": seconds,
-        }
-        reported = {"successes": successes, "survivals": survivals, "final_errors": errors}
-        values |= {name: each for name, each in reported.items() if not np.isnan(each).all()}
-        if "successes" in values:
-            values["successes"] = np.nan_to_num(successes)  # some environments report no failures
-        if group == "eval":  # of the latest update, which the log still holds
-            logged = self.logger.name_to_value
-            values |= {
-                name: float(logged[name]) for name in logged if fnmatchcase(name, "train/*loss")
-            }
-        _append(self._rows[group], values)
-        write_arrays(self._paths[group], **self._rows[group])
-        for name, value in self._latest(group).items():
+        :param group: their group in the log.
+        :param values: noted with the results.
+        """
+        flown = _fly(self.model, evaluations.env, self._n_episodes, self._seed)
+        evaluations.append({**values, **flown})
+        latest = evaluations.latest()
+        for name, value in latest.items():
             self.logger.record(f"{group}/{name}", value)
-        return _score(values.get(self._by, []), rewards)
+        text = ""
+        for name, (_, rate) in RATES.items():
+            if rate in latest:
+                text += f"{name} {100 * latest[rate]:.1f} %, "
+        return f"{text}mean reward {latest['mean_reward']:.2f}"
 
-    def _latest(self, group: str) -> dict[str, float]:
-        """What the latest evaluation says, by its names in the log."""
-        found = {}
+
+class _Evaluations:
+    """The evaluations in some environments: rows of arrays by name, and their file."""
+
+    def __init__(self, env: VecEnv, path: Path) -> None:
+        self.env = env
+        self.path = path
+        self.rows: dict[str, Any] = {}
+
+    def read(self, n_episodes: int) -> None:
+        """Continue the file, if it exists.
+
+        :raises ConfigError: it cannot be read, or its evaluations have another number of episodes.
+        """
+        if not self.path.is_file():
+            return
+        self.rows = {name: list(array) for name, array in read_arrays(self.path).items()}
+        if not self.rows.get("results"):
+            problem = "results: no such array, or an empty one"
+            raise ConfigError(f"{self.path}: cannot be read ({problem})")
+        flown = len(self.rows["results"][-1])
+        if flown != n_episodes:
+            raise ConfigError(
+                f"{self.path}: evaluations of {flown} episodes; "
+                f"n_episodes (--eval-episodes) must be {flown}"
+            )
+
+    def append(self, values: dict[str, Any]) -> None:
+        """Add an evaluation and write the file.
+
+        NaN stands for what one of the evaluations does not have, such as losses before the first
+        update.
+        """
+        n_before = len(self.rows.get("timesteps", []))
+        for name in {**self.rows, **values}:
+            example = values[name] if name in values else self.rows[name][-1]
+            # An array that is new has rows for the earlier evaluations, too.
+            nothing = np.full(np.shape(example), np.nan)
+            self.rows.setdefault(name, [nothing] * n_before).append(values.get(name, nothing))
+        write_arrays(self.path, **self.rows)
+
+    def latest(self) -> dict[str, float]:
+        """Return the statistics of the latest evaluation by their names in the log."""
+        statistics = {}
         for name, (array, statistic) in LOGGED.items():
-            values = np.asarray(self._rows[group].get(array, [np.nan])[-1], dtype=np.float64)
+            values = np.asarray(self.rows.get(array, [np.nan])[-1], dtype=np.float64)
             if not np.isnan(values).all():
-                found[name] = float(statistic(values))
-        return found
+                statistics[name] = float(statistic(values))
+        return statistics
 
-    def _in_words(self, group: str, reward: float) -> str:
-        latest = self._latest(group)
-        rates = [
-            f"{name} {100 * latest[key]:.1f} %, " for name, key in RATES.items() if key in latest
-        ]
-        return f"{''.join(rates)}mean reward {reward:.2f}"
+    def score(self, by: str, number: int = -1) -> Score:
+        """Return the score of an evaluation; without successes, the reward decides.
 
-
-def last_timestep(model: BaseAlgorithm) -> int:
-    """The number of timesteps at which ``model.learn``, which has begun, ends: whole rollouts."""
-    steps = 1
-    if isinstance(model, OnPolicyAlgorithm):
-        steps = model.n_steps
-    elif isinstance(model, OffPolicyAlgorithm):
-        frequency: Any = model.train_freq
-        steps = frequency.frequency if frequency.unit == TrainFrequencyUnit.STEP else 1
-    size = steps * model.n_envs
-    return model.num_timesteps - (model.num_timesteps - model._total_timesteps) // size * size
+        :param by: the array of the rate.
+        """
+        rate = np.nan_to_num(np.mean(self.rows[by][number])) if by in self.rows else 0.0
+        return float(rate), float(np.mean(self.rows["results"][number]))
 
 
-def _append(rows: dict[str, Any], values: dict[str, Any]) -> None:
-    """Add an evaluation to those before it; NaN stands for what one of them does not have, such as
-    losses before the first.
+def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> dict[str, Any]:
+    """Return the arrays of an evaluation, (n_episodes,) each; those that are reported.
+
+    :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
-    before = len(rows.get("timesteps", []))
-    for name in {**rows, **values}:
-        example = values[name] if name in values else rows[name][-1]
-        nothing = np.full(np.shape(example), np.nan)
-        rows.setdefault(name, [nothing] * before).append(values.get(name, nothing))
+    reported = {"successes": "is_success", "survivals": "survival", "final_errors": "distance"}
+    arrays: dict[str, list[float]] = {name: [] for name in reported}
+    n_uncounted = 0
 
+    def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
+        nonlocal n_uncounted
+        if not local_variables["done"]:
+            return
+        info = local_variables["info"]
+        # evaluate_policy counts an episode only where Monitor reports it.
+        if local_variables.get("is_monitor_wrapped") and "episode" not in info:
+            n_uncounted += 1
+            if n_uncounted > LIVES * env.num_envs:
+                raise TrainingError(
+                    "evaluation: a wrapper drops info['episode'], by which SB3 counts episodes"
+                )
+            return
+        n_uncounted = 0
+        for name, key in reported.items():
+            arrays[name].append(float(info.get(key, np.nan)))
+        # There is no final error without a final position.
+        if not info.get("survival"):
+            arrays["final_errors"][-1] = np.nan
 
-def _score(successes: Any, rewards: Any) -> Score:
-    """Where there are no successes, reward decides."""
-    return float(np.mean(successes)) if len(successes) else 0.0, float(np.mean(rewards))
+    env.seed(seed)
+    rewards, lengths = evaluate_policy(
+        model, env, n_episodes, callback=note, return_episode_rewards=True, warn=False
+    )
+    values: dict[str, Any] = {"results": rewards, "ep_lengths": lengths}
+    for name, array in arrays.items():
+        if not np.isnan(array).all():
+            values[name] = array
+    # Some environments report successes and no failures.
+    if "successes" in values:
+        values["successes"] = np.nan_to_num(values["successes"])
+    return values

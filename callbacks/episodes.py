@@ -37,27 +37,31 @@ class EpisodeLog(BaseCallback):
     def _on_training_start(self) -> None:
         self._start = time.time()
         header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
-        if self._path.exists():
+        is_new = not self._path.exists()
+        if not is_new:
+            # A crash may have cut the last row.
             with self._path.open("rb+") as file:
-                file.truncate(file.read().rfind(b"\n") + 1)  # a crash may have cut the last row
-        rows = read_text(self._path).splitlines()[2:] if self._path.exists() else []
+                file.truncate(file.read().rfind(b"\n") + 1)
+            # The seconds of an earlier training count, too; two lines are the file's head.
+            rows = read_text(self._path).splitlines()[2:]
+            if rows:
+                self._start -= float(rows[-1].split(",")[2])
         self._writer = ResultsWriter(
-            str(self._path), header, ("is_success",), override_existing=not self._path.exists()
+            str(self._path), header, ("is_success",), override_existing=is_new
         )
-        if rows:
-            self._start -= float(rows[-1].split(",")[2])
 
     def _on_step(self) -> bool:
-        infos, seconds = self.locals["infos"], round(time.time() - self._start, 3)
+        seconds = round(time.time() - self._start, 3)
         for row in np.flatnonzero(self.locals["dones"]):
-            info = infos[row]
+            info = self.locals["infos"][row]
             if "episode" in info:
                 values = {
                     "r": round(float(info["episode"]["r"]), 6),
                     "l": int(info["episode"]["l"]),
                     "t": seconds,
+                    "is_success": info.get("is_success", ""),
                 }
-                self._writer.write_row({**values, "is_success": info.get("is_success", "")})
+                self._writer.write_row(values)
         return True
 
     def _on_training_end(self) -> None:

@@ -1,17 +1,25 @@
-"""Callbacks that do something every so many timesteps: their base class, and the simplest one."""
+"""Callbacks that do something at regular intervals, of timesteps or of seconds."""
 
-from stable_baselines3.common.callbacks import EventCallback
+import time
+from collections.abc import Callable
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
+from stable_baselines3.common.utils import safe_mean
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import save_model
 
 
 class EveryTimesteps(EventCallback):
-    """Calls :meth:`_on_event` after the first step at or beyond each multiple of ``every``, also in
-    a resumed training.
+    """Calls :meth:`_on_event` after the first step at or beyond each multiple of ``every``.
 
-    SB3's EveryNTimesteps counts from its last call instead, so its events drift away from the
-    multiples.
+    A resumed training keeps to the same multiples. SB3's EveryNTimesteps counts from its last call
+    instead, so its events drift away from them.
 
     :param every: timesteps, over all environments together.
     :raises ConfigError: it is below 1.
@@ -21,13 +29,15 @@ class EveryTimesteps(EventCallback):
         super().__init__(verbose=verbose)
         if every < 1:
             raise ConfigError(f"{type(self).__name__}: every is {every}, must be at least 1")
-        self._every, self._passed = every, 0  # multiples that the training has passed
+        self._every = every
+        self._passed = 0  # multiples that the training has passed
 
     def _on_training_start(self) -> None:
         self._passed = self.num_timesteps // self._every
 
     def _on_step(self) -> bool:
-        before, self._passed = self._passed, self.num_timesteps // self._every
+        before = self._passed
+        self._passed = self.num_timesteps // self._every
         return self._passed == before or self._on_event()
 
 
@@ -36,7 +46,8 @@ class Checkpoint(EveryTimesteps):
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad.envs import QuadcopterVecEnv
-    >>> model = PPO("MlpPolicy", QuadcopterVecEnv(8, seed=0), n_steps=100, batch_size=400, device="cpu")
+    >>> env = QuadcopterVecEnv(8, seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
     >>> _ = model.learn(1600, callback=Checkpoint(800, "checkpoints/rl_model_{steps}_steps.zip"))
     >>> sorted(path.name for path in Path("checkpoints").iterdir())
     ['rl_model_1600_steps.zip', 'rl_model_800_steps.zip']
@@ -52,10 +63,75 @@ class Checkpoint(EveryTimesteps):
         super().__init__(every, verbose)
         if "{steps}" not in path:
             raise ConfigError(
-                f"Checkpoint: {path}: must hold {{steps}}, or each checkpoint would replace the one before"
+                f"Checkpoint: {path}: must hold {{steps}}, "
+                "or each checkpoint would replace the one before"
             )
         self._path = path
 
     def _on_event(self) -> bool:
         save_model(self.model, self._path.replace("{steps}", str(self.num_timesteps)))
         return True
+
+
+class ProgressLine(BaseCallback):
+    """Reports once a minute how far the training is, where there is no terminal for a progress bar.
+
+    >>> from stable_baselines3 import PPO
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> env = QuadcopterVecEnv(8, max_episode_steps=50, seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
+    >>> lines = []
+    >>> _ = model.learn(800, callback=ProgressLine(lines.append, seconds=0.0))
+    >>> lines[-1].split(",")[0].strip()
+    '800 of 800 timesteps (100 %)'
+
+    :param report: called with each line.
+    :param seconds: between two lines.
+    """
+
+    def __init__(
+        self, report: Callable[[str], None] = print, seconds: float = 60.0, verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        self._report = report
+        self._seconds = seconds
+
+    def _on_training_start(self) -> None:
+        self._start = time.monotonic()
+        self._next_line = self._start + self._seconds
+        self._first_timestep = self.num_timesteps
+        self._last_timestep = last_timestep(self.model)
+
+    def _on_step(self) -> bool:
+        now = time.monotonic()
+        if now >= self._next_line:
+            self._next_line = now + self._seconds
+            self._report(self._line(now - self._start))
+        return True
+
+    def _line(self, elapsed: float) -> str:
+        total = self._last_timestep
+        line = f"{self.num_timesteps:>12,} of {total:,} timesteps"
+        line += f" ({100 * self.num_timesteps / total:.0f} %)"
+        # Monitor fills this buffer where an episode ends.
+        episodes = self.model.ep_info_buffer
+        if episodes:
+            line += f", mean reward {safe_mean([episode['r'] for episode in episodes]):.2f}"
+        # A resumed training is timed from where it continues.
+        seconds_per_step = elapsed / (self.num_timesteps - self._first_timestep)
+        minutes = seconds_per_step * (total - self.num_timesteps) / 60
+        return f"{line}, {minutes:.0f} min left"
+
+
+def last_timestep(model: BaseAlgorithm) -> int:
+    """Return the timestep at which ``model.learn``, which has begun, ends: whole rollouts."""
+    steps = 1
+    if isinstance(model, OnPolicyAlgorithm):
+        steps = model.n_steps
+    elif isinstance(model, OffPolicyAlgorithm):
+        frequency: Any = model.train_freq
+        if frequency.unit == TrainFrequencyUnit.STEP:
+            steps = frequency.frequency
+    rollout = steps * model.n_envs
+    n_rollouts = -(-(model._total_timesteps - model.num_timesteps) // rollout)
+    return model.num_timesteps + n_rollouts * rollout

@@ -52,8 +52,8 @@ def test_the_example_runs(name, tmp_path, monkeypatch):
 
 def test_the_page_lists_every_callback_and_its_settings_are_read():
     from sb3_quad.base.yaml_files import parse_yaml
+    from sb3_quad.training.classes import import_class
     from sb3_quad.training.config import build_config
-    from sb3_quad.training.values import import_class
 
     page = (ROOT / "docs" / "callbacks.md").read_text(encoding="utf-8")
     assert set(callbacks.__all__) <= set(re.findall(r"^\| `(\w+)`", page, flags=re.MULTILINE))

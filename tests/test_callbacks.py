@@ -2,6 +2,7 @@
 
 import random
 import signal
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -16,10 +17,10 @@ from stop_on_signal import StopOnSignal
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.callbacks import best_model
+from sb3_quad.callbacks import best_model, every
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint
+from sb3_quad.callbacks.every import Checkpoint, ProgressLine
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.training.snapshots import random_state, set_random_state
@@ -110,7 +111,7 @@ def test_tensorboard_shows_every_evaluation_where_it_happened(tmp_path):
     assert steps == (20, 40, 60, 80, 100, 120) and shown == pytest.approx(means, abs=1e-5)
 
 
-def test_the_final_error_is_the_median_of_the_flights_that_are_not_lost(tmp_path):
+def test_the_final_error_is_the_median_of_the_flights_that_survive(tmp_path):
     how = {
         "task_kwargs": {"start_position": (0, 0, 0.5), "target_distance": 1.0, "velocity_std": 2.0}
     }
@@ -169,7 +170,7 @@ def test_other_environments_are_evaluated_at_the_same_times_and_decide_nothing(t
         )  # here the same environment, so the same episodes
 
 
-def test_a_training_that_goes_on_keeps_to_the_multiples(tmp_path):
+def test_a_resumed_training_keeps_to_the_multiples(tmp_path):
     model = make_model()
     model.learn(80)
     best = make_best(tmp_path, every=60)
@@ -203,7 +204,26 @@ def test_the_episode_log_is_a_monitor_file(tmp_path):
     assert len(load_results(str(tmp_path))) == 3 * 80 / 10
 
 
-def test_evaluations_that_are_none_are_named(tmp_path):
+def test_a_line_a_minute_says_how_far_the_training_is(monkeypatch):
+    clock = iter(range(0, 10_000, 20))  # each control step of both environments takes 20 s
+    monkeypatch.setattr(every, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    lines = []
+    model = make_model()
+    model.learn(150, callback=ProgressLine(lines.append))
+    steps = [int(line.split(" of ")[0]) for line in lines]
+    assert steps == [*range(6, 161, 6)]  # whole rollouts: 160 timesteps
+    assert lines[0].strip() == "6 of 160 timesteps (4 %), 26 min left"
+    rewards = model.ep_info_buffer  # 16 episodes, the last two of them after the last line
+    mean = np.mean([episode["r"] for episode in rewards][:14])
+    assert lines[-1].strip() == f"156 of 160 timesteps (98 %), mean reward {mean:.2f}, 1 min left"
+    lines.clear()
+    clock = iter(range(0, 10_000, 10))
+    model.learn(80, callback=ProgressLine(lines.append), reset_num_timesteps=False)
+    assert lines[0].startswith("         172 of 240 timesteps (72 %), mean reward")
+    assert lines[0].endswith(", 6 min left")  # 12 timesteps took a minute, 68 are left
+
+
+def test_evaluations_without_results_are_refused(tmp_path):
     np.savez(tmp_path / "evaluations.npz", other=np.zeros(2))
     with pytest.raises(ConfigError, match=r"evaluations\.npz: cannot be read"):
         make_model().learn(80, callback=make_best(tmp_path, 40))

@@ -13,8 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.training.config import build_config
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import train
 
 NUMBER = st.floats(-1e3, 1e3)
@@ -125,7 +124,7 @@ def test_any_algorithms_coefficients_follow_the_progress(algorithm, name, kwargs
     assert read(model) == pytest.approx(0.25, abs=1e-9)
 
 
-def test_a_training_that_goes_on_starts_where_it_stopped(tmp_path):
+def test_a_resumed_training_starts_where_it_stopped(tmp_path):
     model = make(DAgger)
     model.learn(
         40,

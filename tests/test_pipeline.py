@@ -1,5 +1,5 @@
-"""Pipelines: stages hand their agents on, interruptions go on where they were, and trimming cancels
-an offset.
+"""Pipelines: stages pass their agents on, interrupted ones resume where they were, and the offset
+correction cancels an offset.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from sb3_quad.algorithms.offset_correction import (
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
+from sb3_quad.callbacks.every import ProgressLine
 from sb3_quad.cli import main
 from sb3_quad.cli.parser import PAIRS
 from sb3_quad.controllers.pretrained import load_pretrained
@@ -83,6 +84,24 @@ def policy(path):
     return PPO.load(path).policy.state_dict()
 
 
+def test_lines_say_how_far_the_pipeline_is_unless_a_bar_does(tmp_path, job, monkeypatch):
+    monkeypatch.setattr(
+        "sb3_quad.training.trainer.ProgressLine", partial(ProgressLine, seconds=0.0)
+    )
+    lines = []
+    result = run_pipeline(tiny(tmp_path), job, "stages", lines.append)
+    stages = [line for line in lines if line.startswith("stage ")]
+    assert [line.split(" on ")[0] for line in stages] == [
+        "stage 1 of 2, one: dagger",
+        "stage 2 of 2, two: ppo_bc",
+    ]
+    assert sum("256 of 256 timesteps (100 %)" in line for line in lines) == 2
+    assert result.exit_code == 0
+    lines.clear()
+    run_pipeline(tiny(tmp_path), {**job, "progress": True}, "stages", lines.append)
+    assert lines and not [line for line in lines if "of 256 timesteps (" in line]
+
+
 def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
     stages = [STAGES[0], {**STAGES[1], "settings": {"learning_rate": 0.0, "n_epochs": 1}}]
     result = run_pipeline(tiny(tmp_path, stages), job, "stages", quiet)
@@ -95,7 +114,7 @@ def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
 
 
 def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
-    with pytest.raises(TrainingError, match=r"stage 'one'.*mean_reward 1.*logs/dagger"):
+    with pytest.raises(TrainingError, match=r"stage 'one'.*mean_reward=1.0.*logs/dagger"):
         run_pipeline(
             tiny(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]]),
             job,
@@ -117,28 +136,48 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
             "see the 18 features alone",
         ),
         (
-            [{**STAGES[0], "position_scale": 0.6}],
-            "position_scale goes with correct_offset: position",
+            [{**STAGES[0], "correct_offset": {"kind": "arrival", "scale": 0.6}}],
+            "scale does not go with kind: arrival",
         ),
         (
-            [{**STAGES[0], "correct_offset": "hover", "overshoot_cost": 2.0}],
-            "overshoot_cost goes with correct_offset: arrival",
+            [{**STAGES[0], "correct_offset": {"kind": "hover", "overshoot_cost": 2.0}}],
+            "overshoot_cost does not go with kind: hover",
+        ),
+        ([{**STAGES[0], "correct_offset": {"kind": "arrival", "round": 2}}], "did you mean 'round"),
+        ([{**STAGES[0], "correct_offset": "hovering"}], "'position', 'hover' or 'arrival'"),
+        (
+            [
+                {
+                    **STAGES[0],
+                    "correct_offset": {
+                        "kind": "arrival",
+                        "env_kwargs": {"randomize": {"gust": {}}},
+                    },
+                }
+            ],
+            "did you mean 'gusts'",
         ),
         (
             [
                 {
                     **STAGES[0],
+                    "env": "Pendulum-v1",
+                    "conf_file": "PENDULUM",
                     "correct_offset": "arrival",
-                    "correction_env_kwargs": {"randomize": {"gust": {}}},
                 }
             ],
-            "did you mean 'gusts'",
+            "Pendulum-v1 is not an environment of this package",
         ),
         ([], "at least 1"),
         ([STAGES[0], STAGES[0]], "one, one: give each a name of its own"),
     ],
 )
 def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, message, capsys):
+    pendulum = tmp_path / "pendulum.yml"
+    pendulum.write_text("Pendulum-v1: {n_timesteps: 10}")
+    for stage in stages:
+        if stage.get("conf_file") == "PENDULUM":
+            stage["conf_file"] = str(pendulum)
     code = main(
         ["train", "--conf-file", str(write(tmp_path, stages)), "-f", str(tmp_path / "logs")]
     )
@@ -190,7 +229,7 @@ def test_moved_and_scaled_positions_are_part_of_the_actor():
     )
 
 
-def test_an_agent_that_crashes_cannot_be_trimmed():
+def test_the_offset_of_an_agent_that_crashes_cannot_be_measured():
     model = PPO(
         "MlpPolicy", QuadcopterVecEnv(4, seed=1), n_steps=8, batch_size=8, seed=0, device="cpu"
     )
@@ -199,7 +238,7 @@ def test_an_agent_that_crashes_cannot_be_trimmed():
 
 
 @pytest.mark.slow
-def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
+def test_the_correction_cancels_the_offset_of_a_trained_agent(monkeypatch):
     monkeypatch.setattr(
         "sb3_quad.algorithms.offset_correction.fly", partial(fly, max_steps=700)
     )  # 7 s are enough to arrive
@@ -210,27 +249,27 @@ def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
     assert result.before > 0.4 and result.after < 0.05
 
 
-def test_a_stage_says_where_and_how_often_its_agent_is_trimmed(tmp_path, job, monkeypatch):
+def test_a_stage_configures_the_flights_and_rounds_of_its_correction(tmp_path, job, monkeypatch):
     seen = []
     monkeypatch.setattr(
         pipeline_module,
         "correct_arrival",
         lambda *given: seen.append(given) or Correction(1.0, 0.5),
     )
-    for own in (
-        {},
-        {"correction_env_kwargs": {"randomize": {"mass": [0.9, 1.1]}}, "correction_rounds": 2},
-    ):
+    twice = {"kind": "arrival", "rounds": 2, "env_kwargs": {"randomize": {"mass": [0.9, 1.1]}}}
+    for correction in ("arrival", twice):
         settings = {"env_kwargs": {"randomize": {"share": 0.5}, "noise": 0.1}}
-        stage = {**STAGES[0], "correct_offset": "arrival", "settings": settings, **own}
+        stage = {**STAGES[0], "correct_offset": correction, "settings": settings}
         run_pipeline(tiny(tmp_path, [stage]), job, "stages", quiet)
-    randomize = [worlds.randomize for _, _, _, worlds, _ in seen]
-    assert [(each.share, each.mass and each.mass.high) for each in randomize] == [
+    flown = [settings for _, _, _, settings, _ in seen]
+    assert [
+        (how.randomize.share, how.randomize.mass and how.randomize.mass.high) for how in flown
+    ] == [
         (0.5, None),
         (1.0, 1.1),
         (1.0, 1.1),
     ]
-    assert {worlds.noise for _, _, _, worlds, _ in seen} == {0.1}
+    assert {how.noise for how in flown} == {0.1}
     assert len({seed for _, seed, *_ in seen}) == 2 and seen[0][1] == seen[1][1]
 
 
@@ -283,7 +322,7 @@ def small_file(tmp_path):
     )
 
 
-def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, monkeypatch):
+def test_an_interrupted_pipeline_resumes_to_the_same_agents(tmp_path, capsys, monkeypatch):
     whole, interrupted = (str(tmp_path / name) for name in ("whole", "interrupted"))
     arguments = ["train", "--conf-file", str(small_file(tmp_path)), "--eval-episodes", "0"]
     assert main([*arguments, "-f", whole]) == 0
@@ -294,7 +333,7 @@ def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, mo
         original(self)
         rollouts.append(None)
         if len(rollouts) == 1:
-            os.kill(os.getpid(), signal.SIGINT)  # within stage two, when stage one is done
+            os.kill(os.getpid(), signal.SIGINT)  # within the second stage, when the first is done
 
     monkeypatch.setattr(PPOBC, "train", train)
     assert main([*arguments, "-f", interrupted]) == 130
@@ -319,7 +358,7 @@ def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
 
 
 def two_stages(tmp_path):
-    """The first is to be trimmed."""
+    """The offset of the first is to be corrected."""
     first = {**STAGES[0], "conf_file": "nominal/dagger.yml"}
     return tiny(tmp_path, [{**first, "correct_offset": "hover"}, {**first, "name": "two"}])
 
@@ -328,7 +367,9 @@ def no_correction(model, seed, settings):
     return Correction(1.0, 0.0)
 
 
-def test_a_stage_is_not_trained_anew_when_its_trimming_was_interrupted(tmp_path, job, monkeypatch):
+def test_a_stage_is_not_trained_again_when_its_correction_was_interrupted(
+    tmp_path, job, monkeypatch
+):
     def interrupted(model, seed, settings):
         signal.raise_signal(signal.SIGTERM)
 

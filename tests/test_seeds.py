@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from sb3_quad.base.seeds import LARGEST, PURPOSES, row_seeds, seed_for
 from sb3_quad.envs import QuadcopterVecEnv, QuadcopterVectorEnv
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.training.config import build_config
+from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.environments import make_environments
-from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
 
 seeds = st.integers(0, LARGEST - 1)

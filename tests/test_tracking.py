@@ -62,8 +62,8 @@ def test_tensorboard_has_the_hyperparameters(tmp_path, capsys):
 def test_tracking_says_what_it_needs(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert main([*TRAIN, "-f", str(tmp_path / "logs"), "--track"]) == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert "--track needs wandb" in said and said.endswith(
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--track needs wandb" in line and line.endswith(
         "pip install '.[track]' from a clone of sb3_quad"
     )
     assert not [*tmp_path.iterdir()]

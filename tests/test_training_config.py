@@ -18,12 +18,25 @@ from sb3_quad.base.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.cli.commands.train import DEFAULT_PIPELINE, THESIS
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.training.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
-from sb3_quad.training.config import SETTINGS, build_config, check_environment, load_config
-from sb3_quad.training.job import TrainingJob, describe
+from sb3_quad.training.algorithms import (
+    ALGORITHMS,
+    constructor_parameters,
+    convert,
+    get_algorithm,
+    takes_whole,
+)
+from sb3_quad.training.config import (
+    SETTINGS,
+    TrainingJob,
+    build_config,
+    check_environment,
+    describe,
+    load_config,
+)
 from sb3_quad.training.pipeline import load_pipeline
-from sb3_quad.training.values import convert, takes_whole
+from sb3_quad.training.trainer import build_model
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}
@@ -108,6 +121,12 @@ def test_any_text_on_the_command_line_is_a_value(text):
         ({"vec_env": "bath"}, "'batch', 'dummy' or 'subproc'"),
         ({"env_kwargs": {"nosie": 0}}, "did you mean 'noise'"),
         ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "did you mean 'nn.Tanh'"),
+        ({"policy_kwargs": {"net_arhc": [8]}}, "did you mean 'net_arch'"),
+        ({"policy_kwargs": {"net_arch": 8}}, "policy_kwargs: net_arch is 8, must be a valid list"),
+        (
+            {"policy_kwargs": {"net_arch": {"pi": [8, 0]}}},
+            r"net_arch is \{'pi': \[8, 0\]\}, must be at least 1",
+        ),
         ({"normalize": True}, "normalize: Input should be False"),
         ({"callback": 3}, "package.module.Class"),
     ],
@@ -116,6 +135,43 @@ def test_bad_settings_are_named(settings, message):
     with pytest.raises(ConfigError, match=message) as error:
         build(**settings)
     assert "\n" not in str(error.value)
+
+
+class Broken(PPO):
+    """Its constructor has a bug."""
+
+    def __init__(self, policy, env, seed, device, verbose, tensorboard_log, bug="len(1)"):
+        eval(bug)
+
+
+class Demanding(PPO):
+    def __init__(self, policy, env, seed, device, verbose, tensorboard_log, needed):
+        raise AssertionError
+
+
+def test_arguments_are_checked_before_a_constructor_is_called_and_its_bugs_are_no_bad_settings(
+    monkeypatch,
+):
+    for name in ("Broken", "Demanding"):
+        monkeypatch.setitem(ALGORITHMS, name, f"test_training_config:{name}")
+
+    def make(algo, **settings):
+        return build_model(TrainingJob(config=build(algo, **settings)), QuadcopterVecEnv(2))
+
+    for bug, kind in (
+        ("len(1)", TypeError),
+        ("{}[0]", KeyError),
+        ("exec('raise RuntimeError')", RuntimeError),
+    ):
+        with pytest.raises(kind) as raised:
+            make("Broken", bug=bug)
+        assert type(raised.value) is kind
+    with pytest.raises(ConfigError, match="Demanding: missing a required argument: 'needed'"):
+        make("Demanding")
+    with pytest.raises(ConfigError, match="did you mean 'bug'"):
+        make("Broken", bugg="")
+    with pytest.raises(ConfigError, match="more than this machine's memory"):
+        make("Broken", bug="exec('raise RuntimeError(\"cannot allocate memory\")')")
 
 
 @pytest.mark.parametrize("algo", ["dagger", "ppo_bc", "ppo"])
@@ -145,7 +201,7 @@ def test_unknown_names_come_with_the_nearest():
         check_environment("QuadStateRecovry-v0")
     with pytest.raises(ConfigError, match=r"did you mean 'thesis/dagger.yml'"):
         load_config("dagger", ENV, "thesis/dager.yml")
-    with pytest.raises(ConfigError, match="learns from no expert"):
+    with pytest.raises(ConfigError, match="does not learn from an expert"):
         build("ppo", expert="pid")
     with pytest.raises(ConfigError, match="no batched form"):
         build("ppo", "Pendulum-v1", vec_env="batch")

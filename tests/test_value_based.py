@@ -18,8 +18,7 @@ from sb3_quad.controllers.zips import load_model, load_zip, saved_algorithm
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.config import build_config, load_config
-from sb3_quad.training.job import TrainingJob, describe
+from sb3_quad.training.config import TrainingJob, build_config, describe, load_config
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import resume, train
 from sb3_quad.tuning.space import load_space
@@ -199,7 +198,7 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
 @pytest.mark.parametrize(
     ("algo", "changes", "message"),
     [
-        ("sac", {"expert": "pid"}, "learns from no expert"),
+        ("sac", {"expert": "pid"}, "does not learn from an expert"),
         ("td3", {"noise_type": "pink"}, "noise_type"),
         ("sac_bc", {"buffer_size": 2**39}, "this machine's memory"),
         ("sac_bc", {"train_freq": [2, "episode"]}, "counts episodes"),

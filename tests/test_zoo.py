@@ -120,7 +120,8 @@ for script in sys.argv[1:]:
     plot = "plot" in script
     try:
         if plot or script in ("train", "enjoy"):
-            getattr(importlib.import_module(("rl_zoo3.plots." if plot else "rl_zoo3.") + script), script)()
+            package = "rl_zoo3.plots." if plot else "rl_zoo3."
+            getattr(importlib.import_module(package + script), script)()
         else:
             runpy.run_module("rl_zoo3." + script, run_name="__main__")
     except Seen as caught:
@@ -293,10 +294,10 @@ for path in sys.argv[1:]:
 
 @with_zoo
 def test_a_second_stage_starts_from_the_first(session):
-    folder, (_, said, *_) = session
+    folder, (_, output, *_) = session
     path = folder / "logs" / "ppo_bc" / f"{ENV}_1"
     settings, _ = open_run(path).read_yaml()
-    assert settings["vec_env"] == "dummy" and "Using 2 environments" in said
+    assert settings["vec_env"] == "dummy" and "Using 2 environments" in output
     assert (path / "0.monitor.csv").read_text().splitlines()[1] == "r,l,t,is_success"
 
 
@@ -331,5 +332,8 @@ def test_ours_shows_its_runs(session, capsys):
 
 @with_zoo
 def test_the_plain_command_knows_us_by_custom_envs(tmp_path):
-    code = "import sys; sys.argv = ['rl_zoo3', 'train', '--help']; from rl_zoo3.cli import main; main()"
+    code = (
+        "import sys; sys.argv = ['rl_zoo3', 'train', '--help']; "
+        "from rl_zoo3.cli import main; main()"
+    )
     assert "dagger,ppo_bc,sac_bc" in "".join(run("-c", code, cwd=tmp_path).split())

@@ -76,7 +76,7 @@ def test_ours_shows_runs_of_other_algorithms(foreign_run, capsys):
     assert "after 0.30 s" in capsys.readouterr().out
 
 
-def test_what_rl_zoo3_was_told_on_its_command_line_counts(foreign_run, capsys):
+def test_options_on_the_command_line_of_rl_zoo3_count(foreign_run, capsys):
     """It keeps env_kwargs in args.yml then, and lets them stand for all."""
     (foreign_run / ENV / "args.yml").write_text(
         yaml.dump(OrderedDict(algo="sac", env=ENV, env_kwargs={"max_episode_steps": 10}))

@@ -21,9 +21,8 @@ from sb3_quad.base.literals import parse_mapping
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.training.algorithms import constructor_parameters, takes_expert
+from sb3_quad.training.algorithms import constructor_parameters, convert, takes_expert
 from sb3_quad.training.config import SETTINGS, VecEnvKind
-from sb3_quad.training.values import convert
 
 Settings = dict[str, Any]
 VEC_ENVS = get_args(VecEnvKind)

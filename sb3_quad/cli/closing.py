@@ -1,5 +1,6 @@
-"""What a command prints at its end: agents and experts on the same fresh episodes, where everything
-is, what to type next.
+"""The closing lines of a command: tables of agents and experts, where everything is, what is next.
+
+The tables are of fresh episodes, the same for all.
 """
 
 import shlex
@@ -14,24 +15,25 @@ from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.tables import Table
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
 from sb3_quad.training.trainer import TrainingResult
 
-FRESH_EPISODES, PIPELINE_EPISODES = 240, 480  # in a table after a single run, and after a pipeline
+FRESH_EPISODES = 240  # in the table after a single run
+PIPELINE_EPISODES = 480  # in each table after a pipeline
 
 
 def print_tables(
     controllers: Mapping[str, Any],
-    how: Mapping[str, Any],
+    settings: Mapping[str, Any],
     n: int,
     seed: int,
     thesis_columns: Iterable[str] = (),
 ) -> None:
     """Print the tables of some controllers over the same episodes of both tasks of the thesis.
 
-    :param how: the controllers fly in any task: vehicle, noise and scaling.
+    :param settings: how the controllers fly in any task: vehicle, noise and scaling.
     """
     result = compare(controllers, n_flights=n, seed=seed, thesis_columns=thesis_columns, **how)
     for table in result.tables:
@@ -39,8 +41,7 @@ def print_tables(
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
-    """The table of the agent of a job and of its expert over the same episodes, which no training
-    has seen.
+    """Return the table of a job's agent and its expert, over episodes that no training has flown.
 
     :param job: of an environment of this package.
     """
@@ -59,13 +60,10 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
 
 
 def _expert(job: TrainingJob) -> Any:
-    """The expert of a training, or the default one, for the vehicle that the agent flies and in its
-    layout.
-    """
-    flown = job.flight_settings
-    return resolve_expert(
-        job.config.expert or DEFAULT_EXPERT, flown.vehicle, layout=flown.rotor_layout
-    )
+    """Return the expert of a training, or the default one, for the vehicle that the agent flies."""
+    settings = job.flight_settings
+    expert = job.config.expert or DEFAULT_EXPERT
+    return resolve_expert(expert, settings.vehicle, layout=settings.rotor_layout)
 
 
 def close_run(result: TrainingResult) -> int:
@@ -74,54 +72,49 @@ def close_run(result: TrainingResult) -> int:
         return result.exit_code
     if result.job.config.task is not None:
         console().print(agent_and_expert(result.job, result.model))
-    if result.seconds:  # else a complete run that made no evaluations
+    # A complete run without evaluations does not know how long it took.
+    if result.seconds:
         print(f"trained in {result.seconds:.1f} s")
-    print(
-        f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}"
-    )
+    names = sorted(entry.name for entry in result.run.path.iterdir())
+    print(f"saved in {result.run.path}: {', '.join(names)}")
     _print_next(result.run)
     return 0
 
 
 def close_pipeline(result: PipelineResult, seconds: float) -> int:
-    """Print both tasks' tables of all stages' agents and where everything is. Returns the exit
-    code.
+    """Print tables of all stages' agents and where everything is. Returns the exit code.
 
     :param seconds: that the pipeline took.
     """
     if result.exit_code != 0:
         return result.exit_code
-    flown = result.job.flight_settings
     controllers = {"expert": _expert(result.job)}
-    controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
+    for name, stage in result.stages.items():
+        controllers[name] = load_model(stage.agent)
+    settings = result.job.flight_settings.in_any_task()
+    seed = seed_for("table", result.job.seed)
     thesis_columns = ("expert", "IL-agent", "RL-agent")
-    print_tables(
-        controllers,
-        flown.in_any_task(),
-        PIPELINE_EPISODES,
-        seed_for("table", result.job.seed),
-        thesis_columns,
-    )
+    print_tables(controllers, settings, PIPELINE_EPISODES, seed, thesis_columns)
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print(f"saved in {result.folder}, {seconds:.0f} s in all")
-    _print_next(open_run([*result.stages.values()][-1].run))
+    last = [*result.stages.values()][-1]
+    _print_next(open_run(last.run))
     return 0
 
 
 def _print_next(run: RunFolder) -> None:
-    """Print the commands that show, measure and export a run's agent, if it flies an environment of
-    this package.
+    """Print the commands that show, measure and export the agent of a run.
+
+    Environments of other packages have no such commands.
     """
     if run.name not in ENVIRONMENTS:
         return
-    agent, label = (
-        shlex.quote(str(run.result)),
-        shlex.quote(f"{run.path.parent.name}_{run.path.name}"),
-    )
-    vehicle = (
-        " --vehicle itm" if agent_settings(run.result)[0].vehicles else ""
-    )  # else the one that it was trained on
+    agent = shlex.quote(str(run.result))
+    label = shlex.quote(f"{run.path.parent.name}_{run.path.name}")
+    # An agent of many vehicles has none that export could take by itself.
+    settings, _ = agent_settings(run.result)
+    vehicle = " --vehicle itm" if settings.vehicles else ""
     print(f"next:\n  sb3-quad enjoy {agent} --env {run.name} -o {label}.png")
     print(f"  sb3-quad demo {agent} pid -o {label}.html")
     print(f"  sb3-quad evaluate {agent} --suite quick -o evaluations/{label}")

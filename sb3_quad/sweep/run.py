@@ -28,8 +28,8 @@ from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.sweep.expand import Run
 from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, Plan, RunRecord, SweepFolder
 from sb3_quad.sweep.spec import Evaluation
+from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.environments import make_environments
-from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.pipeline import (
     STATUS_FILE,
     Pipeline,

@@ -1,16 +1,22 @@
-"""The algorithms that can be trained, imported when first needed."""
+"""The algorithms that can be trained, and the keywords that their constructors take."""
 
 import inspect
+import math
 import pkgutil
 import typing
+from contextlib import suppress
 from typing import Any
 
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.literals import parse_number, parse_value
 
+# Imported when first needed.
 ALGORITHMS = {
     "dagger": "sb3_quad.algorithms.dagger:DAgger",
     "ppo_bc": "sb3_quad.algorithms.ppo_bc:PPOBC",
@@ -19,9 +25,8 @@ ALGORITHMS = {
     "sac": "stable_baselines3.sac.sac:SAC",
     "td3": "stable_baselines3.td3.td3:TD3",
 }
-# Set by a training job rather than by the settings of an algorithm.
-_SET_BY_JOB = {
-    "self",
+# A training job gives these itself, so they are no settings of an algorithm.
+_SET_BY_JOB = (
     "policy",
     "env",
     "expert",
@@ -30,11 +35,13 @@ _SET_BY_JOB = {
     "tensorboard_log",
     "device",
     "seed",
-}
+)
+_LINEAR = "lin_"
+_CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 def get_algorithm(name: str) -> type[BaseAlgorithm]:
-    """The class of an algorithm by its name.
+    """Return the class of an algorithm.
 
     :raises ConfigError: an unknown name.
     """
@@ -43,31 +50,10 @@ def get_algorithm(name: str) -> type[BaseAlgorithm]:
     return pkgutil.resolve_name(ALGORITHMS[name])  # type: ignore[no-any-return]
 
 
-def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
-    """What an algorithm's settings may give: its constructor's keywords, less those that a training
-    job sets.
-
-    The annotation of each is a type; Any where there is none, or where a name in the annotations
-    cannot be resolved.
-    """
-    try:
-        types = typing.get_type_hints(
-            algorithm.__init__, localns={"VecEnv": VecEnv}
-        )  # a forward reference of GymEnv
-    except NameError:
-        types = {}
-    return {
-        name: parameter.replace(annotation=types.get(name, Any))
-        for name, parameter in inspect.signature(algorithm.__init__).parameters.items()
-        if name not in _SET_BY_JOB
-        and not name.startswith("_")
-        and parameter.kind is not parameter.VAR_KEYWORD
-    }
-
-
 def is_off_policy(algorithm: type[BaseAlgorithm]) -> bool:
-    """Whether the algorithm learns from a replay buffer, such as SAC: its rollouts are
-    ``train_freq`` steps long.
+    """Whether the algorithm learns from a replay buffer, such as SAC.
+
+    Its rollouts are ``train_freq`` steps long.
     """
     return issubclass(algorithm, OffPolicyAlgorithm)
 
@@ -75,3 +61,105 @@ def is_off_policy(algorithm: type[BaseAlgorithm]) -> bool:
 def takes_expert(algorithm: type[BaseAlgorithm]) -> bool:
     """Whether the algorithm learns from an expert."""
     return "expert" in inspect.signature(algorithm.__init__).parameters
+
+
+def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
+    """Return the keywords of a constructor, an algorithm's or a policy's, that settings may give.
+
+    Each annotation is a type. It is Any where an annotation is missing or has a name that cannot be
+    resolved.
+    """
+    # SB3's GymEnv holds "VecEnv" as a string, which only some of its modules can resolve.
+    try:
+        types = typing.get_type_hints(algorithm.__init__, localns={"VecEnv": VecEnv})  # type: ignore[misc]
+    except NameError:
+        types = {}
+    parameters = {}
+    for name, parameter in inspect.signature(algorithm).parameters.items():
+        is_setting = name not in _SET_BY_JOB and not name.startswith("_")
+        if is_setting and parameter.kind is not parameter.VAR_KEYWORD:
+            parameters[name] = parameter.replace(annotation=types.get(name, Any))
+    return parameters
+
+
+def convert(
+    value: Any,
+    parameter: inspect.Parameter,
+    where: str,
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> Any:
+    """Return ``value`` as the constructor's ``parameter``, whose annotation is a type, takes it.
+
+    Strings become literals or, as ``lin_x``, SB3's ``LinearSchedule(x, 0, 1)``, which every SB3 can
+    unpickle.
+
+    :param least: the smallest number that is allowed, also at the start of a schedule.
+    :param most: the largest one.
+    :raises ConfigError: text where a number belongs, a fraction where a whole number does, another
+        type; NaN or infinity; a number out of range.
+    """
+    is_linear = isinstance(value, str) and value.startswith(_LINEAR)
+    if is_linear:
+        converted = parse_number(value.removeprefix(_LINEAR))
+        if isinstance(converted, str) or not math.isfinite(converted):
+            raise ConfigError(f"{where} is {value!r}, must be lin_ and a number, such as lin_1e-3")
+    else:
+        if isinstance(value, str):
+            value = parse_value(value)
+        converted = check(parameter.annotation, value, where)
+    if isinstance(converted, (int, float)):
+        if converted < least:
+            raise ConfigError(f"{where} is {value!r}, must be at least {least:g}")
+        if converted > most:
+            raise ConfigError(f"{where} is {value!r}, must be at most {most:g}")
+    if not is_linear:
+        return converted
+    schedule = LinearSchedule(float(converted), 0.0, 1.0)
+    if not _takes(parameter.annotation, schedule):
+        raise ConfigError(f"{where} is {value!r}, but it takes no schedule")
+    return schedule
+
+
+def check(kind: Any, value: Any, where: str) -> Any:
+    """Return ``value`` as the type ``kind``, by pydantic.
+
+    :raises ConfigError: it is of another type; the message says what it must be.
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} is {value}, must be finite")
+    try:
+        # Strict for booleans, since True is not 1.
+        return TypeAdapter(kind, config=_CHECKS).validate_python(
+            value, strict=isinstance(value, bool)
+        )
+    except PydanticUserError:
+        # A type that pydantic cannot check.
+        return value
+    except ValidationError as error:
+        # A union has one error for each of its types: by "int", "float", "callable", …
+        messages = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}
+    # rl_zoo3 imports classes by their names, so a string may stand for a class.
+    if isinstance(value, str) and "is" in messages:
+        return value
+    if "greater" in messages:
+        expected = "at least 1"
+    elif "float" in messages:
+        expected = "a number or lin_<number>" if "callable" in messages else "a number"
+    elif "int" in messages:
+        expected = "a whole number"
+    else:
+        expected = next(iter(messages.values())).removeprefix("Input should be ")
+    raise ConfigError(f"{where} is {value!r}, must be {expected}")
+
+
+def takes_whole(parameter: inspect.Parameter) -> bool:
+    """Whether a constructor's parameter takes whole numbers and no others."""
+    return _takes(parameter.annotation, 2) and not _takes(parameter.annotation, 0.5)
+
+
+def _takes(kind: Any, value: Any) -> bool:
+    with suppress(ConfigError):
+        check(kind, value, "")
+        return True
+    return False

@@ -1,12 +1,12 @@
-"""Scales of an agent's features, found in its own flights, so that it arrives at targets as its
-teacher does.
+"""Scales of an agent's features with which it arrives at targets as its teacher does.
 
-An agent that learns from noisy observations of vehicles that it is not told learns the mean of its
-teacher's actions. That answers to each feature less than the teacher does (regression dilution): it
-brakes late, overshoots and comes back. The thesis divides the position's σ by an α found by trial
-(Eq. 4.10). Here each of GROUPS has an α, found by the cross-entropy method: candidates fly the same
-episodes, and the next ones are sampled around the best. The α go into the actor's first layer,
-since W (s - μ) / (α σ) = (W / α) (s - μ) / σ: the zip stays stock.
+An agent that learns from noisy observations of vehicles whose parameters it does not know learns
+the mean of its teacher's actions. That answers to each feature less than the teacher does
+(regression dilution): it brakes late, overshoots and comes back. The thesis divides the position's
+σ by an α found by trial (Eq. 4.10). Here each of GROUPS has an α, found by the cross-entropy method
+in the agent's own flights: candidates fly the same episodes, and the next ones are sampled around
+the best. The α are folded into the actor's first layer, since W (s - μ) / (α σ) =
+(W / α) (s - μ) / σ: the zip stays stock.
 """
 
 from fnmatch import fnmatchcase
@@ -34,21 +34,29 @@ GROUPS = (
     "velocity_z",
     "body_rate_[xy]",
 )
+# (groups, features): 1 where a feature belongs to a group.
 _MEMBERS = np.array(
     [[fnmatchcase(name, group) for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64
 )
-ROUNDS, CANDIDATES, BEST = 8, 16, 4
-FIRST_SPREAD, KEPT = 0.08, 0.3  # of log α at first; share of the last round's mean in the next
-N_FLIGHTS, N_CHECKED = (
-    120,
-    480,
-)  # of a candidate to targets, half of its recoveries; of the agent before and after
-LEFT, FAILED, LOST = (
-    0.25,
-    0.2,
-    10.0,
-)  # s that a flight costs that leaves its target again, fails, or is lost (fails, too)
-_Sets = list[tuple[FlightSettings, float]]  # of flights, with the weight of their time
+# The cross-entropy method.
+ROUNDS = 8
+CANDIDATES = 16
+BEST = 4
+# Standard deviation of log α in the first round.
+FIRST_SPREAD = 0.08
+# Share of the last round's mean in the next one.
+KEPT = 0.3
+# Flights of a candidate to targets; half of them are its recoveries.
+N_FLIGHTS = 120
+# Flights of the agent before and after.
+N_CHECKED = 480
+# Costs of a flight in seconds: for leaving its target after reaching it, for not succeeding, and
+# for crashing or flying out of range, which costs that of not succeeding, too.
+OVERSHOOT_COST = 0.25
+MISS_COST = 0.2
+CRASH_COST = 10.0
+# Flights, with the weight of their settling time.
+_Sets = list[tuple[FlightSettings, float]]
 
 
 def correct_arrival(
@@ -56,65 +64,76 @@ def correct_arrival(
     seed: int,
     settings: FlightSettings,
     trained: FlightSettings,
-    left: float = LEFT,
+    overshoot_cost: float = OVERSHOOT_COST,
 ) -> Correction:
-    """Find the scales of an agent and fold them into its first layer, unless fresh flights say that
-    they make it worse.
+    """Find the scales of an agent and fold them into its first layer.
+
+    They are not kept where they make the agent worse in fresh flights.
 
     :param seed: of the flights.
     :param settings: how evaluations fly it.
-    :param trained: how it was trained, or what else is to count: vehicles and disturbances.
-    :param left: s that it costs to leave a target again.
-    :return: the cost before and after, s: the mean time to stay within 0.1 m of targets 10 m away,
-        0.3 times the same in the worlds of the training, and what it costs to leave a target, to
-        fail and to be lost, also in twice as many recoveries.
+    :param trained: how it was trained, or with other vehicles and disturbances that are to count.
+    :param overshoot_cost: cost in s of leaving a target after reaching it.
+    :return: the cost before and after, s: the mean settling time within 0.1 m of targets 10 m away,
+        0.3 times the same with the randomized dynamics of the training, and the costs of leaving a
+        target, missing it and crashing, also in twice as many recoveries.
     :raises ConfigError: an agent whose first layer does not read these observations.
     """
-    layer, rng = first_layer(model, settings.size), np.random.default_rng(seed)
-    agent: Any = (
-        partial(mean_actions, network_of(model.policy))
-        if isinstance(model.policy, ActorCriticPolicy)
-        else model
+    layer = first_layer(model, settings.size)
+    rng = np.random.default_rng(seed)
+    agent: Any = model
+    if isinstance(model.policy, ActorCriticPolicy):
+        agent = partial(mean_actions, network_of(model.policy))
+    undisturbed = settings.with_changes(
+        task="target_tracking", task_kwargs=None, max_episode_steps=500
     )
-    worlds = trained.with_changes(position_integral=settings.position_integral, task_kwargs=None)
-    sets = [
-        (
-            settings.with_changes(task="target_tracking", task_kwargs=None, max_episode_steps=500),
-            1.0,
-        ),
-        (worlds.with_changes(task="target_tracking", max_episode_steps=600), 0.3),
-        *[(worlds.with_changes(task="state_recovery", max_episode_steps=500), 0.0)] * 2,
-    ]
-    mean, spread = np.zeros(len(GROUPS)), np.full(len(GROUPS), FIRST_SPREAD)
-    for each in row_seeds(seed, ROUNDS):
-        tried = mean + spread * rng.standard_normal((CANDIDATES, len(GROUPS)))
-        best = tried[np.argsort(_costs(agent, tried, sets, each, N_FLIGHTS, left))[:BEST]]
-        mean, spread = KEPT * mean + (1 - KEPT) * best.mean(axis=0), (spread + best.std(axis=0)) / 2
-    before, after = _costs(agent, np.stack([0.0 * mean, mean]), sets, seed, N_CHECKED, left)
+    randomized = trained.with_changes(
+        position_integral=settings.position_integral, task_kwargs=None
+    )
+    targets = randomized.with_changes(task="target_tracking", max_episode_steps=600)
+    recoveries = randomized.with_changes(task="state_recovery", max_episode_steps=500)
+    # The recoveries are there twice, each with episodes of its own.
+    sets = [(undisturbed, 1.0), (targets, 0.3), (recoveries, 0.0), (recoveries, 0.0)]
+    mean = np.zeros(len(GROUPS))
+    spread = np.full(len(GROUPS), FIRST_SPREAD)
+    for round_seed in row_seeds(seed, ROUNDS):
+        candidates = mean + spread * rng.standard_normal((CANDIDATES, len(GROUPS)))
+        costs = _costs(agent, candidates, sets, round_seed, N_FLIGHTS, overshoot_cost)
+        best = candidates[np.argsort(costs)[:BEST]]
+        mean = KEPT * mean + (1 - KEPT) * best.mean(axis=0)
+        spread = (spread + best.std(axis=0)) / 2
+    # Other flights than those of the search decide whether the scales are kept.
+    compared = np.stack([np.zeros_like(mean), mean])
+    before, after = _costs(agent, compared, sets, seed, N_CHECKED, overshoot_cost)
     if after < before:
+        # Features beyond the 18, such as the last action, keep their scale; each age of a history
+        # has a frame.
         frame = np.append(np.exp(mean @ _MEMBERS), np.ones(settings.frame_size - OBSERVATION_SIZE))
+        scales = np.tile(frame, len(settings.ages))
         with th.no_grad():
-            layer.weight.div_(th.as_tensor(np.tile(frame, len(settings.ages))).to(layer.weight))
+            layer.weight.div_(th.as_tensor(scales).to(layer.weight))
     return Correction(float(before), float(min(after, before)))
 
 
 def _costs(
-    agent: Any, log_scales: FloatArray, sets: _Sets, seed: int, n: int, left: float
+    agent: Any, log_scales: FloatArray, sets: _Sets, seed: int, n: int, overshoot_cost: float
 ) -> FloatArray:
-    """What :func:`correct_arrival` minimises for each of m candidates, on the same n flights of each
-    set, (m,).
+    """Return the mean cost in s of each of m candidates, which fly the same n flights of each set.
+
+    :param log_scales: (m, groups).
+    :return: (m,).
     """
+    m = len(log_scales)
     scales = np.repeat(np.exp(log_scales @ _MEMBERS), n, axis=0)
-    total = np.zeros(len(scales))
+    total = np.zeros(m * n)
     for (settings, weight), episodes in zip(sets, row_seeds(seed, len(sets)), strict=True):
         scaled = settings.with_changes(observation_std=scaling(settings)[1] * scales)
-        flights = fly_settings(
-            agent, scaled, row_seeds(episodes, n) * len(log_scales), tolerances=(NEAR,)
-        )
-        stay = np.nan_to_num(flights.settling_time[NEAR], nan=2.0 * flights.flown.max())
-        total += (
-            weight * (stay + left * (flights.time_to[NEAR] < stay))
-            + LOST * ~flights.survival
-            + FAILED * ~flights.success
-        )
-    return np.asarray(total.reshape(len(log_scales), n).mean(axis=1))
+        seeds = row_seeds(episodes, n) * m
+        flights = fly_settings(agent, scaled, seeds, tolerances=(NEAR,))
+        # A flight that never settles counts as twice the longest.
+        settling_time = np.nan_to_num(flights.settling_time[NEAR], nan=2.0 * flights.flown.max())
+        overshot = overshoot_cost * (flights.time_to[NEAR] < settling_time)
+        crashed = CRASH_COST * ~flights.survival
+        missed = MISS_COST * ~flights.success
+        total += weight * (settling_time + overshot) + crashed + missed
+    return np.asarray(total.reshape(m, n).mean(axis=1))

@@ -1,12 +1,12 @@
-"""The settings of one training job, from rl-zoo's YAML: one file per algorithm, top keys
-environment ids.
+"""The settings of one training job, and the job itself.
 
-:class:`TrainingConfig` lists the keys of a job; any other key is a keyword of the algorithm's
-constructor, where ``lin_1e-3`` falls linearly to 0 over the training; a learning rate to its n-th
-part, in the last of n updates.
+Settings come from rl-zoo's YAML: one file per algorithm, whose top keys are environment ids.
+:class:`TrainingConfig` lists the keys of a job. Any other key is a keyword of the algorithm's
+constructor. There, ``lin_1e-3`` falls linearly to 0 over the training; a learning rate falls to its
+n-th part, which it has in the last of n updates.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -29,21 +29,25 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.tasks import TASKS
+from sb3_quad.simulation.tasks import TASKS, in_words
 from sb3_quad.training.algorithms import (
+    check,
     constructor_parameters,
+    convert,
     get_algorithm,
     is_off_policy,
     takes_expert,
 )
-from sb3_quad.training.values import BASES, as_list, check, convert, import_class, qualified_classes
+from sb3_quad.training.classes import as_list, qualified_classes
+from sb3_quad.training.options import JobOptions
 from sb3_quad.vehicles.vehicle import VEHICLES
 
-_FOLDERS = "any_quadcopter", "nominal", "robust", "thesis", "value_based"
+_FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
-MAX_SINGLE = 1000  # environments of dummy and subproc; PyBullet allows about as many in a process
+# For dummy and subproc. PyBullet allows about as many in a process.
+MAX_SINGLE = 1000
 
 
 def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
@@ -65,11 +69,13 @@ Classes: TypeAlias = Annotated[
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
 Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
+# Units of the layers of all networks, or of each by name; the last form is that of older versions.
+Layers: TypeAlias = list[PositiveInt]
+NetArch: TypeAlias = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
 
 
 class TrainingConfig(Frozen):
-    """One job's settings, checked. ``settings`` holds them as given: plain values that YAML can
-    hold.
+    """The checked settings of one job. ``settings`` holds them as given, in values of plain YAML.
 
     Classes are given as ``package.module.Class``, one or a list; with keywords as
     ``{package.module.Class: {…}}``.
@@ -78,7 +84,7 @@ class TrainingConfig(Frozen):
     algo: str
     env_id: str
     n_timesteps: Whole = Field(description="timesteps to train on, over all environments")
-    n_envs: Whole = Field(default=1, description="environments flown side by side")
+    n_envs: Whole = Field(default=1, description="number of parallel environments")
     vec_env: VecEnvKind = Field(
         description="batch by default for this package's environments, dummy for others"
     )
@@ -90,10 +96,10 @@ class TrainingConfig(Frozen):
     )
     eval_tasks: Tasks = Field(
         default=(),
-        description="further tasks to evaluate on; the own one decides which model is best",
+        description="more tasks to evaluate on; the job's own task decides which model is best",
     )
     best_by: Literal["success", "survival"] = Field(
-        default="success", description="which share makes a model the best"
+        default="success", description="the rate that decides which model is best"
     )
     policy: str = "MlpPolicy"
     policy_kwargs: Keywords = Field(
@@ -105,7 +111,7 @@ class TrainingConfig(Frozen):
     )
     callback: Classes = Field(default=[], description="callbacks of the training")
     env_wrapper: Classes = Field(
-        default=[], description="wrappers around each environment, of dummy and subproc"
+        default=[], description="wrappers around each environment, for dummy and subproc"
     )
     vec_env_wrapper: Classes = Field(
         default=[], description="wrappers around the vectorised environment"
@@ -114,10 +120,10 @@ class TrainingConfig(Frozen):
         default=None, description="its statistics would not be part of a model's zip"
     )
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = Field(
-        default=None, description="of an off-policy algorithm"
+        default=None, description="action noise, for off-policy algorithms"
     )
     noise_std: NonNegativeFloat = Field(
-        default=0.1, description="deviation of that noise, of actions within -1 and 1"
+        default=0.1, description="standard deviation of the action noise; actions are in [-1, 1]"
     )
     hyperparams: dict[str, Any] = Field(
         description="keywords of the algorithm's constructor, converted"
@@ -126,49 +132,51 @@ class TrainingConfig(Frozen):
 
     @property
     def task(self) -> str | None:
-        """The quadcopter task, None for an environment that is not this package's."""
+        """The quadcopter task; None for an environment of another package."""
         return ENVIRONMENTS.get(self.env_id)
 
     @property
     def flight_settings(self) -> FlightSettings:
-        """How an agent of this job flies, of an environment of this package."""
+        """How an agent of this job flies, in an environment of this package."""
         return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
 
     def keyword(self, name: str) -> Any:
-        """What the algorithm's constructor is given as ``name``, or its default."""
-        return self.hyperparams.get(
-            name, constructor_parameters(get_algorithm(self.algo))[name].default
-        )
+        """Return what the algorithm's constructor is given as ``name``, or its default."""
+        if name in self.hyperparams:
+            return self.hyperparams[name]
+        return constructor_parameters(get_algorithm(self.algo))[name].default
 
     @property
     def is_off_policy(self) -> bool:
-        """Whether it learns from a replay buffer."""
+        """Whether the algorithm learns from a replay buffer."""
         return is_off_policy(get_algorithm(self.algo))
 
     @property
     def rollout_steps(self) -> int:
-        """Control steps of each environment between two updates; 1 where ``train_freq`` counts
-        episodes.
+        """Control steps of each environment between two updates.
+
+        1 where ``train_freq`` counts episodes.
         """
         if not self.is_off_policy:
             return int(self.keyword("n_steps"))
-        freq = self.keyword("train_freq")
-        number, unit = freq if isinstance(freq, (tuple, list)) else (freq, "step")
-        return int(number) if unit == "step" else 1
+        train_freq = self.keyword("train_freq")
+        if isinstance(train_freq, int):
+            return train_freq
+        number, unit = train_freq
+        return number if unit == "step" else 1
 
     def shorter_rollout(self) -> dict[str, int]:
-        """The settings that fit a rollout to a budget of less than one, which SB3 would fly whole;
-        none otherwise.
+        """Return the settings that fit a rollout to a budget of less than one.
+
+        SB3 would fly the rollout whole. Empty where the budget is large enough.
         """
         n_steps = -(-self.n_timesteps // self.n_envs)
         if n_steps >= self.rollout_steps:
             return {}
         if self.is_off_policy:
             return {"train_freq": n_steps}
-        return {
-            "n_steps": n_steps,
-            "batch_size": min(self.keyword("batch_size"), n_steps * self.n_envs),
-        }
+        batch_size = min(self.keyword("batch_size"), n_steps * self.n_envs)
+        return {"n_steps": n_steps, "batch_size": batch_size}
 
     @field_validator("policy", mode="before")
     @classmethod
@@ -177,22 +185,16 @@ class TrainingConfig(Frozen):
 
     @field_validator("policy_kwargs")
     @classmethod
-    def _some_units(cls, value: dict[str, Any]) -> dict[str, Any]:
-        parts = value.get("net_arch")
-        lists = (
-            parts.values()
-            if isinstance(parts, dict)
-            else [parts]
-            if isinstance(parts, list)
-            else []
-        )
-        if any(
-            isinstance(units, int) and units < 1
-            for part in lists
-            if isinstance(part, list)
-            for units in part
-        ):
-            raise ConfigError(f"net_arch {parts}: every layer has at least 1 unit")
+    def _fits_policy(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        if "policy" not in info.data:
+            return value
+        # The constructor of the policy takes these, not that of the algorithm.
+        policy = get_algorithm(info.data["algo"]).policy_aliases[info.data["policy"]]
+        parameters = constructor_parameters(policy)
+        for name in value:
+            if name not in parameters:
+                raise ConfigError(unknown(f"keyword of {policy.__name__}", name, parameters))
+        check(NetArch, value.get("net_arch"), "net_arch")
         return value
 
     @field_validator("env_kwargs", "eval_env_kwargs")
@@ -200,37 +202,27 @@ class TrainingConfig(Frozen):
     def _known_keywords(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         env_id = info.data["env_id"]
         if env_id in ENVIRONMENTS:
-            for key in value:
-                if key not in FlightSettings.model_fields:
-                    raise ConfigError(
-                        unknown(f"keyword of {env_id}", key, FlightSettings.model_fields)
-                    )
-            FlightSettings().with_changes(
-                **{"task": ENVIRONMENTS[env_id], **info.data.get("env_kwargs", {}), **value}
-            )
-        return value
-
-    @field_validator(*BASES)
-    @classmethod
-    def _known_classes(
-        cls, value: list[tuple[str, dict[str, Any]]], info: ValidationInfo
-    ) -> list[tuple[str, dict[str, Any]]]:
-        for path, _ in value:
-            import_class(path, str(info.field_name))
+            valid = FlightSettings.model_fields
+            for name in value:
+                if name not in valid:
+                    raise ConfigError(unknown(f"keyword of {env_id}", name, valid))
+            # eval_env_kwargs go over env_kwargs, so they are checked together.
+            own = info.data.get("env_kwargs", {})
+            FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **own, **value})
         return value
 
     @field_validator("eval_tasks")
     @classmethod
     def _known_tasks(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if value and info.data["env_id"] not in ENVIRONMENTS:
-            raise ConfigError(f"{info.data['env_id']} has no tasks; leave it out")
+            raise ConfigError(f"{info.data['env_id']} has no tasks; remove eval_tasks")
         return tuple(_one_of(TASKS, name, info) for name in value)
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
         if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
             raise ConfigError(
-                f"n_envs: {self.n_envs} of vec_env {self.vec_env}, at most {MAX_SINGLE} are made"
+                f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
             )
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(
@@ -238,20 +230,83 @@ class TrainingConfig(Frozen):
             )
         if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
             raise ConfigError(
-                f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; give steps"
+                f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; "
+                "give steps"
             )
         if self.noise_type is not None and not self.is_off_policy:
-            raise ConfigError(f"noise_type: {self.algo} samples its actions; leave it out")
+            raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
         if self.expert and not takes_expert(get_algorithm(self.algo)):
-            raise ConfigError(f"expert: {self.algo} learns from no expert; leave it out")
+            raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
 
 
-JOB_KEYS = tuple(
-    name
-    for name in TrainingConfig.model_fields
-    if name not in ("algo", "env_id", "hyperparams", "settings")
-)
+# Keys of a settings file that are not the algorithm's.
+JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams", "settings"}
+
+
+class TrainingJob(JobOptions):
+    """One job of the trainer: settings and options."""
+
+    config: TrainingConfig = Field(description="the settings")
+
+    def for_evaluation(self, **changes: Any) -> TrainingConfig:
+        """Return the settings with the environments as evaluations have them.
+
+        :param changes: to the keywords of the environments.
+        """
+        keywords = {
+            **self.config.env_kwargs,
+            **self.config.eval_env_kwargs,
+            **(self.eval_env_kwargs or {}),
+            **changes,
+        }
+        return self.config.model_copy(update={"env_kwargs": keywords})
+
+    @property
+    def flight_settings(self) -> FlightSettings:
+        """How the agent is evaluated, in an environment of this package."""
+        return self.for_evaluation().flight_settings
+
+    def arguments(self) -> dict[str, Any]:
+        """Return what args.yml holds: all but the settings, and how evaluations fly.
+
+        The settings are in config.yml.
+        """
+        names = {
+            "algo": self.config.algo,
+            "env": self.config.env_id,
+            "env_kwargs": self.for_evaluation().env_kwargs,
+        }
+        return {**names, **self.model_dump(exclude={"config"})}
+
+
+def describe(job: TrainingJob) -> str:
+    """Return one line about what is going to be trained, in whole rollouts as SB3 trains."""
+    config = job.config
+    n_steps = config.rollout_steps
+    rollout = n_steps * config.n_envs
+    # The last rollout is flown whole.
+    n_updates = -(-config.n_timesteps // rollout)
+    timesteps = n_updates * rollout
+    if config.is_off_policy:
+        # -1 stands for as many as there are timesteps in a rollout.
+        gradient_steps = config.keyword("gradient_steps")
+        n_updates *= rollout if gradient_steps < 0 else gradient_steps
+    line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
+    if timesteps != config.n_timesteps:
+        line += f" ({config.n_timesteps:,} were asked for)"
+    line += f", rollouts of {n_steps} steps, {config.n_envs} environments ({config.vec_env})"
+    task = config.env_kwargs.get("task")
+    if isinstance(task, Mapping):
+        line += f", tasks {in_words(task)}"
+    if config.expert is not None:
+        line += f", expert {config.expert}"
+    line += f", seed {job.seed}"
+    if job.trained_agent:
+        line += f", from {job.trained_agent}"
+    if n_updates <= config.hyperparams.get("critic_warmup", 0):
+        line += "; critic_warmup lasts all of it, so that the policy will not learn"
+    return line
 
 
 def load_config(
@@ -260,25 +315,24 @@ def load_config(
     conf_file: str | Path | None = None,
     overrides: dict[str, Any] | None = None,
 ) -> TrainingConfig:
-    """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them (into them, for
-    ``env_kwargs``).
+    """Read the settings of ``env_id`` from a YAML file and put ``overrides`` over them.
 
-    Where ``n_timesteps`` is less than a rollout, ``n_steps`` is shortened to it, and ``batch_size``
-    to no more than that; of an off-policy algorithm ``train_freq``.
+    ``env_kwargs`` are merged key by key. Where ``n_timesteps`` is less than a rollout, ``n_steps``
+    is shortened to it, and ``batch_size`` to no more than that; ``train_freq`` for an off-policy
+    algorithm.
 
     :param conf_file: path of a file, or the name of one that comes with the package such as
         ``thesis/dagger.yml``; None for ``<algo>.yml`` of the package.
     :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that
         does not fit.
     """
+    # A misspelt name would otherwise be reported as a missing file.
     get_algorithm(algo)
     check_environment(env_id)
-    content, where = SETTINGS.read(conf_file if conf_file is not None else f"{algo}.yml")
+    content, where = SETTINGS.read(f"{algo}.yml" if conf_file is None else conf_file)
     if env_id not in content:
-        listed = [str(key) for key in content]
-        raise ConfigError(
-            f"{where}: {unknown('environment in this file', env_id, listed)}; give another with --conf-file"
-        )
+        missing = unknown("environment in this file", env_id, map(str, content))
+        raise ConfigError(f"{where}: {missing}; give another with --conf-file")
     settings = content[env_id]
     if not isinstance(settings, dict):
         raise ConfigError(f"{where}: {env_id} must hold keys and values, such as 'n_envs: 8'")
@@ -288,11 +342,9 @@ def load_config(
         changes["env_kwargs"] = {**base, **parse_mapping(changes["env_kwargs"], "env_kwargs")}
     config = build_config(algo, env_id, {**settings, **changes}, where, changes)
     shorter = config.shorter_rollout()
-    return (
-        build_config(algo, env_id, {**config.settings, **shorter}, where, changes)
-        if shorter
-        else config
-    )
+    if shorter:
+        config = build_config(algo, env_id, {**config.settings, **shorter}, where, changes)
+    return config
 
 
 def build_config(
@@ -302,66 +354,73 @@ def build_config(
     where: str = "settings",
     changes: Collection[str] = (),
 ) -> TrainingConfig:
-    """The checked settings of one job, from a plain mapping.
+    """Check the settings of one job, given as a plain mapping.
 
     :param where: what the messages call the source of the settings.
     :param changes: keys that come from the command line instead.
     :raises ConfigError: see :func:`load_config`.
     """
-    parameters = constructor_parameters(get_algorithm(algo))
+    algorithm = get_algorithm(algo)
+    parameters = constructor_parameters(algorithm)
     check_environment(env_id)
-    settings = {
-        key: with_vehicle_path(value) if key.endswith("env_kwargs") else value
-        for key, value in settings.items()
-    }
-    if takes_expert(get_algorithm(algo)) and settings.get("expert") is None:
-        settings["expert"] = DEFAULT_EXPERT  # so that config.yml names it
+    settings = dict(settings)
+    for key in ("env_kwargs", "eval_env_kwargs"):
+        if key in settings:
+            settings[key] = with_vehicle_path(settings[key])
+    # The default is written out, so that config.yml names the expert.
+    if takes_expert(algorithm) and settings.get("expert") is None:
+        settings["expert"] = DEFAULT_EXPERT
 
     def source(key: str) -> str:
         return "command line" if key in changes else where
 
-    for key in settings:
-        if key not in JOB_KEYS and key not in parameters:
-            raise ConfigError(
-                f"{source(key)}: {unknown(f'key of {algo}', key, [*JOB_KEYS, *parameters])}"
-            )
-    if settings.get("n_timesteps") is None:
-        raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
-    hyperparams = {
-        key: convert(value, parameters[key], f"{source(key)}: {key}", *LIMITS.get(key, ()))
-        for key, value in settings.items()
-        if key in parameters
-    }
     fields: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
-    fields |= {
-        key: value for key, value in settings.items() if key in JOB_KEYS and value is not None
-    }
+    hyperparams = {}
+    for key, value in settings.items():
+        if key in parameters:
+            limits = LIMITS.get(key, ())
+            hyperparams[key] = convert(value, parameters[key], f"{source(key)}: {key}", *limits)
+        elif key not in JOB_KEYS:
+            message = unknown(f"key of {algo}", key, [*JOB_KEYS, *parameters])
+            raise ConfigError(f"{source(key)}: {message}")
+        elif value is not None:
+            fields[key] = value
+    if "n_timesteps" not in fields:
+        raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
     fields |= {"algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": settings}
     return validate(TrainingConfig, fields, source)
 
 
-def with_vehicle_path(value: Any) -> Any:
-    """``env_kwargs`` whose vehicle file, if they name one, can be found from any folder: runs are
-    flown and resumed later.
+def with_vehicle_path(env_kwargs: Any) -> Any:
+    """Return ``env_kwargs`` with absolute paths of vehicle files.
+
+    A run may be flown and resumed later, from another folder.
     """
-    vehicle = value.get("vehicle") if isinstance(value, dict) else None
+    if not isinstance(env_kwargs, dict) or "vehicle" not in env_kwargs:
+        return env_kwargs
+    vehicle = env_kwargs["vehicle"]
     if isinstance(vehicle, (list, tuple)):
-        return {
-            **value,
-            "vehicle": [with_vehicle_path({"vehicle": each})["vehicle"] for each in vehicle],
-        }
-    if not isinstance(vehicle, (str, Path)) or not VEHICLES.is_path(vehicle):
-        return value
-    return {**value, "vehicle": str(Path(vehicle).absolute())}
+        vehicle = [_absolute(entry) for entry in vehicle]
+    else:
+        vehicle = _absolute(vehicle)
+    return {**env_kwargs, "vehicle": vehicle}
+
+
+def _absolute(vehicle: Any) -> Any:
+    if isinstance(vehicle, (str, Path)) and VEHICLES.is_path(vehicle):
+        return str(Path(vehicle).absolute())
+    return vehicle
 
 
 def check_environment(env_id: str) -> None:
-    """:raises ConfigError: an environment that Gymnasium does not know; the message names the
-    nearest.
+    """Check that Gymnasium knows an environment.
+
+    :raises ConfigError: it does not; the message names the nearest.
     """
     if env_id in gymnasium.registry:
         return
     hint = did_you_mean(env_id, gymnasium.registry)
     raise ConfigError(
-        f"unknown environment {env_id!r}: {hint}(of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)"
+        f"unknown environment {env_id!r}: {hint}(of this package: {', '.join(ENVIRONMENTS)}; "
+        "others: --gym-packages)"
     )

@@ -1,28 +1,29 @@
-"""The vectorised environment of a job: batched, one process, or one process each; the same learning
-problem in all.
+"""The vectorised environment of a job: batched, in one process, or in one process each.
+
+The learning problem is the same in all of them.
 """
 
 import importlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-import sb3_quad  # noqa: F401  (registers the environments, also in a worker process)
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.process import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.simulation.settings import ENDLESS
+from sb3_quad.training.classes import instance
 from sb3_quad.training.config import TrainingConfig
-from sb3_quad.training.values import instance
 
+Env: TypeAlias = gymnasium.Env[Any, Any]
 WORKER_ENDED = (
-    "a worker process of the environments ended (its error, if it had time for one, is above; else out of memory?);"
-    " vec_env dummy needs none"
+    "a worker process of the environments ended (its error, if it had time for one, is above; "
+    "else out of memory?); vec_env dummy needs no worker processes"
 )
 
 
@@ -31,14 +32,14 @@ class _Dummy(RowSeeds, DummyVecEnv):
 
 
 class _Subproc(RowSeeds, SubprocVecEnv):
-    """SB3's ``close`` waits forever for the answer of a worker process that has ended; this one
-    ends the others.
+    """Ends its worker processes also where one of them has ended before.
+
+    SB3's ``close`` would wait forever for the answer of that one.
     """
 
     def close(self) -> None:
-        if not self.closed and (
-            self.waiting or not all(process.is_alive() for process in self.processes)
-        ):
+        all_alive = all(process.is_alive() for process in self.processes)
+        if not self.closed and (self.waiting or not all_alive):
             for process in self.processes:
                 process.terminate()
                 process.join()
@@ -51,36 +52,20 @@ class _Subproc(RowSeeds, SubprocVecEnv):
 def make_environments(
     config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False
 ) -> VecEnv:
-    """``n_envs`` environments as the settings describe them; their rows fly by ``row_seeds`` of
-    ``seed``.
+    """Make ``n_envs`` environments; their rows fly by ``row_seeds`` of ``seed``.
 
     Each gives ``info["episode"]`` where an episode ends, as SB3's Monitor does.
 
-    :param staggered: whether the first episodes end at different times, as of
-        :class:`QuadcopterVecEnv`.
+    :param staggered: whether the first episodes end at different times, as those of
+        :class:`QuadcopterVecEnv` do.
     :raises ConfigError: keywords that the environment does not take.
     :raises TrainingError: a worker process that ended.
     """
-    env: VecEnv
     try:
         if config.vec_env == "batch":
-            if config.env_wrapper:
-                raise ConfigError(
-                    "env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy"
-                )
-            env = QuadcopterVecEnv(
-                n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs}
-            )
+            env = _make_batch(config, n_envs, seed, staggered)
         else:
-            if (
-                config.task is not None
-            ):  # here, where a worker process could not say what is missing
-                importlib.import_module("sb3_quad.base.bullet")
-            makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [
-                partial(_make_one, config, row, n_envs if staggered else 1) for row in range(n_envs)
-            ]
-            env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
-            env.seed(seed)
+            env = _make_single(config, n_envs, seed, staggered)
     except SB3QuadError:
         raise
     except (EOFError, ConnectionError):
@@ -94,19 +79,49 @@ def make_environments(
     return env
 
 
-def _make_one(config: TrainingConfig, row: int, phases: int) -> gymnasium.Env[Any, Any]:
-    """The environment of a row; where keywords are lists of what rows fly, they are counted round.
+def _make_batch(config: TrainingConfig, n_envs: int, seed: int, staggered: bool) -> VecEnv:
+    if config.env_wrapper:
+        raise ConfigError(
+            "env_wrapper: the batched environment has no single environments to wrap; "
+            "use vec_env dummy"
+        )
+    keywords = {"task": config.task, **config.env_kwargs}
+    return QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **keywords)
 
-    :param phases: of this many, evenly spread over an episode, the row begins in its own.
+
+def _make_single(config: TrainingConfig, n_envs: int, seed: int, staggered: bool) -> VecEnv:
+    # A worker process could not say that PyBullet is missing.
+    if config.task is not None:
+        importlib.import_module("sb3_quad.base.bullet")
+    phases = 1
+    if staggered:
+        phases = n_envs
+    makers: list[Callable[[], Env]] = [
+        partial(_make_row, config, row, phases) for row in range(n_envs)
+    ]
+    env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
+    env.seed(seed)
+    return env
+
+
+def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
+    """Make the environment of a row.
+
+    Keywords that are lists hold the values of the rows, which start again at the end of the list.
+
+    :param phases: row i begins in the i-th of so many phases, which divide an episode evenly.
     """
     if config.vec_env == "subproc":
         ignore_interrupts()
-    kwargs = dict(config.env_kwargs)
+    # One environment flies one vehicle, where the batched one takes a list.
+    keywords = dict(config.env_kwargs)
     for name in ("vehicle", "max_episode_steps"):
-        if isinstance(given := kwargs.get(name), (list, tuple)) and given:
-            kwargs[name] = given[row % len(given)]
-    env: gymnasium.Env[Any, Any] = gymnasium.make(config.env_id, **kwargs)
+        values = keywords.get(name)
+        if isinstance(values, (list, tuple)) and values:
+            keywords[name] = values[row % len(values)]
+    env: Env = gymnasium.make(config.env_id, **keywords)
     limit = env.spec and env.spec.max_episode_steps
+    # The rows would otherwise end all their episodes in the same step.
     if limit and row % phases:
         env = _FirstEpisode(env, limit - row * limit // phases)
     env = Monitor(env)

@@ -1,5 +1,6 @@
-"""The options of a training: flags of ``train``, ``tune`` and ``sweep``, and keys of a sweep's
-file; cheap to import.
+"""The options of a training: flags of ``train``, ``tune`` and ``sweep``, keys of a sweep's file.
+
+Cheap to import, so that ``--help`` is quick.
 """
 
 from typing import Annotated, Any, Literal
@@ -13,9 +14,9 @@ from sb3_quad.base.validate import Frozen
 
 
 def option(default: Any, description: str, *flags: str, metavar: str | None = "N") -> Any:
-    """A field that is also a flag.
+    """Make a field that is also a flag.
 
-    :param flags: rl-zoo's short names of it.
+    :param flags: rl-zoo's short names of the flag.
     """
     return Field(
         default=default,
@@ -25,7 +26,7 @@ def option(default: Any, description: str, *flags: str, metavar: str | None = "N
 
 
 def _check_device(device: str) -> str:
-    """Refuse CUDA where there is none, as SB3 would take the CPU without a word."""
+    """Refuse CUDA on a machine without it; SB3 would take the CPU without a warning."""
     import torch
 
     if device.startswith("cuda") and not torch.cuda.is_available():
@@ -34,12 +35,12 @@ def _check_device(device: str) -> str:
 
 
 class SettingsOptions(Frozen):
-    """Keys of a settings file that have a flag of their own; None leaves what the file says."""
+    """Keys of a settings file that have a flag of their own; None keeps the file's value."""
 
     n_timesteps: int | None = option(
         None, "timesteps, in whole rollouts; fewer than one shorten it", "-n"
     )
-    n_envs: int | None = option(None, "environments side by side")
+    n_envs: int | None = option(None, "number of parallel environments")
     vec_env: str | None = option(
         None, "batch (compiled), dummy (PyBullet) or subproc (one process each)", metavar="KIND"
     )
@@ -52,9 +53,7 @@ class SettingsOptions(Frozen):
 
 
 class RunOptions(Frozen):
-    """What a training is told beyond its settings, which the configurations of a sweep may differ
-    in.
-    """
+    """Run options outside the settings file; the configurations of a sweep may override them."""
 
     eval_env_kwargs: dict[str, Any] | None = option(
         None, "environment keywords for evaluations only", metavar="K:V"
@@ -73,13 +72,13 @@ class RunOptions(Frozen):
     save_freq: int = option(-1, "timesteps between checkpoints; below 1: none")
     snapshot_every: NonNegativeFloat = option(
         60.0,
-        "seconds between snapshots, from which --resume goes on after a crash; 0: none",
+        "seconds between snapshots, from which --resume continues after a crash; 0: none",
         metavar="SECONDS",
     )
 
 
 class JobOptions(RunOptions):
-    """All that a training is told beyond its settings. All its random numbers follow from ``seed``."""
+    """All options of a training. All its random numbers follow from ``seed``."""
 
     log_folder: str = option("logs", "folder for the run folders", "-f", metavar="DIR")
     seed: Seed = option(0, "seed of policy, environments and exploration")
@@ -87,19 +86,21 @@ class JobOptions(RunOptions):
     tensorboard_log: str | None = option(None, "folder for TensorBoard", "-tb", metavar="DIR")
     verbose: Literal[0, 1, 2] = option(0, "1: SB3's tables, 2: debugging")
     uuid: bool = option(False, "add a UUID to the run folder's name", "-uuid", metavar=None)
-    progress: bool = option(False, "progress bar", "-P", metavar=None)
-    track: bool = option(
-        False, "track with Weights & Biases; -tb is runs without one", metavar=None
+    progress: bool = option(
+        False, "progress bar; without it, a line each minute", "-P", metavar=None
     )
-    wandb_project_name: str = option("sb3", "its project", metavar="NAME")
-    wandb_entity: str | None = option(None, "its entity, a user or team", metavar="NAME")
-    wandb_group: str | None = option(None, "its group of runs", metavar="NAME")
-    wandb_tags: list[str] | None = option(None, "tags of the run", "-tags", metavar="TAG")
+    track: bool = option(
+        False, "track with Weights & Biases; -tb is runs unless you give it", metavar=None
+    )
+    wandb_project_name: str = option("sb3", "project in Weights & Biases", metavar="NAME")
+    wandb_entity: str | None = option(None, "entity there, a user or team", metavar="NAME")
+    wandb_group: str | None = option(None, "group of runs there", metavar="NAME")
+    wandb_tags: list[str] | None = option(None, "tags of the run there", "-tags", metavar="TAG")
 
     @model_validator(mode="before")
     @classmethod
     def _tracked(cls, given: dict[str, Any]) -> dict[str, Any]:
-        """Weights & Biases takes what TensorBoard is given."""
+        """Weights & Biases shows what TensorBoard is given, so there must be a folder for that."""
         if not given.get("track"):
             return given
         require("wandb", "track", "--track")

@@ -1,11 +1,10 @@
-"""Several training jobs in a row, each starting from the agent of the one before: the two stages of
-the thesis (4.2).
+"""Pipelines: several training jobs in a row, each starting from the agent of the one before.
 
-A pipeline's file lists its stages in order, as ``zoo_configs/two_stage.yml`` does; :class:`Stage`
-says the keys.
+The two stages of the thesis (4.2) are one. A pipeline's file lists its stages in order, as
+``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 import yaml
 from pydantic import (
+    BeforeValidator,
     Field,
     NonNegativeFloat,
     NonNegativeInt,
@@ -34,20 +34,56 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.algorithms import get_algorithm
-from sb3_quad.training.arrival_correction import LEFT, correct_arrival
-from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
-from sb3_quad.training.job import TrainingJob, describe
+from sb3_quad.training.arrival_correction import OVERSHOOT_COST, correct_arrival
+from sb3_quad.training.config import (
+    SETTINGS,
+    TrainingConfig,
+    TrainingJob,
+    describe,
+    load_config,
+    with_vehicle_path,
+)
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import resume, train, trained_seconds
+from sb3_quad.training.trainer import Report, resume, train, trained_seconds
 
 STATUS_FILE = "pipeline.yml"
+# The keys that go with each kind of offset correction.
+_KEYS = {"position": ("scale",), "hover": (), "arrival": ("rounds", "overshoot_cost", "env_kwargs")}
 
 
 class Requirement(Frozen):
-    """What the best evaluation of a stage must reach before the next one begins."""
+    """The least that a stage must reach in its best evaluation before the next stage begins."""
 
     success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
     mean_reward: float | None = None
+
+
+class OffsetCorrection(Frozen):
+    """How the agent of a stage is corrected after its training."""
+
+    kind: Literal["position", "hover", "arrival"] = Field(
+        description="see algorithms/offset_correction.py, and training/arrival_correction.py"
+    )
+    scale: PositiveFloat = Field(
+        default=1.0, description="position: α, which becomes a part of the agent"
+    )
+    rounds: PositiveInt = Field(
+        default=1, description="arrival: number of searches, each from the result of the one before"
+    )
+    overshoot_cost: NonNegativeFloat = Field(
+        default=OVERSHOOT_COST,
+        description="arrival: penalty in seconds for leaving a target after reaching it",
+    )
+    env_kwargs: dict[str, Any] = Field(
+        default={}, description="arrival: changes to env_kwargs of the flights that are optimised"
+    )
+
+    @model_validator(mode="after")
+    def _keys_of_kind(self) -> "OffsetCorrection":
+        for name in self.model_fields_set - {"kind"}:
+            if name not in _KEYS[self.kind]:
+                raise ValueError(f"{name} does not go with kind: {self.kind}")
+        return self
 
 
 class Stage(Frozen):
@@ -64,26 +100,17 @@ class Stage(Frozen):
     )
     seed_offset: NonNegativeInt = Field(
         default=0,
-        description="added to the seed, so that a stage sees other episodes than one before it on the same task",
+        description="added to the seed, so that stages on the same task fly different episodes",
     )
     pass_on: Literal["best", "last"] = Field(
         default="best", description="the best evaluation, as best_by of its settings says"
     )
-    correct_offset: Literal["position", "hover", "arrival"] | None = Field(
-        default=None, description="algorithms.offset_correction, .arrival say how"
-    )
-    position_scale: PositiveFloat = Field(
-        default=1.0, description="α, which correct_offset: position makes a part of the agent"
-    )
-    overshoot_cost: NonNegativeFloat = Field(
-        default=LEFT, description="s that correct_offset: arrival counts for a target left again"
-    )
-    correction_env_kwargs: dict[str, Any] = Field(
-        default={}, description="changes to env_kwargs in which correct_offset: arrival counts, too"
-    )
-    correction_rounds: PositiveInt = Field(
-        default=1,
-        description="how often correct_offset: arrival searches, each time from what it found before",
+    correct_offset: Annotated[
+        OffsetCorrection | None,
+        BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value),
+    ] = Field(
+        default=None,
+        description="offset correction after the stage: {kind: arrival, rounds: 2}, or its kind",
     )
     require: Requirement = Field(
         default=Requirement(), description="the pipeline stops where this is missed"
@@ -93,22 +120,6 @@ class Stage(Frozen):
     )
     eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
 
-    @model_validator(mode="after")
-    def _of_its_trim(self) -> "Stage":
-        for name in (
-            "position_scale",
-            "overshoot_cost",
-            "correction_env_kwargs",
-            "correction_rounds",
-        ):
-            kind = "position" if name == "position_scale" else "arrival"
-            if (
-                getattr(self, name) != type(self).model_fields[name].default
-                and self.correct_offset != kind
-            ):
-                raise ValueError(f"{name} goes with correct_offset: {kind}")
-        return self
-
 
 class Pipeline(Frozen):
     """The stages, in order."""
@@ -117,18 +128,17 @@ class Pipeline(Frozen):
 
     @field_validator("stages")
     @classmethod
-    def _of_their_own_names(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
-        if len({stage.name for stage in stages}) < len(stages):
-            raise ValueError(
-                f"{', '.join(stage.name for stage in stages)}: give each a name of its own"
-            )
+    def _different_names(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+        names = [stage.name for stage in stages]
+        if len({*names}) < len(names):
+            raise ValueError(f"{', '.join(names)}: give each a name of its own")
         return stages
 
 
 class Status(Pipeline):
-    """What ``pipeline.yml`` in a pipeline's folder holds."""
+    """The content of ``pipeline.yml`` in a pipeline's folder."""
 
-    job: dict[str, Any] = Field(description="arguments of every job")
+    job: dict[str, Any] = Field(description="options of every job")
     runs: tuple[str, ...] = Field(description="the run folders of the stages that have begun")
 
 
@@ -137,7 +147,7 @@ class StageResult(NamedTuple):
 
     :param run: its run folder.
     :param agent: the zip that is passed on.
-    :param seconds: of training; of a stage that was resumed, since then.
+    :param seconds: of training; where the stage was resumed, since then.
     """
 
     run: str
@@ -150,8 +160,8 @@ class StageResult(NamedTuple):
 class PipelineResult:
     """How a pipeline ended.
 
-    :param stages: by name, all of them, or those before an interruption (then ``exit_code`` is not
-        0).
+    :param stages: the finished stages by name. After an interruption, some are missing and
+        ``exit_code`` is not 0.
     :param job: that of the first stage.
     """
 
@@ -172,7 +182,7 @@ def is_pipeline_run(folder: Path) -> bool:
 
 
 def load_pipeline(conf_file: str | Path) -> Pipeline:
-    """The pipeline in a file, by path or by the name of one in the package.
+    """Load the pipeline in a file, by path or by the name of one in the package.
 
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
     """
@@ -180,32 +190,32 @@ def load_pipeline(conf_file: str | Path) -> Pipeline:
 
 
 def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
-    """The pipeline with ``changes`` put over the settings of every stage (into them, for
-    ``env_kwargs``).
+    """Return the pipeline with ``changes`` put over the settings of every stage.
+
+    ``env_kwargs`` are merged key by key.
     """
     stages = []
     for stage in pipeline.stages:
         settings = {**stage.settings, **changes}
-        parts = [
-            parse_mapping(given.get("env_kwargs"), f"{stage.name}: env_kwargs")
-            for given in (stage.settings, changes)
-        ]
-        if any(parts):
-            settings["env_kwargs"] = with_vehicle_path({**parts[0], **parts[1]})
+        where = f"{stage.name}: env_kwargs"
+        env_kwargs = parse_mapping(stage.settings.get("env_kwargs"), where)
+        env_kwargs |= parse_mapping(changes.get("env_kwargs"), where)
+        if env_kwargs:
+            settings["env_kwargs"] = with_vehicle_path(env_kwargs)
         stages.append(stage.model_copy(update={"settings": settings}))
     return pipeline.model_copy(update={"stages": tuple(stages)})
 
 
 def run_pipeline(
-    pipeline: Pipeline, job: Mapping[str, Any], name: str, report: Callable[[str], None] = print
+    pipeline: Pipeline, job: Mapping[str, Any], name: str, report: Report = print
 ) -> PipelineResult:
     """Train the stages one after the other, each from the agent that the one before passed on.
 
-    Their run folders lie where single runs lie; ``<log_folder>/<name>/<name>_<run>/pipeline.yml``
-    says which they are.
+    Their run folders lie where those of single runs lie.
+    ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them.
 
-    :param job: arguments of every :class:`TrainingJob`, such as ``seed``; a stage's own
-        ``eval_freq`` and ``eval_episodes`` go before them.
+    :param job: options of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq``
+        and ``eval_episodes`` take precedence.
     :param name: of the pipeline, for its folder.
     :raises ConfigError: settings that do not fit, named with their stage, before the first one
         starts.
@@ -217,13 +227,10 @@ def run_pipeline(
     return _train_stages(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
 
 
-def resume_pipeline(
-    folder: Path, report: Callable[[str], None] = print, **changes: Any
-) -> PipelineResult:
-    """Go on with an interrupted or killed pipeline: within the stage that was under way, then with
-    the stages after it.
+def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:
+    """Resume an interrupted or killed pipeline within its present stage, then train the others.
 
-    :param changes: arguments of the jobs to change, as for
+    :param changes: options of the jobs to change, as for
         :func:`~sb3_quad.training.trainer.resume`.
     :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
     """
@@ -233,138 +240,155 @@ def resume_pipeline(
 
 
 def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
-    """What each stage trains, checked.
+    """Return the checked job of each stage.
 
-    :raises ConfigError: settings of a stage, or arguments of its job, that do not fit.
+    :raises ConfigError: settings of a stage, or options of its job, that do not fit.
     """
     jobs = []
     for stage in pipeline.stages:
         where = f"stage {stage.name!r}"
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
-            if stage.correct_offset == "arrival":
-                config.flight_settings.with_changes(**stage.correction_env_kwargs)
+            _check_correction(stage.correct_offset, config)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
-        if (
-            stage.correct_offset in ("position", "hover")
-            and config.task is not None
-            and config.flight_settings.size != OBSERVATION_SIZE
-        ):
-            raise ConfigError(
-                f"{where}: correct_offset: {stage.correct_offset} is for agents that see the 18 features alone"
-            )
+        # The evaluations of a stage may differ from those of the pipeline.
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
 
 
+def _check_correction(correction: OffsetCorrection | None, config: TrainingConfig) -> None:
+    """Check that an agent with these settings can be corrected."""
+    if correction is None:
+        return
+    if config.task is None:
+        raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
+    if correction.kind == "arrival":
+        config.flight_settings.with_changes(**correction.env_kwargs)
+    elif config.flight_settings.size != OBSERVATION_SIZE:
+        raise ConfigError(
+            f"correct_offset: {correction.kind} is for agents that see the "
+            f"{OBSERVATION_SIZE} features alone"
+        )
+
+
 def _train_stages(
     folder: Path,
     status: Status,
     jobs: list[TrainingJob],
-    report: Callable[[str], None],
+    report: Report,
     **changes: Any,
 ) -> PipelineResult:
-    """Train what is left of the stages. A stage's run folder is noted before its training begins."""
-    runs, results = [*status.runs], {}
+    """Train the stages that are not complete."""
+    runs = [*status.runs]
+    results: dict[str, StageResult] = {}
     agent: str | None = None
 
+    def write() -> None:
+        # The stages are written, too, since the settings file may change before a resume.
+        current = status.model_copy(update={"runs": tuple(runs)})
+        content = current.model_dump(mode="json", exclude_defaults=True)
+        write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
+
     def note(number: int, run: RunFolder) -> None:
+        """Note a stage's run folder before its training begins."""
         runs[number:] = [str(run.path)]
         write()
-
-    def write() -> None:
-        content = status.model_copy(update={"runs": tuple(runs)}).model_dump(
-            mode="json", exclude_defaults=True
-        )
-        write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
         try:
             write()
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
+                if agent is not None:
+                    job = job.model_copy(update={"trained_agent": agent})
                 run = open_run(runs[number]) if number < len(runs) else None
                 if run is not None and run.timesteps >= job.config.n_timesteps:
-                    timesteps, seconds = run.timesteps, trained_seconds(run)
+                    seconds = trained_seconds(run)
                 else:
-                    start = job.model_copy(update={"trained_agent": agent}) if agent else job
-                    report(f"{stage.name}: {describe(start)}")
-                    begun = run is not None and (run.not_begun or run.resume_state.is_file())
-                    trained = (
-                        resume(runs[number], report, **changes)
-                        if begun
-                        else train(start, report, on_start=partial(note, number))
-                    )
+                    report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
+                    # A run that has a model and no snapshot cannot be resumed.
+                    if run is not None and (run.not_begun or run.resume_state.is_file()):
+                        trained = resume(runs[number], report, **changes)
+                    else:
+                        trained = train(job, report, on_start=partial(note, number))
                     if trained.exit_code:
                         break
-                    run, timesteps, seconds = (
-                        trained.run,
-                        trained.model.num_timesteps,
-                        trained.seconds,
-                    )
+                    run = trained.run
+                    seconds = trained.seconds
                 if signals.received is not None:
                     break
-                agent = str(
-                    _corrected(stage, job, run, report)
-                    if stage.correct_offset
-                    else _passed_on(stage, job, run)
-                )
-                results[stage.name] = StageResult(str(run.path), agent, timesteps, seconds)
+                agent = str(_agent(stage, job, run, report))
+                results[stage.name] = StageResult(str(run.path), agent, run.timesteps, seconds)
         except KeyboardInterrupt:
             if signals.received is None:
                 raise
     if signals.received is not None:
-        report(f"to go on with the whole pipeline: --resume {folder}")
+        report(f"to resume the whole pipeline: --resume {folder}")
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
+def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
+    """Return the zip that a stage passes on, after the offset correction where it has one."""
+    if stage.correct_offset is None:
+        return _passed_on(stage, job, run)
+    if not run.corrected_model.is_file():
+        _correct(stage.correct_offset, job, run, _passed_on(stage, job, run), report)
+    return run.corrected_model
+
+
 def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
-    """The zip that a stage passes on, before it is trimmed; TrainingError if it misses what the
-    stage requires.
+    """Return the zip that a stage passes on, before the offset correction.
+
+    :raises TrainingError: it misses what the stage requires.
     """
     if run.evaluations.is_file():
         curve = read_curve(run.path)
-        share, success = (
-            np.nan_to_num(curve.values(name)) for name in (job.config.best_by, "success")
-        )
-        scores = list(zip(share, curve.reward, success, strict=True))
-        _, reward, success = max(scores) if stage.pass_on == "best" else scores[-1]
-        wanted = -np.inf if stage.require.mean_reward is None else stage.require.mean_reward
-        if success < stage.require.success_rate or reward < wanted:
+        rate = np.nan_to_num(curve.values(job.config.best_by))
+        success = np.nan_to_num(curve.values("success"))
+        # Ordered as BestModel orders models: by the rate, then by the reward.
+        scores = list(zip(rate, curve.reward, success, strict=True))
+        if stage.pass_on == "best":
+            scores.sort()
+        _, reward, success_rate = scores[-1]
+        required = stage.require
+        misses_reward = required.mean_reward is not None and reward < required.mean_reward
+        if success_rate < required.success_rate or misses_reward:
             raise TrainingError(
-                f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} miss what it requires "
-                f"(success_rate {stage.require.success_rate:g}, mean_reward {wanted:g}); its run is {run.path}"
+                f"stage {stage.name!r}: success {success_rate:.3f} and mean reward {reward:.2f} "
+                f"miss what it requires ({required}); its run is {run.path}"
             )
-    return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
+    if stage.pass_on == "best" and run.best_model.is_file():
+        return run.best_model
+    return run.model
 
 
-def _corrected(
-    stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[str], None]
-) -> Path:
-    """The trimmed agent of a stage, which lies beside the one that it is made of."""
-    if run.corrected_model.is_file():
-        return run.corrected_model
-    model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, job, run), device=job.device)
-    report(f"trimming the agent ({stage.correct_offset}), which may take minutes")
+def _correct(
+    correction: OffsetCorrection,
+    job: TrainingJob,
+    run: RunFolder,
+    agent: Path,
+    report: Report,
+) -> None:
+    """Write the corrected agent of a run."""
+    model = load_zip(get_algorithm(job.config.algo), agent, device=job.device)
+    report(f"correcting the agent's offset ({correction.kind}), which may take minutes")
+    settings = job.flight_settings
     seed = seed_for("correction", job.seed)
-    if stage.correct_offset == "hover":
-        did = correct_hover(model, seed, job.flight_settings)
-        words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
-    elif stage.correct_offset == "arrival":
-        flown = job.config.flight_settings.with_changes(**stage.correction_env_kwargs)
-        seeds = [seed_for("correction", job.seed + i) for i in range(stage.correction_rounds)]
-        found = [
-            correct_arrival(model, each, job.flight_settings, flown, stage.overshoot_cost)
-            for each in seeds
-        ]
-        words = "slow arrivals, failures and losses cost " + "; ".join(
-            f"{a:.2f} s, now {b:.2f} s" for a, b in found
-        )
+    if correction.kind == "hover":
+        change = correct_hover(model, seed, settings)
+        line = f"action at the target {change.before:.4f} from hover, now {change.after:.4f}"
+    elif correction.kind == "position":
+        change = correct_offset(model, seed, settings, correction.scale)
+        line = f"steady offset {change.before:.3f} m, now {change.after:.3f} m"
     else:
-        did = correct_offset(model, seed, job.flight_settings, stage.position_scale)
-        words = f"steady offset {did.before:.3f} m, now {did.after:.3f} m"
+        trained = job.config.flight_settings.with_changes(**correction.env_kwargs)
+        costs = []
+        for number in range(correction.rounds):
+            seed = seed_for("correction", job.seed + number)
+            change = correct_arrival(model, seed, settings, trained, correction.overshoot_cost)
+            costs.append(f"{change.before:.2f} s, now {change.after:.2f} s")
+        line = "slow arrivals, misses and crashes cost " + "; ".join(costs)
     save_model(model, run.corrected_model)
-    report(f"trimmed: {words}: {run.corrected_model}")
-    return run.corrected_model
+    report(f"corrected: {line}: {run.corrected_model}")

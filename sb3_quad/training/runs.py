@@ -22,57 +22,67 @@ MADE_WITH = ("commit", "versions")  # keys of args.yml
 
 
 class RunFolder:
-    """The files of one run. There are also ``rl_model_<N>_steps.zip``, its checkpoints.
+    """The files of one run. Its checkpoints are further ones, ``rl_model_<N>_steps.zip``.
 
     :param path: the folder.
     :param name: the environment id, as file names take it.
     """
 
     def __init__(self, path: Path, name: str) -> None:
-        self.path, self.name = path, name
-        self.model = path / f"{name}.zip"  # at the end, or where the run was interrupted
-        self.best_model = path / BEST  # of the evaluations: by success, then by mean reward
-        self.corrected_model = (
-            path / CORRECTED
-        )  # the same after trimming, where a pipeline does that
-        self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
-        self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
-        self.resume_state = path / "resume.npz"  # the snapshot of an unfinished run
-        self.config = path / name / "config.yml"  # the settings
-        self.arguments = (
-            path / name / "args.yml"
-        )  # of the command line; env_kwargs: what the agent is judged with
-        self.command = path / name / "command.txt"  # what was typed
+        self.path = path
+        self.name = name
+        # The model at the end, or where the run was interrupted.
+        self.model = path / f"{name}.zip"
+        # The best model of the evaluations: by success, then by mean reward.
+        self.best_model = path / BEST
+        # The model after the offset correction, where a pipeline does that.
+        self.corrected_model = path / CORRECTED
+        # Evaluations as SB3's EvalCallback writes them.
+        self.evaluations = path / "evaluations.npz"
+        # Every training episode, as SB3's Monitor writes them.
+        self.episodes = path / "0.monitor.csv"
+        # The snapshot of an unfinished run.
+        self.resume_state = path / "resume.npz"
+        # The traceback of the error that ended the run.
+        self.error = path / "error.txt"
+        # The settings.
+        self.config = path / name / "config.yml"
+        # The options; env_kwargs there are those of the evaluations.
+        self.arguments = path / name / "args.yml"
+        # The command that was typed.
+        self.command = path / name / "command.txt"
 
     @property
     def result(self) -> Path:
-        """What the run has to offer: its trimmed agent, else its best one, else its last one."""
+        """The run's agent: the corrected one, else the best one, else the last one."""
         return run_agent(self.path, self.name)
 
     @property
     def not_begun(self) -> bool:
-        """Whether the run ended before its first rollout: it holds neither a snapshot nor any
-        model.
-        """
+        """Whether the run ended before its first rollout, without a snapshot or a model."""
         return not self.resume_state.is_file() and not any(self.path.glob("*.zip"))
 
     @property
     def timesteps(self) -> int:
         """Timesteps of the model at the run's end; 0 before that."""
-        ended = self.model.is_file() and not self.resume_state.is_file()
-        return int(saved_data(self.model)["num_timesteps"]) if ended else 0
+        if self.resume_state.is_file() or not self.model.is_file():
+            return 0
+        return int(saved_data(self.model)["num_timesteps"])
 
     def checkpoint(self, timesteps: int | str) -> Path:
-        """Where the model after ``timesteps`` goes."""
+        """Return the path of the model after ``timesteps``."""
         return self.path / f"rl_model_{timesteps}_steps.zip"
 
     def latest_checkpoint(self) -> Path:
-        """The checkpoint after most timesteps.
+        """Return the path of the checkpoint after most timesteps.
 
-        :raises ConfigError: there is none.
+        :raises ConfigError: the run has no checkpoint.
         """
-        names = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
-        steps = [int(name) for name in names if name.isdigit()]
+        steps = []
+        for checkpoint in self.path.glob(self.checkpoint("*").name):
+            number = checkpoint.name.split("_")[2]
+            if number.isdigit():
+                steps.append(int(number))
         if not steps:
             raise ConfigError(
                 f"{self.path}: holds no checkpoint; train with --save-freq to have some"
@@ -80,53 +90,54 @@ class RunFolder:
         return self.checkpoint(max(steps))
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
-        """Write config.yml and command.txt, then args.yml: a run that has it has begun."""
+        """Write config.yml, command.txt and args.yml.
+
+        args.yml comes last, so that a run that has it lacks nothing.
+        """
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
+        # A program of the user's may train, too.
         program = Path(sys.argv[0]).name
         start = ["sb3-quad"] if program in ("sb3-quad", "__main__.py") else ["python", program]
         write_text(self.command, shlex.join([*start, *sys.argv[1:]]) + "\n")
         write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
 
     def read_yaml(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """config.yml and args.yml, also of a run of rl_zoo3's.
+        """Read config.yml and args.yml, also those of rl_zoo3.
 
-        :raises ConfigError: either missing, unreadable or not a mapping.
+        :raises ConfigError: either is missing, unreadable or not a mapping.
         """
         return read_yaml(self.config), read_yaml(self.arguments)
 
 
 def made_with() -> dict[str, str]:
-    """The commit of the checkout, with a mark where files differ from it, and the versions of what
-    a run is made with.
+    """Return the commit of the checkout and the versions of the packages that train a run.
+
+    The commit has a mark where files differ from it.
     """
     checkout = Path(__file__).resolve().parents[2]
-    command = [
-        "git",
-        "-C",
-        str(checkout),
-        "describe",
-        "--always",
-        "--abbrev=40",
-        "--exclude=*",
-        "--dirty= and changes",
-    ]
+    describe = ["describe", "--always", "--abbrev=40", "--exclude=*"]
+    command = ["git", "-C", str(checkout), *describe, "--dirty= and changes"]
     try:
         commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"
-    versions = f"stable-baselines3 {stable_baselines3.__version__}, torch {torch.__version__}"
-    return dict(zip(MADE_WITH, (commit, f"sb3_quad {__version__}, {versions}"), strict=True))
+    versions = (
+        f"sb3_quad {__version__}, stable-baselines3 {stable_baselines3.__version__}, "
+        f"torch {torch.__version__}"
+    )
+    return {"commit": commit, "versions": versions}
 
 
 def file_name(env_id: str) -> str:
-    """An environment id as part of a file name."""
+    """Return an environment id as part of a file name."""
     return env_id.replace("/", "-").replace(":", "-")
 
 
 def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> RunFolder:
-    """Make the folder of a new run, with the next free number; no other process can get the same
-    one.
+    """Make the folder of a new run, with the next free number.
+
+    No other process can get the same one.
 
     :param unique: add a UUID to the name, as rl-zoo's ``--uuid`` does.
     :raises ConfigError: a folder that cannot be made.
@@ -136,33 +147,38 @@ def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = Fal
 
 
 def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
-    """Make ``<parent>/<name>_<number>`` with the next free number; no other process can get the
-    same one.
+    """Make ``<parent>/<name>_<number>`` with the next free number.
+
+    No other process can get the same one.
 
     :raises ConfigError: a folder that cannot be made.
     """
     make_folder(parent, "log folder", "-f")
-    number = max(_runs(parent, name), default=0) + 1
+    # Numbers of removed runs before the last one are not used again.
+    number = max(_numbered(parent, name), default=0) + 1
     while True:
-        path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
+        ending = f"_{uuid.uuid4()}" if unique else ""
+        path = parent / f"{name}_{number}{ending}"
         try:
-            path.mkdir()  # fails if another run was quicker
+            path.mkdir()
             return path
         except FileExistsError:
+            # Another process was quicker.
             number += 1
 
 
-def _runs(parent: Path, name: str) -> dict[int, Path]:
-    """The folders ``<parent>/<name>_<number>…`` by their numbers."""
-    entries = {
-        entry: entry.name.removeprefix(f"{name}_").split("_")[0]
-        for entry in sorted(parent.glob(f"{name}_*"))
-    }
-    return {int(number): entry for entry, number in entries.items() if number.isdigit()}
+def _numbered(parent: Path, name: str) -> dict[int, Path]:
+    """Return the folders ``<parent>/<name>_<number>…`` by their numbers."""
+    folders = {}
+    for folder in sorted(parent.glob(f"{name}_*")):
+        number = folder.name.removeprefix(f"{name}_").split("_")[0]
+        if number.isdigit():
+            folders[int(number)] = folder
+    return folders
 
 
 def open_run(path: str | Path) -> RunFolder:
-    """The folder of an existing run.
+    """Open the folder of an existing run.
 
     :raises ConfigError: a folder that holds no run.
     """
@@ -176,22 +192,26 @@ def open_run(path: str | Path) -> RunFolder:
 
 
 def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
-    """A run by rl-zoo's ``--exp-id``.
+    """Find a run by rl-zoo's ``--exp-id``.
 
     :param exp_id: number of the run; 0: the latest that has an agent.
-    :raises ConfigError: there is no such run; the message names those there are.
+    :raises ConfigError: there is no such run; the message names the existing ones.
     """
-    parent, name = Path(log_folder) / algo, file_name(env_id)
-    runs = _runs(parent, name)
-    with_agent = [number for number, path in runs.items() if any(path.glob("*.zip"))]
-    number = exp_id if exp_id > 0 else max(with_agent or runs, default=0)
-    if number in runs:
-        return RunFolder(runs[number], name)
-    if not runs:
+    parent = Path(log_folder) / algo
+    name = file_name(env_id)
+    folders = _numbered(parent, name)
+    if not folders:
         raise ConfigError(
             f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f"
         )
-    there = ", ".join(entry.name for entry in runs.values())
-    raise ConfigError(
-        f"{parent}: there is no run {name}_{number}; there is {there}; give another with --exp-id"
-    )
+    number = exp_id
+    if number <= 0:
+        with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
+        number = max(with_agent or folders)
+    if number not in folders:
+        existing = ", ".join(folder.name for folder in folders.values())
+        raise ConfigError(
+            f"{parent}: there is no run {name}_{number}; there is {existing}; "
+            "give another with --exp-id"
+        )
+    return RunFolder(folders[number], name)

@@ -1,4 +1,4 @@
-"""Snapshots of a run: one file that holds all it needs to go on, and is replaced as a whole."""
+"""Snapshots of a run: one file that holds all it needs to resume, and is replaced as a whole."""
 
 import io
 import json
@@ -26,35 +26,39 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
-ENVIRONMENT = "environment."  # before the names of its arrays
-COUNTERS = {
-    "dataset": ("added",),
-    "replay_buffer": ("pos", "full"),
-}  # of what a model may keep: how far it is filled
-LOG = TypeAdapter(
-    dict[str, tuple[float, int, tuple[str, ...]]]
-)  # by name: value, how many it is the mean of, not shown by
+# Prefix of the environments' arrays.
+ENVIRONMENT = "environment."
+# Fill counters of a model's stores, which keep rows beyond a rollout.
+COUNTERS = {"dataset": ("added",), "replay_buffer": ("pos", "full")}
+# By name: value, sample count, excluded formats.
+LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])
 NO_BYTES = np.zeros(0, np.uint8)
+# Arrays whose length is not known before they are read.
 ANY_LENGTH = ("model", "best_model", "random", "log")
-SHARE = 0.03  # of the run's time that snapshots may take
-PAUSE = 1.0  # s between two snapshots of an off-policy algorithm, whose rollouts are short
+# Share of the run's time that snapshots may take.
+SHARE = 0.03
+# Seconds between two snapshots of an off-policy algorithm, whose rollouts are short.
+PAUSE = 1.0
 
 
 class Snapshot(NamedTuple):
-    """A model between two rollouts."""
+    """A model between two rollouts.
+
+    :param model: the zip.
+    """
 
     timesteps: int
-    model: bytes  # the zip
+    model: bytes
 
 
 class SnapshotFile(BaseCallback):
-    """Takes a :class:`Snapshot` whenever a rollout starts, and writes that of the first, then one
-    in so many seconds.
+    """Takes a :class:`Snapshot` whenever a rollout starts, and writes some of them to the file.
 
-    Where writing takes long, as it does for a large dataset on a slow disk, fewer are written.
+    That is the first one, then one in so many seconds. Where writing takes long, as it does for a
+    large dataset on a slow disk, fewer are written.
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
-    :param report: called with one line if a snapshot cannot be written; the training goes on.
+    :param report: called with one line if a snapshot cannot be written; the training continues.
     :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
     :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from
         before that update.
@@ -66,81 +70,76 @@ class SnapshotFile(BaseCallback):
         self, run: RunFolder, every: float, report: Callable[[str], None], hurry: Callable[[], bool]
     ) -> None:
         super().__init__()
-        self._run, self._every, self._report, self._hurry = run, every, report, hurry
+        self._run = run
+        self._every = every
+        self._report = report
+        self._hurry = hurry
         self._state: Arrays = {}
-        self._taken, self._next_write = -np.inf, -np.inf  # s
+        self._next_taken = -np.inf  # s
+        self._next_write = -np.inf  # s
 
     @property
     def is_fresh(self) -> bool:
-        """Whether the rollout under way is in its first step after the snapshot, so that no buffer
-        holds more than it.
+        """Whether the rollout is in its first step after the snapshot.
+
+        No buffer holds more than the snapshot then.
         """
-        after = self.num_timesteps - self.training_env.num_envs
-        return (
-            not isinstance(self.model, OffPolicyAlgorithm)
-            or self.snapshot is None
-            or self.snapshot.timesteps == after
-        )
+        if self.snapshot is None or not isinstance(self.model, OffPolicyAlgorithm):
+            return True
+        return self.snapshot.timesteps == self.num_timesteps - self.training_env.num_envs
 
     def _on_training_start(self) -> None:
-        if (
-            self._run.resume_state.is_file()
-        ):  # the log of a resumed run says what it would have said
-            set_log(
-                self.logger,
-                read_arrays(self._run.resume_state, "log").get("log"),
-                self._run.resume_state,
-            )
+        path = self._run.resume_state
+        # The log of a resumed run is to say what it would have said without the interruption.
+        if path.is_file():
+            set_log(self.logger, read_arrays(path, "log").get("log"), path)
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
         start = time.monotonic()
-        if (
-            isinstance(self.model, OffPolicyAlgorithm)
-            and start < self._taken + PAUSE
-            and not self._hurry()
-        ):
+        is_off_policy = isinstance(self.model, OffPolicyAlgorithm)
+        if is_off_policy and start < self._next_taken and not self._hurry():
             return
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
                 raise TrainingError(
-                    f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate"
+                    f"after {self.num_timesteps:,} timesteps {name} is no longer finite; "
+                    "lower learning_rate"
                 )
-        self._taken, self.snapshot = (
-            start,
-            Snapshot(self.model.num_timesteps, model_bytes(self.model)),
-        )
-        self._state = self._beside_the_model()
+        self._next_taken = start + PAUSE
+        self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model))
+        self._state = self._around_model()
         start = time.monotonic()
         if self._every > 0 and start >= self._next_write:
             try:
                 self.write()
             except ConfigError as error:
                 self._report(f"warning: no new snapshot, the one before is kept: {error}")
-            self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
+            took = time.monotonic() - start
+            self._next_write = start + max(self._every, took / SHARE)
 
-    def _beside_the_model(self) -> Arrays:
-        """Random numbers, environments, how far files have come, and how far the dataset and
-        buffers are filled.
+    def _around_model(self) -> Arrays:
+        """Return random numbers, environments, lengths of files, and fill counters of the stores.
 
-        What these hold is read when the snapshot is written. A rollout later they hold more, and
-        the oldest of a full one are replaced; the resumed training adds the same rows again before
-        it reads any.
+        The stores' rows are read when the snapshot is written. A rollout later they hold more, and
+        the oldest of a full store are replaced; the resumed training adds the same rows again
+        before it reads any.
         """
-        model: Any = self.model
-        batch: Any = getattr(
-            self.training_env.unwrapped, "batch", None
-        )  # there is none in dummy and subproc
-        state = random_state() | {"log": log_state(self.logger)}
-        state |= _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {})
-        episodes, best_model = self._run.episodes, self._run.best_model
-        state["episodes"] = np.array(episodes.stat().st_size if episodes.is_file() else 0)
-        state["best_model"] = (
-            np.fromfile(best_model, dtype=np.uint8) if best_model.is_file() else NO_BYTES
-        )
-        return state | _counters(model)
+        state = {
+            **random_state(),
+            **_environment_state(self.training_env),
+            **_counters(self.model),
+            "log": log_state(self.logger),
+            "episodes": np.array(0),
+            "best_model": NO_BYTES,
+        }
+        if self._run.episodes.is_file():
+            state["episodes"] = np.array(self._run.episodes.stat().st_size)
+        if self._run.best_model.is_file():
+            state["best_model"] = np.fromfile(self._run.best_model, np.uint8)
+        return state
 
     def write(self) -> None:
         """Write the latest snapshot; until that is whole, the file holds the one before.
@@ -148,174 +147,177 @@ class SnapshotFile(BaseCallback):
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
         assert self.snapshot is not None
-        timesteps, model = self.snapshot
         arrays: dict[str, Any] = {
-            "timesteps": np.array(timesteps),
-            "model": np.frombuffer(model, dtype=np.uint8),
+            "timesteps": np.array(self.snapshot.timesteps),
+            "model": np.frombuffer(self.snapshot.model, np.uint8),
             **self._state,
         }
         for name, store in _stores(self.model).items():
-            arrays |= _with_prefix(f"{name}.", _filled(store))
+            arrays |= _filled(name, store)
         write_arrays(self._run.resume_state, **arrays)
 
 
 def load_snapshot(
     run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any
 ) -> BaseAlgorithm:
-    """The model of a run's snapshot, ready for ``learn(…, reset_num_timesteps=False)``; what came
-    after it is taken back.
+    """Load the model of a run's snapshot, ready for ``learn(…, reset_num_timesteps=False)``.
+
+    The run's files are rolled back to the snapshot.
 
     :param attributes: given to ``load``: what the zip does not hold, such as ``expert``.
-    :raises ConfigError: a file that is missing or damaged, or of other settings; nothing has been
-        taken back then.
+    :raises ConfigError: a file that is missing or damaged, or of other settings; then nothing has
+        been rolled back.
     """
     path = run.resume_state
     if not path.is_file():
-        further = (
-            f"; to train its model further use -i {run.result}" if run.result.is_file() else ""
-        )
-        raise ConfigError(f"run folder {run.path}: holds no interrupted run{further}")
-    state, batch = read_arrays(path), getattr(env.unwrapped, "batch", None)
-    environment = {
-        name.removeprefix(ENVIRONMENT): each
-        for name, each in state.items()
-        if name.startswith(ENVIRONMENT)
-    }
-    algorithm = get_algorithm(algo)
+        message = f"run folder {run.path}: holds no interrupted run"
+        if run.result.is_file():
+            message += f"; to train its model further use -i {run.result}"
+        raise ConfigError(message)
+    state = read_arrays(path)
+    batch = _batch(env)
+    # The model comes first: what else is expected depends on it.
     _check(state, {"model": NO_BYTES}, path)
-    zip_file, where = io.BytesIO(state["model"].tobytes()), f"{path}: model"
     model: Any = load_zip(
-        algorithm,
-        zip_file,
-        where=where,
+        get_algorithm(algo),
+        io.BytesIO(state["model"].tobytes()),
+        where=f"{path}: model",
         env=env,
         device=device,
         force_reset=batch is None,
         **attributes,
     )
-    one = np.array(0)
-    _check(
-        state,
-        {
-            "timesteps": one,
-            "episodes": one,
-            "best_model": NO_BYTES,
-            "log": np.array(""),
-            **random_state(),
-        },
-        path,
-    )
-    _check(state, _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {}), path)
-    _require(
-        batch is not None or not environment,
-        f"{ENVIRONMENT}… is of environments of another kind",
-        path,
-    )
+    expected = {
+        "timesteps": np.array(0),
+        "episodes": np.array(0),
+        "best_model": NO_BYTES,
+        "log": np.array(""),
+        **random_state(),
+        **_environment_state(env),
+        **_counters(model),
+    }
+    _check(state, expected, path)
     _require(int(state["episodes"]) >= 0, "episodes is negative", path)
+    _require(model.num_timesteps == state["timesteps"], "timesteps is not that of model", path)
     try:
         set_random_state(state)
-    except Exception as error:  # what is no state raises what it likes
-        _require(
-            False, f"random and torch are no states of random numbers ({one_line(error)})", path
-        )
-    _require(model.num_timesteps == int(state["timesteps"]), "timesteps is not that of model", path)
-    _check(state, _counters(model), path)
+    except Exception as error:  # a damaged state may raise anything
+        problem = f"random and torch are not states of random numbers ({one_line(error)})"
+        _require(False, problem, path)
     for name, store in _stores(model).items():
-        for counter in COUNTERS[name]:
-            value = state[f"{name}.{counter}"].item()
-            _require(
-                0 <= value < getattr(store, "buffer_size", np.inf),
-                f"{name}.{counter} is beyond its rows",
-                path,
-            )
-            setattr(store, counter, value)
-        own = _with_prefix(f"{name}.", _filled(store))
-        # What was written later than the rest may hold more rows.
-        state |= {
-            each: state[each][: len(rows)]
-            for each, rows in own.items()
-            if each in state and state[each].ndim
-        }
-        _check(state, own, path)
-        for each, rows in own.items():
-            rows[...] = state[each]
+        _fill(name, store, state, path)
+    environment = {
+        name.removeprefix(ENVIRONMENT): array
+        for name, array in state.items()
+        if name.startswith(ENVIRONMENT)
+    }
     if batch is not None:
         try:
             batch.restore(environment)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from None
-    _take_back(run, state, model.num_timesteps)
+    else:
+        problem = f"{ENVIRONMENT}… is of environments of another kind"
+        _require(not environment, problem, path)
+    _roll_back(run, state)
+    # What was loaded since then may have sampled.
     set_random_state(state)
     return cast(BaseAlgorithm, model)
 
 
 def _check(state: Arrays, expected: Arrays, path: Path) -> None:
-    """See that a snapshot has arrays of the names, types and shapes of those that are expected."""
+    """Check that a snapshot has arrays of the names, types and shapes of the expected ones."""
     for name, like in expected.items():
         _require(name in state, f"{name} is missing", path)
         array = state[name]
-        kinds = [
-            (each.dtype.kind, each.ndim) if name in ANY_LENGTH else (each.dtype, each.shape)
-            for each in (array, like)
-        ]
-        found = f"{name} is {array.dtype} of shape {array.shape}, must be {like.dtype} of shape {like.shape}"
-        _require(kinds[0] == kinds[1], found, path)
+        if name in ANY_LENGTH:
+            fits = array.dtype.kind == like.dtype.kind and array.ndim == like.ndim
+        else:
+            fits = array.dtype == like.dtype and array.shape == like.shape
+        problem = f"{name} is {array.dtype} {array.shape}, must be {like.dtype} {like.shape}"
+        _require(fits, problem, path)
 
 
-def _require(fits: bool, otherwise: str, path: Path) -> None:
+def _require(fits: bool, problem: str, path: Path) -> None:
     if not fits:
         raise ConfigError(
-            f"{path}: {otherwise}; it is damaged, or of other settings; -i trains an agent of the run further"
+            f"{path}: {problem}; it is damaged, or of other settings; "
+            "-i trains an agent of the run further"
         )
 
 
-def _with_prefix(prefix: str, arrays: Arrays) -> Arrays:
-    return {f"{prefix}{name}": array for name, array in arrays.items()}
+def _batch(env: VecEnv) -> Any:
+    """Return the batch of the batched environment, which can be restored; None for others."""
+    return getattr(env.unwrapped, "batch", None)
+
+
+def _environment_state(env: VecEnv) -> Arrays:
+    batch = _batch(env)
+    if batch is None:
+        return {}
+    return {f"{ENVIRONMENT}{name}": array for name, array in batch.snapshot().items()}
 
 
 def _stores(model: Any) -> dict[str, Any]:
-    """What a model keeps beyond a rollout, by name."""
-    return {
-        name: getattr(model, name) for name in COUNTERS if getattr(model, name, None) is not None
-    }
+    """Return what a model keeps beyond a rollout, by name."""
+    stores = {name: getattr(model, name, None) for name in COUNTERS}
+    return {name: store for name, store in stores.items() if store is not None}
 
 
 def _counters(model: Any) -> Arrays:
-    """How far these are filled."""
-    stores = _stores(model)
-    return {
-        f"{name}.{each}": np.array(getattr(stores[name], each))
-        for name in stores
-        for each in COUNTERS[name]
-    }
+    """Return the fill counters of a model's stores."""
+    counters = {}
+    for name, store in _stores(model).items():
+        for counter in COUNTERS[name]:
+            counters[f"{name}.{counter}"] = np.array(getattr(store, counter))
+    return counters
 
 
-def _filled(store: Any) -> Arrays:
-    """Views of the rows that a dataset or a replay buffer holds, by name."""
+def _filled(name: str, store: Any) -> Arrays:
+    """Return views of the rows that a dataset or a replay buffer holds, by name."""
     if not isinstance(store, ReplayBuffer):
-        return store.filled  # type: ignore[no-any-return]
-    if isinstance(store.observations, dict):
+        arrays = store.filled
+    elif isinstance(store.observations, dict):
         raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
-    rows = store.size() + 1  # the memory-efficient variant keeps the last next observation there
-    return {
-        name: array[:rows] for name, array in vars(store).items() if isinstance(array, np.ndarray)
-    }
+    else:
+        # The memory-efficient variant keeps the last next observation one row further on.
+        rows = store.size() + 1
+        buffers = {
+            key: array for key, array in vars(store).items() if isinstance(array, np.ndarray)
+        }
+        arrays = {key: array[:rows] for key, array in buffers.items()}
+    return {f"{name}.{key}": array for key, array in arrays.items()}
 
 
-def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:
-    """Let evaluations, best model and episodes be those of the snapshot, so that nothing is there
-    twice.
-    """
+def _fill(name: str, store: Any, state: Arrays, path: Path) -> None:
+    """Put a snapshot's rows into a store."""
+    for counter in COUNTERS[name]:
+        value = state[f"{name}.{counter}"].item()
+        fits = 0 <= value < getattr(store, "buffer_size", np.inf)
+        _require(fits, f"{name}.{counter} is beyond its rows", path)
+        setattr(store, counter, value)
+    for key, rows in _filled(name, store).items():
+        # What was written later than the counters may hold more rows.
+        if key in state and state[key].ndim:
+            state[key] = state[key][: len(rows)]
+        _check(state, {key: rows}, path)
+        rows[...] = state[key]
+
+
+def _roll_back(run: RunFolder, state: Arrays) -> None:
+    """Roll logs and best model back to the snapshot, so that resuming does not duplicate rows."""
     evaluations = {path: read_arrays(path) for path in run.path.glob("evaluations*.npz")}
     for path, rows in evaluations.items():
-        is_table = "timesteps" in rows and len({each.shape[:1] for each in rows.values()}) == 1
+        lengths = {array.shape[:1] for array in rows.values()}
+        is_table = "timesteps" in rows and len(lengths) == 1
         _require(is_table and rows["timesteps"].dtype.kind == "i", "holds no evaluations", path)
+    # Only when all files are known to be good is any of them changed.
     for path, rows in evaluations.items():
-        earlier = rows["timesteps"] <= timesteps
-        if not earlier.any():
+        is_earlier = rows["timesteps"] <= state["timesteps"]
+        if not is_earlier.any():
             path.unlink()
-        elif not earlier.all():
-            write_arrays(path, **{name: array[earlier] for name, array in rows.items()})
+        elif not is_earlier.all():
+            write_arrays(path, **{name: array[is_earlier] for name, array in rows.items()})
     if state["best_model"].size:
         write_bytes(run.best_model, state["best_model"].tobytes())
     else:
@@ -325,38 +327,37 @@ def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:
 
 
 def log_state(logger: Logger) -> Any:
-    """What was recorded since the logger's last dump, such as the losses of the latest update, as
-    JSON.
+    """Return what was recorded since the logger's last dump, as JSON.
+
+    That is the losses of the latest update, for example.
     """
-    numbers = {
-        name: value
-        for name, value in logger.name_to_value.items()
-        if isinstance(value, (int, float, np.number))
-    }
-    kept = {
-        name: (float(each), logger.name_to_count[name], logger.name_to_excluded[name])
-        for name, each in numbers.items()
-    }
-    return np.array(json.dumps(kept))
+    records = {}
+    for name, value in logger.name_to_value.items():
+        if isinstance(value, (int, float, np.number)):
+            count = logger.name_to_count[name]
+            records[name] = (float(value), count, logger.name_to_excluded[name])
+    return np.array(json.dumps(records))
 
 
 def set_log(logger: Logger, state: Any, path: Path) -> None:
-    """Record what :func:`log_state` gave.
+    """Record again what :func:`log_state` returned.
 
     :raises ConfigError: something else, which the file at ``path`` holds.
     """
     try:
-        kept = LOG.validate_python(json.loads(str(state)))
+        records = LOG.validate_python(json.loads(str(state)))
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
-    for name, (value, count, excluded) in kept.items():
-        logger.name_to_value[name], logger.name_to_excluded[name] = value, excluded
+    for name, (value, count, excluded) in records.items():
+        logger.name_to_value[name] = value
         logger.name_to_count[name] = count
+        logger.name_to_excluded[name] = excluded
 
 
 def random_state() -> Arrays:
-    """The states of the global random number generators of torch, Python and NumPy, which SB3
-    samples from.
+    """Return the states of the global generators that SB3 samples from.
+
+    They are torch's, Python's and NumPy's.
     """
     numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
@@ -365,7 +366,7 @@ def random_state() -> Arrays:
 
 
 def set_random_state(state: Arrays) -> None:
-    """Undo what has happened to the random numbers since :func:`random_state`."""
+    """Restore the generators to what :func:`random_state` returned."""
     (version, words, gauss), numpy_state = json.loads(str(state["random"]))
     random.setstate((version, tuple(words), gauss))
     np.random.set_state(numpy_state)  # noqa: NPY002

@@ -1,4 +1,4 @@
-"""Settings of a training that starts from a trained agent: observation and networks as in its zip."""
+"""Settings of a training that starts from a trained agent: observation and networks of its zip."""
 
 from pathlib import Path
 from typing import Any
@@ -12,36 +12,36 @@ from sb3_quad.vehicles.vehicle import first_vehicle
 
 
 def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) -> dict[str, Any]:
-    """``changes`` to a settings file, and with them what makes its agent's successor: observation
-    and networks, as in the zip.
+    """Return ``changes`` to a settings file with the observation and networks of a zip added.
 
-    What ``changes`` give themselves holds. Evaluations fly with the agent's integral, if it has
-    one, as it does; training does without. A zip that says nothing of its flights changes nothing.
+    What is in ``changes`` takes precedence. Evaluations fly with the agent's position integral, if
+    it has one; training does without. A zip that does not say how its agent flies adds nothing.
 
-    :param config: what the file and ``changes`` alone amount to.
+    :param config: the settings with ``changes`` alone.
     """
     own, source = agent_settings(path)
     if source is None or config.task is None:
         return changes
-    if notice := unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle)):
-        print_once(f"warning: {notice}; --env-kwargs vehicle:… says which")
-    seen = {
+    # A new vehicle may be what the user wants, so this is only a warning.
+    notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))
+    if notice:
+        print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
+    env_kwargs = {
         name: own.observed[name]
         for name in ("last_action", "history", "observation_mean", "observation_std")
     }
-    flown = {"position_integral": own.observed["position_integral"]}
-    given = {**changes, "env_kwargs": {**seen, **changes.get("env_kwargs", {})}}
-    given["eval_env_kwargs"] = {
-        **flown,
-        **config.eval_env_kwargs,
-        **changes.get("eval_env_kwargs", {}),
-    }
+    env_kwargs |= changes.get("env_kwargs", {})
+    eval_env_kwargs = {"position_integral": own.observed["position_integral"]}
+    eval_env_kwargs |= config.eval_env_kwargs
+    eval_env_kwargs |= changes.get("eval_env_kwargs", {})
+    merged = {**changes, "env_kwargs": env_kwargs, "eval_env_kwargs": eval_env_kwargs}
+    # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
         policy: Any = load_model(path).policy
-        unit = f"nn.{policy.activation_fn.__name__}"  # as config.yml names it
-        given["policy_kwargs"] = {
+        merged["policy_kwargs"] = {
             **config.policy_kwargs,
             "net_arch": policy.net_arch,
-            "activation_fn": unit,
+            # As config.yml names it.
+            "activation_fn": f"nn.{policy.activation_fn.__name__}",
         }
-    return given
+    return merged

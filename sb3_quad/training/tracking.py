@@ -1,4 +1,4 @@
-"""What others see of a training: its settings in TensorBoard, and a run of Weights & Biases."""
+"""Settings of a training in TensorBoard, and runs of Weights & Biases."""
 
 import time
 from collections.abc import Iterator
@@ -10,14 +10,11 @@ from stable_baselines3.common.logger import HParam
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.runs import made_with
 
-METRICS = (
-    "eval/success_rate",
-    "eval/mean_reward",
-    "rollout/ep_rew_mean",
-)  # beside the settings, under HPARAMS
+# TensorBoard shows these next to the settings, under HPARAMS.
+METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")
 
 
 class HyperparameterLog(BaseCallback):
@@ -25,20 +22,19 @@ class HyperparameterLog(BaseCallback):
 
     def __init__(self, job: TrainingJob) -> None:
         super().__init__()
-        given = {
-            **job.config.settings,
-            "algo": job.config.algo,
-            "env": job.config.env_id,
+        config = job.config
+        self._shown: dict[str, bool | int | float | str] = {
+            "algo": config.algo,
+            "env": config.env_id,
             "seed": job.seed,
         }
-        self._shown = {
-            name: value if isinstance(value, (bool, int, float)) else str(value)
-            for name, value in given.items()
-        }
+        # TensorBoard takes plain values alone.
+        for name, value in config.settings.items():
+            self._shown[name] = value if isinstance(value, (bool, int, float)) else str(value)
 
     def _on_training_start(self) -> None:
-        shown = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
-        self.logger.record("hparams", shown, exclude=("stdout", "log", "json", "csv"))
+        parameters = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
+        self.logger.record("hparams", parameters, exclude=("stdout", "log", "json", "csv"))
 
     def _on_step(self) -> bool:
         return True
@@ -46,24 +42,27 @@ class HyperparameterLog(BaseCallback):
 
 @contextmanager
 def tracked(job: TrainingJob) -> Iterator[None]:
-    """Where the job is to be tracked, a run of Weights & Biases as rl_zoo3 makes it: it takes what
-    TensorBoard is given.
+    """Track the block in a run of Weights & Biases, if the job asks for it.
+
+    The run is made as rl_zoo3 makes it, and shows what TensorBoard is given.
 
     :raises ConfigError: it cannot begin, for example without a login.
     """
     if not job.track:
         yield
         return
+    # wandb is an extra, which JobOptions has checked.
     import wandb
 
+    config = job.config
     try:
         run = wandb.init(
-            name=f"{job.config.env_id}__{job.config.algo}__{job.seed}__{int(time.time())}",
+            name=f"{config.env_id}__{config.algo}__{job.seed}__{int(time.time())}",
             project=job.wandb_project_name,
             entity=job.wandb_entity,
             group=job.wandb_group,
             tags=[*(job.wandb_tags or ()), f"v{stable_baselines3.__version__}"],
-            config={**job.arguments(), **job.config.settings, **made_with()},
+            config={**job.arguments(), **config.settings, **made_with()},
             sync_tensorboard=True,
         )
     except wandb.Error as error:

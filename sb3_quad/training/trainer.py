@@ -1,13 +1,14 @@
-"""Runs a training job: from its settings to a run folder with a model, also after a signal or an
-error.
+"""Runs a training job: from its settings to a run folder with a model.
 
-A snapshot of a run lies between two rollouts. Where the environments can be restored (the batched
-one can), the resumed run is bit for bit the one that was not interrupted; elsewhere episodes start
-anew.
+A run that a signal or an error ends leaves a model and a snapshot, which lies between two rollouts.
+Where the environments can be restored (the batched one can), the resumed run is bit for bit the one
+that was not interrupted; elsewhere the episodes start again.
 """
 
 import copy
+import inspect
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -23,37 +24,37 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes
+from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint
+from sb3_quad.callbacks.every import Checkpoint, ProgressLine
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.training.algorithms import get_algorithm, takes_expert
-from sb3_quad.training.config import TrainingConfig, build_config
+from sb3_quad.training.classes import instance
+from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
-from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
-from sb3_quad.training.snapshots import Snapshot, SnapshotFile, load_snapshot
+from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
 from sb3_quad.training.tracking import HyperparameterLog, tracked
-from sb3_quad.training.values import instance
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
+NEVER = 2**62  # timesteps
+OWN_TASK = ""  # the name of the evaluations on the task of the training
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
-EvalEnvs = dict[str | None, VecEnv]
 
 
 @dataclass(frozen=True)
 class TrainingResult:
     """How a run ended.
 
-    :param seconds: wall-clock time of the training, evaluations along the way included.
+    :param seconds: wall-clock time of the training, evaluations included.
     :param signal: the name of the signal that interrupted it, empty if none did.
     :param exit_code: 0; 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP.
     """
@@ -72,52 +73,43 @@ def train(
     on_start: Callable[[RunFolder], None] = lambda run: None,
     should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
-    """Train as ``job`` says, in a run folder of its own.
+    """Train a job in a new run folder.
 
     :param report: called with one line for each event.
     :param on_start: called with the run folder before the training begins.
     :param should_continue: called after each evaluation with its success rate and mean reward;
         False ends the training.
-    :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model
-        was saved.
+    :raises SB3QuadError: bad settings; or a training that cannot continue, after the last good
+        model was saved.
     """
-    config = job.config
-    if job.tensorboard_log is not None:  # before there is a run folder, which would stay empty
+    # All that can be refused is refused before there is a run folder, which would stay empty.
+    if job.tensorboard_log is not None:
         make_folder(job.tensorboard_log, "TensorBoard folder", "-tb")
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
-        callbacks = _own_callbacks(config)  # a misspelt keyword leaves no run folder
+        callbacks = _user_callbacks(job.config)
         with tracked(job):
-            run = claim_run(job.log_folder, config.algo, config.env_id, job.uuid)
+            run = claim_run(job.log_folder, job.config.algo, job.config.env_id, job.uuid)
             with locked(run.path, "run folder"):
-                run.write_yaml(config.settings, job.arguments() | made_with())
+                run.write_yaml(job.config.settings, job.arguments() | made_with())
                 on_start(run)
-                return _learn(
-                    job, run, model, eval_envs, callbacks, signals, report, should_continue
-                )
+                training = _Training(job, run, model, eval_envs, signals, report, should_continue)
+                return training.run_to_end(callbacks)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
-    """Go on with an interrupted or killed run, in its folder: same settings, seed, optimiser,
-    dataset and step count.
+    """Continue an interrupted or killed run in its folder.
 
-    A run that has not come to its first rollout is begun; one that is complete gives its result.
+    Settings, seed, optimiser, dataset and step count stay the same. A run that has not come to its
+    first rollout is started; a complete one gives its result.
 
-    :param changes: arguments of the job to change, such as ``progress``.
+    :param changes: options of the job to change, such as ``progress``.
     :raises SB3QuadError: a folder without such a run, one that another process trains, or with
         damaged files; else as :func:`train`.
     """
     run = open_run(run_folder)
-    settings, arguments = run.read_yaml()
-    if not {"algo", "env"} <= arguments.keys():
-        raise ConfigError(f"{run.arguments}: algo or env is missing")
-    config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
-    given = {
-        key: value
-        for key, value in arguments.items()
-        if key not in ("algo", "env", "env_kwargs", *MADE_WITH)
-    }
-    job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
+    job = _read_job(run, changes)
+    config = job.config
     with (
         StopSignals() as signals,
         locked(run.path, "run folder"),
@@ -131,221 +123,301 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         if run.not_begun:
             model = build_model(job, env)
         else:
-            attributes = _expert(config) | {
-                "tensorboard_log": job.tensorboard_log,
-                "verbose": job.verbose,
-            }
+            attributes = {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
+            attributes |= _expert(config)
             model = load_snapshot(run, config.algo, env, job.device, **attributes)
             env.seed(seed_for("training", job.seed))  # as in build_model
-        report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
+        report(f"resuming after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         with tracked(job):
-            return _learn(job, run, model, eval_envs, _own_callbacks(config), signals, report)
+            training = _Training(job, run, model, eval_envs, signals, report)
+            return training.run_to_end(_user_callbacks(config))
+
+
+def _read_job(run: RunFolder, changes: dict[str, Any]) -> TrainingJob:
+    """Return the job of a run folder, with ``changes`` to its options."""
+    settings, options = run.read_yaml()
+    if not {"algo", "env"} <= options.keys():
+        raise ConfigError(f"{run.arguments}: algo or env is missing")
+    config = build_config(str(options["algo"]), str(options["env"]), settings, str(run.config))
+    # These are in args.yml for its readers; they are not options.
+    for name in ("algo", "env", "env_kwargs", *MADE_WITH):
+        options.pop(name, None)
+    return validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
 
 
 @contextmanager
-def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
-    """The environments to train in and those to evaluate in; closed in the end.
+def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]]:
+    """Make the environments to train in and those to evaluate in, and close them in the end.
 
-    The latter by task, the run's own first, whose name is None; none if there are no evaluations.
+    The latter are by task, with the job's own under OWN_TASK; without evaluations, there are only
+    the former.
     """
     config = job.config
-    evaluating: EvalEnvs = {}
+    eval_envs: dict[str, VecEnv] = {}
     with ExitStack() as stack:
-        made = make_environments(
-            config, config.n_envs, seed_for("training", job.seed), staggered=True
-        )
-        env = stack.enter_context(closing(made))
+        seed = seed_for("training", job.seed)
+        env = make_environments(config, config.n_envs, seed, staggered=True)
+        stack.enter_context(closing(env))
         if job.eval_episodes > 0:
-            n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
-            for task in (None, *config.eval_tasks):
-                settings = job.for_evaluation() if task is None else job.for_evaluation(task=task)
-                made = make_environments(
-                    settings, min(n_envs, job.eval_episodes), seed_for("evaluation", job.seed)
-                )
-                evaluating[task] = stack.enter_context(closing(made))
-        yield env, evaluating
+            configs = {OWN_TASK: job.for_evaluation()}
+            for task in config.eval_tasks:
+                configs[task] = job.for_evaluation(task=task)
+            n_envs = job.n_eval_envs or 1
+            # The batched environment flies all episodes of an evaluation at once.
+            if config.vec_env == "batch" and job.n_eval_envs is None:
+                n_envs = job.eval_episodes
+            n_envs = min(n_envs, job.eval_episodes)
+            seed = seed_for("evaluation", job.seed)
+            for task, eval_config in configs.items():
+                eval_envs[task] = make_environments(eval_config, n_envs, seed)
+                stack.enter_context(closing(eval_envs[task]))
+        yield env, eval_envs
 
 
 def _expert(config: TrainingConfig) -> dict[str, Any]:
+    """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
     if not takes_expert(get_algorithm(config.algo)):
         return {}
-    vehicle, layout = config.env_kwargs.get("vehicle", "itm"), config.env_kwargs.get("rotor_layout")
+    vehicle = config.env_kwargs.get("vehicle", "itm")
+    layout = config.env_kwargs.get("rotor_layout")
     return {"expert": resolve_expert(config.expert, vehicle, layout=layout)}
 
 
-def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
-    return [instance(path, "callback", **kwargs) for path, kwargs in config.callback]
+def _user_callbacks(config: TrainingConfig) -> list[BaseCallback]:
+    return [instance(path, "callback", **keywords) for path, keywords in config.callback]
 
 
 def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
-    """The algorithm of a job, new, with the policy that it starts from.
+    """Make the algorithm of a job, with the policy that it starts from.
 
     :raises ConfigError: settings that it refuses, or for which this machine has too little memory;
         an agent that does not fit.
     :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
-    keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
+    keywords = copy.deepcopy(config.hyperparams) | _expert(config)
     if config.noise_type is not None:
         zeros = np.zeros(env.action_space.shape or ())
         keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
-    keywords |= {
-        "seed": job.seed,
-        "device": job.device,
-        "verbose": job.verbose,
-        "tensorboard_log": job.tensorboard_log,
-    }
-    try:
-        model = get_algorithm(config.algo)(config.policy, env, **keywords)
-    except SB3QuadError:
-        raise
-    except MemoryError as error:
-        sizes = "n_steps by n_envs, buffer_size or dataset_capacity"
-        raise ConfigError(
-            f"{config.algo}: {sizes} is more than this machine's memory ({one_line(error)})"
-        ) from None
-    except (TypeError, ValueError, AssertionError, RuntimeError) as error:
-        raise ConfigError(
-            f"{config.algo} cannot be made with these settings ({one_line(error)})"
-        ) from error
-    asked: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
-    if asked():  # an expert that fails does so before there is a run folder
+    for name in ("seed", "device", "verbose", "tensorboard_log"):
+        keywords[name] = getattr(job, name)
+    model = _construct(config, env, keywords)
+    # An expert that fails does so before there is a run folder.
+    will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
+    if will_clone():
         observation: Any = env.reset()
         Controller.for_env(keywords["expert"], env).labels(observation)
+    # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
     rate = keywords.get("learning_rate")
-    if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
-        rate.end = rate.start / -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
+    if isinstance(rate, LinearSchedule):
+        n_updates = -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
+        rate.end = rate.start / n_updates
     if job.trained_agent is not None:
         transfer_policy(job.trained_agent, model)
-    env.seed(seed_for("training", job.seed))  # SB3 has seeded it with the seed of the policy
+    # SB3 has seeded the environments with the seed of the policy.
+    env.seed(seed_for("training", job.seed))
     return model
 
 
-def _learn(
-    job: TrainingJob,
-    run: RunFolder,
-    model: BaseAlgorithm,
-    eval_envs: EvalEnvs,
-    own_callbacks: list[BaseCallback],
-    signals: StopSignals,
-    report: Report,
-    should_continue: ShouldContinue = lambda success, reward: True,
-) -> TrainingResult:
-    config = job.config
-    last_good, best = (
-        SnapshotFile(run, job.snapshot_every, report, lambda: signals.received is not None),
-        None,
-    )
-    if config.task is not None and not (
-        config.env_wrapper or config.vec_env_wrapper
-    ):  # flights have no wrappers
-        job.flight_settings.write_into(model)
-    callbacks: list[BaseCallback] = [
-        last_good,
-        EpisodeLog(run.episodes, config.env_id),
-        HyperparameterLog(job),
-    ]
-    if eval_envs:
-        best = BestModel(
-            eval_envs[None],
-            every=job.eval_freq if job.eval_freq > 0 else 2**62,
+def _construct(config: TrainingConfig, env: VecEnv, keywords: dict[str, Any]) -> BaseAlgorithm:
+    """Call the algorithm's constructor; errors that do not concern its arguments stay as they are.
+
+    :raises ConfigError: arguments that it does not take or refuses, or too little memory.
+    """
+    algorithm = get_algorithm(config.algo)
+    try:
+        inspect.signature(algorithm).bind(config.policy, env, **keywords)
+    except TypeError as error:
+        raise ConfigError(f"{config.algo}: {one_line(error)}") from None
+    try:
+        return algorithm(config.policy, env, **keywords)
+    except SB3QuadError:
+        raise
+    except (ValueError, AssertionError) as error:
+        # SB3 refuses values of arguments by these.
+        raise ConfigError(
+            f"{config.algo} cannot be made with these settings ({one_line(error)})"
+        ) from error
+    except (MemoryError, RuntimeError) as error:
+        # PyTorch has a plain RuntimeError for want of memory.
+        if isinstance(error, RuntimeError) and "memory" not in str(error):
+            raise
+        raise ConfigError(
+            f"{config.algo}: n_steps by n_envs, buffer_size or dataset_capacity is more than this "
+            f"machine's memory ({one_line(error)})"
+        ) from None
+
+
+@dataclass
+class _Training:
+    """The training of a model in a run folder: what watches it, and how it ends.
+
+    :param eval_envs: by task, the job's own under OWN_TASK; empty: no evaluations.
+    """
+
+    job: TrainingJob
+    run: RunFolder
+    model: BaseAlgorithm
+    eval_envs: dict[str, VecEnv]
+    signals: StopSignals
+    report: Report
+    should_continue: ShouldContinue = lambda success, reward: True
+
+    def __post_init__(self) -> None:
+        self.snapshots = SnapshotFile(
+            self.run,
+            self.job.snapshot_every,
+            self.report,
+            lambda: self.signals.received is not None,
+        )
+        self.best: BestModel | None = None
+        if self.eval_envs:
+            self.best = self._best_model()
+
+    def _best_model(self) -> BestModel:
+        job = self.job
+        return BestModel(
+            self.eval_envs[OWN_TASK],
+            every=job.eval_freq if job.eval_freq > 0 else NEVER,
             n_episodes=job.eval_episodes,
             seed=seed_for("evaluation", job.seed),
-            best_model=run.best_model,
-            evaluations=run.evaluations,
-            report=report,
-            others={task: env for task, env in eval_envs.items() if task is not None},
-            should_continue=should_continue,
+            best_model=self.run.best_model,
+            evaluations=self.run.evaluations,
+            report=self.report,
+            others={task: self.eval_envs[task] for task in job.config.eval_tasks},
+            should_continue=self.should_continue,
             by=job.config.best_by,
         )
-        callbacks.append(best)
-    if job.save_freq > 0:
-        callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint("{steps}"))))
-    callbacks += own_callbacks
-    if job.progress:
-        callbacks.append(ProgressBarCallback())
-    callbacks.append(
-        ConvertCallback(lambda local, _: signals.received is None or not last_good.is_fresh)
-    )
-    start = time.perf_counter()
-    try:
+
+    def run_to_end(self, user_callbacks: list[BaseCallback]) -> TrainingResult:
+        """Train until the job is done, or a signal or an error ends it, and save the model."""
+        config = self.job.config
+        # A zip says how its agent flies, but a flight cannot have the user's wrappers.
+        if config.task is not None and not (config.env_wrapper or config.vec_env_wrapper):
+            self.job.flight_settings.write_into(self.model)
+        self.run.error.unlink(missing_ok=True)
+        start = time.perf_counter()
         try:
-            model.learn(
-                config.n_timesteps - model.num_timesteps,
-                callback=callbacks,
-                # An off-policy algorithm counts episodes: about as many as rows end their episodes
-                # once.
-                log_interval=job.log_interval * (config.n_envs if config.is_off_policy else 1),
-                tb_log_name=f"{config.algo}_{run.path.name}",
-                reset_num_timesteps=model.num_timesteps == 0,
+            try:
+                self._learn(self._callbacks(user_callbacks))
+            finally:
+                # From here on, no signal interrupts what is saved.
+                self.signals.hold()
+        except (Exception, KeyboardInterrupt) as error:
+            if self.signals.received is None:
+                self._save_after(error)
+                raise
+        seconds = time.perf_counter() - start
+        if self.signals.received is not None:
+            return self._interrupted(seconds)
+        save_model(self.model, self.run.model)
+        self.run.resume_state.unlink(missing_ok=True)
+        self._refuse_removed_folder(self.model.num_timesteps)
+        return TrainingResult(self.job, self.run, self.model, seconds)
+
+    def _callbacks(self, user_callbacks: list[BaseCallback]) -> list[BaseCallback]:
+        """Return all callbacks; they are called in this order."""
+        callbacks: list[BaseCallback] = [
+            self.snapshots,
+            EpisodeLog(self.run.episodes, self.job.config.env_id),
+            HyperparameterLog(self.job),
+        ]
+        if self.best is not None:
+            callbacks.append(self.best)
+        if self.job.save_freq > 0:
+            path = str(self.run.checkpoint("{steps}"))
+            callbacks.append(Checkpoint(self.job.save_freq, path))
+        callbacks += user_callbacks
+        if self.job.progress:
+            callbacks.append(ProgressBarCallback())
+        else:
+            callbacks.append(ProgressLine(self.report))
+        # A signal ends the training where the snapshot can still be completed.
+        callbacks.append(
+            ConvertCallback(lambda *_: self.signals.received is None or not self.snapshots.is_fresh)
+        )
+        return callbacks
+
+    def _learn(self, callbacks: list[BaseCallback]) -> None:
+        config = self.job.config
+        log_interval = self.job.log_interval
+        # An off-policy algorithm counts episodes here; n_envs of them end at about the same time.
+        if config.is_off_policy:
+            log_interval *= config.n_envs
+        self.model.learn(
+            config.n_timesteps - self.model.num_timesteps,
+            callback=callbacks,
+            log_interval=log_interval,
+            tb_log_name=f"{config.algo}_{self.run.path.name}",
+            reset_num_timesteps=self.model.num_timesteps == 0,
+        )
+        best = self.best
+        if best is None or best.stopped or self.signals.received is not None:
+            return
+        # A user's callback may have ended the training early.
+        if best.latest < self.model.num_timesteps:
+            best.evaluate()
+
+    def _interrupted(self, seconds: float) -> TrainingResult:
+        """Save the model and the snapshot after a signal."""
+        snapshot = self.snapshots.snapshot
+        when = "before the first rollout"
+        if snapshot is not None:
+            when = f"after {snapshot.timesteps:,} timesteps: model saved to {self.run.model}"
+            # The model comes first, since it needs the least room.
+            write_bytes(self.run.model, snapshot.model)
+            try:
+                self.snapshots.write()
+            except ConfigError as error:
+                raise ConfigError(f"{error}; interrupted {when}") from error
+            self._refuse_removed_folder(snapshot.timesteps)
+        self.report(
+            f"interrupted by {self.signals.name} {when}; to resume: --resume {self.run.path}"
+        )
+        return TrainingResult(
+            self.job, self.run, self.model, seconds, self.signals.name, self.signals.exit_code
+        )
+
+    def _refuse_removed_folder(self, timesteps: int) -> None:
+        """:raises TrainingError: the run folder was removed while it was trained.
+
+        It has been made again for the model alone.
+        """
+        if not self.run.arguments.is_file():
+            raise TrainingError(
+                f"run folder {self.run.path}: was removed while the training wrote to it; "
+                f"the model after {timesteps:,} timesteps is in {self.run.model}, "
+                "the run's settings and its records until then are lost"
             )
-            if (
-                best is not None
-                and signals.received is None
-                and not best.stopped
-                and best.latest < model.num_timesteps
-            ):
-                best.evaluate()  # a callback has ended the training before its time
-        finally:
-            signals.hold()
-    except (Exception, KeyboardInterrupt) as error:
-        if signals.received is None:
-            _save_after(error, run, last_good.snapshot, model)
-            raise
-    seconds = time.perf_counter() - start
-    if signals.received is None:
-        save_model(model, run.model)
-        run.resume_state.unlink(missing_ok=True)
-        _refuse_removed(run, model.num_timesteps)
-        return TrainingResult(job, run, model, seconds)
-    after = "before the first rollout"
-    if last_good.snapshot is not None:
-        after = f"after {last_good.snapshot.timesteps:,} timesteps: model saved to {run.model}"
-        write_bytes(run.model, last_good.snapshot.model)  # first: it needs the least room
-        try:
-            last_good.write()
-        except ConfigError as error:
-            raise ConfigError(f"{error}; interrupted {after}") from error
-        _refuse_removed(run, last_good.snapshot.timesteps)
-    report(f"interrupted by {signals.name} {after}; to go on: --resume {run.path}")
-    return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
+
+    def _save_after(self, error: BaseException) -> None:
+        """Save the last good model, and the traceback of an error that was not expected.
+
+        An error that has an explanation is raised again; the message says where they are.
+        """
+        where = ""
+        snapshot = self.snapshots.snapshot
+        if snapshot is not None:
+            write_bytes(self.run.model, snapshot.model)
+            where = f"; the model after {snapshot.timesteps:,} timesteps is in {self.run.model}"
+        # An error of this package says what is wrong; the place in the code adds nothing.
+        if isinstance(error, SB3QuadError):
+            raise type(error)(f"{error}{where}") from error
+        write_text(self.run.error, "".join(traceback.format_exception(error)))
+        where += f"; the traceback is in {self.run.error}"
+        if isinstance(error, (EOFError, ConnectionError)):
+            raise TrainingError(f"{WORKER_ENDED}{where}") from error
+        parameters = self.model.policy.parameters()
+        if isinstance(error, ValueError) and not all(th.isfinite(p).all() for p in parameters):
+            raise TrainingError(
+                f"the policy's parameters are no longer finite; lower learning_rate{where}"
+            ) from error
+        # The command line prints the notes of an error that no check foresaw.
+        error.__notes__ = [*getattr(error, "__notes__", ()), where.removeprefix("; ")]
 
 
 def trained_seconds(run: RunFolder) -> float:
-    """Wall-clock time that a complete run took, as far as its evaluations say."""
+    """Return the wall-clock time that a complete run took, as its evaluations say, or 0."""
     return float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
-
-
-def _refuse_removed(run: RunFolder, timesteps: int) -> None:
-    """:raises TrainingError: the run's folder was removed while it trained, and has been made again
-    for the model alone.
-    """
-    if not run.arguments.is_file():
-        raise TrainingError(
-            f"run folder {run.path}: was removed while the training wrote to it; the model after {timesteps:,} timesteps is in"
-            f" {run.model}, the run's settings and what it had noted before are lost"
-        )
-
-
-def _save_after(
-    error: BaseException, run: RunFolder, snapshot: Snapshot | None, model: BaseAlgorithm
-) -> None:
-    """Save the last good model; an error of this package's, or of one of its kinds, is raised anew
-    and says where that is.
-    """
-    where = ""
-    if snapshot is not None:
-        write_bytes(run.model, snapshot.model)
-        where = f"; the model after {snapshot.timesteps:,} timesteps is in {run.model}"
-    if isinstance(error, SB3QuadError):
-        raise type(error)(f"{error}{where}") from error
-    if isinstance(error, (EOFError, ConnectionError)):
-        raise TrainingError(f"{WORKER_ENDED}{where}") from error
-    if isinstance(error, ValueError) and not all(
-        th.isfinite(each).all() for each in model.policy.parameters()
-    ):
-        raise TrainingError(
-            f"the policy's parameters are no longer finite; lower learning_rate{where}"
-        ) from error

@@ -25,8 +25,7 @@ from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
-from sb3_quad.training.config import build_config
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 

@@ -26,8 +26,12 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.training.algorithms import constructor_parameters, get_algorithm, is_off_policy
-from sb3_quad.training.values import takes_whole
+from sb3_quad.training.algorithms import (
+    constructor_parameters,
+    get_algorithm,
+    is_off_policy,
+    takes_whole,
+)
 
 SPACES = YamlFolder("search space", "sb3_quad.zoo_configs.search_spaces", ".yml")
 MINIBATCHES = "n_minibatches"

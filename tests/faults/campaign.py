@@ -1,4 +1,4 @@
-"""Kills commands at random moments, lets them go on, and compares what they leave with what
+"""Kills commands at random moments, lets them resume, and compares what they leave with what
 undisturbed ones leave.
 
     python tests/faults/campaign.py FOLDER KILLS [SEED]
@@ -61,13 +61,16 @@ SETTINGS = {
 MARKS = {
     "pipeline": "pipeline.yml",
     "sweep": "plan.json",
-}  # what a folder has that somebody goes on with; a run */args.yml
+}  # what a folder has that somebody resumes from; a run */args.yml
 NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline|sweep)_\d+"
 SUITE = """
 name: one
 scenarios:
   - {name: near, target: {distance: 1}, duration: 2, episodes: 400}
-  - {name: thrown, start: {attitude: {distribution: uniform}, velocity: {std: 2}}, duration: 2, episodes: 400}
+  - name: thrown
+    start: {attitude: {distribution: uniform}, velocity: {std: 2}}
+    duration: 2
+    episodes: 400
 """
 SWEEP = {
     **{key: DAGGER[key] for key in ("n_timesteps", "n_envs", "env_kwargs")},
@@ -305,9 +308,8 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
             print(
                 f"{place.name}: exit code {code}, differing: {differing}; {log.read_text()[-600:]}"
             )
-    print(
-        f"{done} kills of {', '.join(f'{kind} {count}' for kind, count in kills_of.items())}; {failed} cost something"
-    )
+    counts = ", ".join(f"{kind} {count}" for kind, count in kills_of.items())
+    print(f"{done} kills of {counts}; {failed} cost something")
     return failed
 
 

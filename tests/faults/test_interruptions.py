@@ -1,4 +1,4 @@
-"""Whatever ends a training, it goes on from its snapshot to the same agent, and its files say
+"""Whatever ends a training, it resumes from its snapshot to the same agent, and its files hold
 nothing twice.
 """
 
@@ -17,8 +17,7 @@ from sb3_quad.base.files import locked
 from sb3_quad.base.process import StopSignals
 from sb3_quad.cli import main
 from sb3_quad.training import snapshots
-from sb3_quad.training.config import build_config
-from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import resume, train
 
 ENV = "QuadTargetTracking-v0"
@@ -105,7 +104,7 @@ def broken(tmp_path):
     return tmp_path / "dagger" / f"{ENV}_1"
 
 
-def test_an_error_leaves_a_run_that_goes_on_to_the_same_agent_also_the_second_time(broken, whole):
+def test_an_error_leaves_a_run_that_resumes_to_the_same_agent_also_the_second_time(broken, whole):
     Trouble.what = fail
     with pytest.raises(RuntimeError):
         resume(str(broken), quiet)
@@ -116,7 +115,23 @@ def test_an_error_leaves_a_run_that_goes_on_to_the_same_agent_also_the_second_ti
     assert not any(half.exists() for half in halves)
 
 
-def test_the_seconds_of_the_episodes_go_on(broken):
+def test_the_traceback_of_an_unexpected_error_is_kept_until_the_run_is_resumed(
+    broken, whole, capsys
+):
+    traceback = broken / "error.txt"
+    traceback.unlink()
+    Trouble.what = fail
+    assert main(["train", "--resume", str(broken), "--no-progress"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"the simulation failed; the model after 800 timesteps is in {broken}" in line
+    assert f"the traceback is in {traceback}" in line
+    text = traceback.read_text()
+    assert text.startswith("Traceback") and ", in fail\n" in text
+    assert text.endswith("RuntimeError: the simulation failed\n")
+    assert the_same(resume(str(broken), quiet).run, whole)  # and it has the same files
+
+
+def test_the_seconds_of_the_episodes_continue(broken):
     seconds = 1000.0
     lines = (broken / "0.monitor.csv").read_text().splitlines()
     state = dict(np.load(broken / "resume.npz"))
@@ -243,7 +258,7 @@ def test_what_is_refused_costs_nothing(broken, whole, capsys):
     assert the_same(resume(str(broken), quiet).run, whole)
 
 
-def test_a_run_that_was_killed_before_its_first_rollout_is_begun(tmp_path, whole, monkeypatch):
+def test_a_run_that_was_killed_before_its_first_rollout_is_started(tmp_path, whole, monkeypatch):
     def killed(run):
         raise SystemExit
 

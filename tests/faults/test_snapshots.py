@@ -11,9 +11,8 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.config import build_config
+from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.environments import make_environments
-from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.runs import open_run
 from sb3_quad.training.snapshots import load_snapshot, random_state
 from sb3_quad.training.trainer import train

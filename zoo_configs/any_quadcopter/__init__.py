@@ -1,3 +1,1 @@
-"""Settings for one policy that flies any quadcopter, by imitation of the expert that is told each
-one.
-"""
+"""Settings for one policy that flies any quadcopter, by imitation of the privileged expert."""

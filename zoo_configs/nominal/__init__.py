@@ -1,3 +1,1 @@
-"""Settings for one vehicle in still air, from the geometric expert: agents that see the 18 features
-alone.
-"""
+"""Settings for one undisturbed vehicle with the geometric expert; agents see 18 features alone."""

@@ -1,3 +1,1 @@
-"""The shipped agent for random worlds, `itm-robust`: larger, and trained for longer, than the
-default.
-"""
+"""The agent `itm-robust`, with domain randomization: larger and trained longer than the default."""

@@ -1,1 +1,1 @@
-"""What ``tune`` varies, a file per algorithm."""
+"""Search spaces of ``tune``, a file per algorithm."""

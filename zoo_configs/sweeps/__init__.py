@@ -1,1 +1,1 @@
-"""Sweeps, by which tables of docs/research/results.md are made."""
+"""Sweeps that make the tables of docs/research/results.md."""

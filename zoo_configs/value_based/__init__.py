@@ -1,1 +1,1 @@
-"""Pipelines whose second stage learns by values: SAC from an imitation."""
+"""Pipelines whose second stage is value-based: SAC from an imitation agent."""

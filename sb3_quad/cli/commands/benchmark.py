@@ -159,8 +159,8 @@ def _measure_loop(config: Any) -> list[Measurement]:
     from stable_baselines3.common.callbacks import BaseCallback
 
     from sb3_quad.base.errors import ConfigError
+    from sb3_quad.training.config import TrainingJob
     from sb3_quad.training.environments import make_environments
-    from sb3_quad.training.job import TrainingJob
     from sb3_quad.training.trainer import build_model
 
     class Clock(BaseCallback):

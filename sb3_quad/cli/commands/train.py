@@ -1,17 +1,19 @@
-"""Train an agent. Without arguments: DAgger, then PPO with cloning, in random worlds, from an
-expert that is told the truth.
+"""Train an agent. Without arguments: DAgger, then PPO with cloning, with domain randomization.
+
+The expert of both is privileged.
 
 examples:
-  sb3-quad train                                          both stages in random worlds, in the batched environment
-  sb3-quad train --thesis                                 the thesis's method: both stages from its PID expert, in minutes
-  sb3-quad train --conf-file nominal/two_stage.yml        both stages for one vehicle in still air
-  sb3-quad train --conf-file thesis/two_stage.yml         the thesis's recipe as it prints it; hours
-  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
-  sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
-  sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
-  sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
+  sb3-quad train                                     both stages with domain randomization
+  sb3-quad train --thesis                            the thesis's method and PID expert, in minutes
+  sb3-quad train --conf-file nominal/two_stage.yml   both stages for one undisturbed vehicle
+  sb3-quad train --conf-file thesis/two_stage.yml    the recipe that the thesis prints; hours
+  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   PyBullet, a process per environment
+  sb3-quad train --seed 1 -P -tb logs/tb             another seed, progress bar, TensorBoard
+  sb3-quad train --conf-file thesis/dagger.yml       Table A.4 as the thesis prints it
+  sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4
+  sb3-quad train --hyperparams "policy_kwargs:dict(net_arch=[32, 32])"
   sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
-  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i thesis-imitation      stage two from an agent
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i thesis-imitation   from an agent
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
@@ -26,21 +28,24 @@ from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, po
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, SettingsOptions
 
-DEFAULT_PIPELINE, THESIS = "two_stage.yml", "thesis.yml"
-DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
+DEFAULT_PIPELINE = "two_stage.yml"
+THESIS = "thesis.yml"
+DEFAULT_ALGO = "dagger"
+DEFAULT_ENV = "QuadTargetTracking-v0"
+# A resumed run has its own values of these.
 KEPT_BY_RESUME = (
-    *(
-        "algo",
-        "env",
-        "conf_file",
-        "hyperparams",
-        "eval_env_kwargs",
-        "trained_agent",
-        "log_folder",
-        "seed",
-    ),
+    "algo",
+    "env",
+    "conf_file",
+    "hyperparams",
+    "eval_env_kwargs",
+    "trained_agent",
+    "log_folder",
+    "seed",
     *SettingsOptions.model_fields,
 )
+# A pipeline's stages have their own values of these.
+KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
 
 
 def add_settings(parser: Parser) -> None:
@@ -49,21 +54,20 @@ def add_settings(parser: Parser) -> None:
     add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
     add(
         "--env",
-        help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc",
+        help=f"environment id ({DEFAULT_ENV}); "
+        "any id that Gymnasium knows, with --vec-env dummy or subproc",
     )
-    file = "settings: a YAML file, or one of the package, such as thesis/dagger.yml (ALGO.yml: still air, PID expert)"
-    add("-conf", "--conf-file", metavar="FILE", help=file)
+    add(
+        "-conf",
+        "--conf-file",
+        metavar="FILE",
+        help="settings: a YAML file, or one of the package, such as thesis/dagger.yml "
+        "(ALGO.yml: undisturbed, PID expert)",
+    )
     add_fields(parser, SettingsOptions)
     add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
-    add_fields(
-        parser,
-        JobOptions,
-        "eval_env_kwargs",
-        "trained_agent",
-        "n_eval_envs",
-        "device",
-        trained_agent={"type": agent_path},
-    )
+    shared = ("eval_env_kwargs", "trained_agent", "n_eval_envs", "device")
+    add_fields(parser, JobOptions, *shared, trained_agent={"type": agent_path})
     add(
         "--num-threads",
         type=positive,
@@ -91,33 +95,11 @@ def add_arguments(parser: Parser) -> None:
         metavar="N",
         help="seed (0); negative: a random one, recorded in args.yml",
     )
-    add_fields(
-        parser,
-        JobOptions,
-        "log_folder",
-        "uuid",
-        "eval_freq",
-        "eval_episodes",
-        "save_freq",
-        "snapshot_every",
-    )
-    add_fields(
-        parser,
-        JobOptions,
-        "log_interval",
-        "tensorboard_log",
-        "verbose",
-        "track",
-        "wandb_project_name",
-    )
-    add_fields(
-        parser,
-        JobOptions,
-        "wandb_entity",
-        "wandb_group",
-        "wandb_tags",
-        wandb_tags={"nargs": "+", "type": str},
-    )
+    run_fields = ("log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
+    log_fields = ("log_interval", "tensorboard_log", "verbose", "track", "wandb_project_name")
+    add_fields(parser, JobOptions, *run_fields, *log_fields)
+    tags = {"nargs": "+", "type": str}
+    add_fields(parser, JobOptions, "wandb_entity", "wandb_group", "wandb_tags", wandb_tags=tags)
     add(
         "--resume",
         metavar="RUN_FOLDER",
@@ -127,48 +109,71 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Train, compare, print where everything is. Returns the exit code."""
-    from sb3_quad.base.validate import validate
-    from sb3_quad.cli.closing import close_pipeline, close_run
     from sb3_quad.cli.output import shows_progress
-    from sb3_quad.training import pipeline as stages
-    from sb3_quad.training.job import TrainingJob, describe
-    from sb3_quad.training.trainer import resume, train
+    from sb3_quad.training.pipeline import is_pipeline
 
-    if options.thesis and (options.conf_file or options.resume):
-        raise ConfigError(
-            f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume"
-        )
-    options.conf_file = THESIS if options.thesis else options.conf_file
+    if options.thesis:
+        if options.conf_file or options.resume:
+            raise ConfigError(
+                f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume"
+            )
+        options.conf_file = THESIS
     prepare(options)
-    start = time.perf_counter()
-    arguments = {
-        **given(options, *JobOptions.model_fields),
-        "progress": shows_progress(options.progress),
-    }
+    job = given(options, *JobOptions.model_fields)
+    job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
-        for name in given(options, *KEPT_BY_RESUME):
-            raise ConfigError(
-                f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away"
-            )
-        if stages.is_pipeline_run(Path(options.resume)):
-            finished = stages.resume_pipeline(Path(options.resume), **arguments)
-            return close_pipeline(finished, time.perf_counter() - start)
-        return close_run(resume(options.resume, **arguments))
-    conf_file = options.conf_file or (
-        DEFAULT_PIPELINE if options.algo is None and options.env is None else None
-    )
-    if conf_file is not None and stages.is_pipeline(conf_file):
-        for name in given(options, "algo", "env", "n_timesteps", "trained_agent"):
-            own = f"a pipeline's stages have their own in {conf_file}"
-            raise ConfigError(
-                f"--{name.replace('_', '-')} goes with a single run (--algo, --env); {own}"
-            )
-        pipeline = stages.with_settings(stages.load_pipeline(conf_file), changed_settings(options))
-        finished = stages.run_pipeline(pipeline, arguments, Path(conf_file).stem)
-        return close_pipeline(finished, time.perf_counter() - start)
-    job = validate(TrainingJob, {"config": make_config(options), **arguments}, "command line")
-    print(describe(job))
-    return close_run(train(job))
+        return _resume(options, job)
+    # Without any of these, the default is a pipeline rather than a single run.
+    if options.conf_file is None and options.algo is None and options.env is None:
+        options.conf_file = DEFAULT_PIPELINE
+    if options.conf_file is not None and is_pipeline(options.conf_file):
+        return _train_pipeline(options, job)
+    return _train_single(options, job)
+
+
+def _resume(options: argparse.Namespace, changes: dict[str, Any]) -> int:
+    from sb3_quad.cli.closing import close_pipeline, close_run
+    from sb3_quad.training.pipeline import is_pipeline_run, resume_pipeline
+    from sb3_quad.training.trainer import resume
+
+    for name in given(options, *KEPT_BY_RESUME):
+        raise ConfigError(f"--resume keeps the run's own settings; remove {_flag(name)}")
+    folder = Path(options.resume)
+    start = time.perf_counter()
+    if is_pipeline_run(folder):
+        return close_pipeline(resume_pipeline(folder, **changes), time.perf_counter() - start)
+    return close_run(resume(options.resume, **changes))
+
+
+def _train_pipeline(options: argparse.Namespace, job: dict[str, Any]) -> int:
+    from sb3_quad.cli.closing import close_pipeline
+    from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
+
+    for name in given(options, *KEPT_BY_STAGES):
+        raise ConfigError(
+            f"{_flag(name)} goes with a single run (--algo, --env); "
+            f"a pipeline's stages have their own in {options.conf_file}"
+        )
+    start = time.perf_counter()
+    pipeline = with_settings(load_pipeline(options.conf_file), changed_settings(options))
+    result = run_pipeline(pipeline, job, Path(options.conf_file).stem)
+    return close_pipeline(result, time.perf_counter() - start)
+
+
+def _train_single(options: argparse.Namespace, job: dict[str, Any]) -> int:
+    from sb3_quad.base.validate import validate
+    from sb3_quad.cli.closing import close_run
+    from sb3_quad.training.config import TrainingJob, describe
+    from sb3_quad.training.trainer import train
+
+    content = {"config": make_config(options), **job}
+    checked = validate(TrainingJob, content, "command line")
+    print(describe(checked))
+    return close_run(train(checked))
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def prepare(options: argparse.Namespace) -> None:
@@ -181,6 +186,7 @@ def prepare(options: argparse.Namespace) -> None:
     from sb3_quad.algorithms.networks.perceptron import use_one_torch_thread
     from sb3_quad.base.imports import import_packages
 
+    # Environments must be registered before the settings are checked.
     import_packages(options.gym_packages, "--gym-packages")
     if options.num_threads is None:
         use_one_torch_thread()
@@ -189,20 +195,21 @@ def prepare(options: argparse.Namespace) -> None:
 
 
 def make_config(options: argparse.Namespace) -> Any:
-    """The :class:`~sb3_quad.training.config.TrainingConfig` that a command line describes."""
+    """Return the :class:`~sb3_quad.training.config.TrainingConfig` of a command line."""
     from sb3_quad.training.config import load_config
     from sb3_quad.training.successor import as_agent
 
-    asked, changes = (
-        (options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file),
-        changed_settings(options),
-    )
-    config = load_config(*asked, changes)
-    if options.trained_agent is None or options.conf_file is not None:
-        return config
-    return load_config(*asked, as_agent(options.trained_agent, config, changes))
+    algo = options.algo or DEFAULT_ALGO
+    env = options.env or DEFAULT_ENV
+    changes = changed_settings(options)
+    config = load_config(algo, env, options.conf_file, changes)
+    # A file of settings takes precedence over those of the agent.
+    if options.trained_agent is not None and options.conf_file is None:
+        changes = as_agent(options.trained_agent, config, changes)
+        config = load_config(algo, env, None, changes)
+    return config
 
 
 def changed_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """What a command line puts over a settings file."""
+    """Return the settings that a command line puts over a settings file."""
     return {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)}

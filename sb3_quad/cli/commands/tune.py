@@ -135,8 +135,7 @@ def _make_search(options: argparse.Namespace) -> Any:
     its results.
     """
     from sb3_quad.base.validate import validate
-    from sb3_quad.training.config import build_config
-    from sb3_quad.training.job import TrainingJob
+    from sb3_quad.training.config import TrainingJob, build_config
     from sb3_quad.training.runs import claim_folder, file_name
     from sb3_quad.tuning.search import Search
     from sb3_quad.tuning.space import load_space
