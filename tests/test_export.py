@@ -23,7 +23,7 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, network, policy
-from sb3_quad.export.check import Reference, physical_features
+from sb3_quad.export.check import Reference
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
 from sb3_quad.export.network import StatefulNetwork, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
@@ -71,6 +71,14 @@ def zips(tmp_path_factory):
     for kind in MODELS:
         untrained(kind, QuadcopterVecEnv(2, seed=0)).save(folder / f"{kind}.zip")
     return folder
+
+
+def physical_features(state):
+    """The 18 features of the true state, (n, 18), float32, as docs/export.md lists them."""
+    to_body = state.rotation.transpose(0, 2, 1)
+    velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
+    parts = (state.position - state.target, to_body.reshape(-1, 9), velocity, state.body_rates)
+    return np.concatenate(parts, axis=1).astype(np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@
  * @typedef {{inputs: number, outputs: number, activation: string}} Shape
  */
 import { fromHalf, layersOf } from "./network.js";
-import { OBSERVATION_SIZE } from "./observation.js";
+import { OBSERVATION_SIZE } from "./tables.js";
 
 /** @param {Uint8Array} bytes @param {"deflate" | "deflate-raw"} format */
 async function inflate(bytes, format) {
