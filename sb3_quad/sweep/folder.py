@@ -103,7 +103,9 @@ class SweepFolder:
     def results(self, runs: Sequence[Run]) -> dict[str, RunResult]:
         """Read the results of those runs that ended, by name."""
         paths = {run.name: self._result(run.name) for run in runs}
-        return {name: read_record(path, RunResult) for name, path in paths.items() if path.is_file()}
+        return {
+            name: read_record(path, RunResult) for name, path in paths.items() if path.is_file()
+        }
 
     def _result(self, name: str) -> Path:
         return self.path / "records" / f"{name}.json"

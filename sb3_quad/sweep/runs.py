@@ -127,8 +127,8 @@ def _folder_name(configuration: Configuration, label: str) -> str:
     """Return the name of a configuration, or else one made of its settings."""
     name = configuration.name or label
     if not name:
-        file = Path(configuration.conf_file or "").with_suffix("").as_posix()
-        name = "-".join(filter(None, [configuration.algo, file]))
+        named_by = configuration.model_dump(include={"algo", "conf_file"}, exclude_none=True)
+        name = _name(named_by).replace(",", "-")
     return re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", name).strip("-.,")[:LONGEST] or "run"
 
 
@@ -171,8 +171,7 @@ def _pipeline(
     for key in ("algo", "env"):
         if key not in given:
             raise ConfigError(
-                f"{key} is missing; "
-                "give algo and env, or a conf_file with the stages of a pipeline"
+                f"{key} is missing; give algo and env, or a conf_file with the stages of a pipeline"
             )
     stage = Stage(
         name=given["algo"], algo=given["algo"], env=given["env"], conf_file=file, settings=changes

@@ -26,7 +26,7 @@ MAX_RUNS = 10_000
 
 
 class Configuration(SettingsOptions, RunOptions, use_attribute_docstrings=True):
-    """The settings of one training, less its seed; a missing key means the same as for ``train``."""
+    """The settings of one training, less its seed; a missing key has the default of ``train``."""
 
     name: str | None = Field(default=None, pattern=NAME)
     """in tables and folders; made of the settings that differ without it"""

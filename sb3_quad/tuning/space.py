@@ -3,8 +3,8 @@ lists them.
 
 Keys are those of the settings. ``policy_kwargs.net_arch`` is an entry of a mapping, and
 ``n_minibatches`` stands for the ``batch_size`` that divides a rollout into so many. Where the
-settings have ``lin_x``, the x is varied. A setting for which only whole numbers are valid gets whole
-numbers, others get four significant digits.
+settings have ``lin_x``, the x is varied. A setting for which only whole numbers are valid gets
+whole numbers, others get four significant digits.
 """
 
 import json
@@ -66,7 +66,7 @@ class SearchSpace:
     dimensions: Mapping[str, BaseDistribution]
 
     def settings(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
-        """Return all settings of a trial with these parameters: plain values, as YAML holds them."""
+        """Return all settings of a trial with these parameters, as YAML holds them."""
         changed = dict(self.base)
         for name, parameter in parameters.items():
             outer, dot, inner = name.partition(".")

@@ -75,8 +75,8 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Train, compare, print where everything is. Returns the exit code."""
     from sb3_quad.base.imports import import_packages
-    from sb3_quad.sweep.expand import expand, suite_of
-    from sb3_quad.sweep.folder import Plan, SweepFolder
+    from sb3_quad.sweep.folder import Sweep, SweepFolder
+    from sb3_quad.sweep.runs import make_runs, suite_of
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
@@ -88,17 +88,17 @@ def run(options: argparse.Namespace) -> int:
         return _go_on(options, place.read(), place)
     spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
-    plan = Plan(spec=spec, runs=tuple(expand(spec)), suite=suite_of(spec))
+    sweep = Sweep(spec=spec, runs=tuple(make_runs(spec)), suite=suite_of(spec))
     if not options.dry_run:
-        return _go_on(options, plan, None)
-    for each in plan.runs:
+        return _go_on(options, sweep, None)
+    for each in sweep.runs:
         stages = (
             f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
             for stage in each.stages
         )
         print(f"{each.name}: {', then '.join(stages)}")
-    configurations = len({each.configuration for each in plan.runs})
-    print(f"{_count(len(plan.runs), 'run')} of {_count(configurations, 'configuration')}")
+    configurations = len({each.configuration for each in sweep.runs})
+    print(f"{_count(len(sweep.runs), 'run')} of {_count(configurations, 'configuration')}")
     return 0
 
 
@@ -146,8 +146,8 @@ def _with_defaults(data: Mapping[str, Any]) -> Mapping[str, Any]:
     return {"algo": DEFAULT_ALGO, "env": DEFAULT_ENV, **data}
 
 
-def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
-    """Do what is left of a sweep's Plan, in its SweepFolder (None: a new one). Returns the exit
+def _go_on(options: argparse.Namespace, sweep: Any, place: Any) -> int:
+    """Do what is left of a Sweep, in its SweepFolder (None: a new one). Returns the exit
     code.
     """
     from sb3_quad.base.cores import available_cpus
@@ -156,32 +156,32 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
     from sb3_quad.cli.output import console, progress_bar
     from sb3_quad.executors import start_executor
     from sb3_quad.sweep.folder import SweepFolder
-    from sb3_quad.sweep.results import evaluate, tables, write_report, write_results
+    from sb3_quad.sweep.results import summarize, tables, write_report, write_results
     from sb3_quad.sweep.run import execute
     from sb3_quad.training.runs import claim_folder
 
-    start, needs = time.perf_counter(), plan.spec.resources
-    workers = min(options.workers or available_cpus(), len(plan.runs))
+    start, needs = time.perf_counter(), sweep.spec.resources
+    workers = min(options.workers or available_cpus(), len(sweep.runs))
     with start_executor(
         options.executor, workers, options.address, needs.num_cpus, needs.num_gpus
     ) as executor:
         if place is None:
             place = SweepFolder(
                 claim_folder(
-                    Path(options.log_folder or "logs") / "sweep", plan.spec.name or "sweep"
+                    Path(options.log_folder or "logs") / "sweep", sweep.spec.name or "sweep"
                 )
             )
-            place.write(plan)
+            place.write(sweep)
         where = f"{executor.workers} side by side, executor {options.executor}"
-        print(f"sweep {place.path}: {_count(len(plan.runs), 'run')}, {where}")
+        print(f"sweep {place.path}: {_count(len(sweep.runs), 'run')}, {where}")
         with (
             locked(place.path, "sweep folder"),
             StopSignals() as signals,
             progress_bar(options.progress) as show,
         ):
-            records = execute(place, plan, executor, signals, show, print)
+            records = execute(place, sweep, executor, signals, show, print)
             signals.hold()
-            found = evaluate(plan, records)
+            found = summarize(sweep, records)
             write_results(place, found)
             if found.groups:
                 shown = tables(found)
@@ -190,7 +190,7 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
                 write_report(place, found, shown)
     failures = [record for record in records.values() if record.state == "failed"]
     finished = (
-        f"{found.finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
+        f"{found.finished} of {_count(len(sweep.runs), 'run')} finished, {len(failures)} failed"
     )
     print(f"{finished}; {time.perf_counter() - start:.1f} s")
     print(
