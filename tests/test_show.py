@@ -95,7 +95,7 @@ def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
     np.testing.assert_array_equal(hit.targets, [[3, 0, 16]])
 
 
-def test_what_randomize_pushes_with_is_recorded():
+def test_disturbances_of_randomize_are_recorded():
     setting = fixed_setting(
         FlightSettings(
             task="target_tracking", randomize={"force": {"magnitude": [3, 3]}, "gusts": {"std": 1}}
@@ -208,7 +208,8 @@ def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
 def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
     ends = [len(fall.times) - 1, 60]
     view = sequence.view_of([fall, hit], ends, Lens(300, 400))
-    chosen = [sequence.pose_steps(each, end, view) for each, end in zip((fall, hit), ends, strict=True)]
+    flights = zip((fall, hit), ends, strict=True)
+    chosen = [sequence.pose_steps(flight, end, view) for flight, end in flights]
     assert chosen[0][0] == 0 and chosen[0][-1] == ends[0] and hit.disturbances[0] in chosen[1]
     for steps, flight in zip(chosen, (fall, hit), strict=True):
         places, breadth = view.project(flight.state.position[steps])

@@ -45,6 +45,7 @@ class Camera(NamedTuple):
         """
         width, height, slope = self.lens
         forward, right, up = self.axes @ (points - self.eye).T
+        # A point at or behind the camera gets a place far outside the picture.
         scale = height / 2.0 / (np.maximum(forward, 1e-6) * slope)
         return np.stack([width / 2.0 + scale * right, height / 2.0 - scale * up, forward], axis=1)
 
@@ -123,6 +124,7 @@ class ChaseCamera:
 
 def _axes(forward: FloatArray) -> FloatArray:
     """Forward, right and up of a camera without roll, (3, 3)."""
+    # Level: the camera does not roll.
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     return np.stack([forward, right, np.cross(right, forward)])

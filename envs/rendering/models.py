@@ -46,16 +46,16 @@ class Part(NamedTuple):
 def add_body(parts: Sequence[Part], colour: Colour, client: int) -> int:
     """Add a body of at most 16 parts, out of sight; return its number."""
     # PyBullet takes lists only; tuples crash it.
+    shapes, places, boxes, radii, lengths, rolls, yaws = map(list, zip(*parts, strict=True))
+    angles = zip(rolls, [0.0] * len(parts), yaws, strict=True)
     shape = p.createVisualShapeArray(
-        shapeTypes=[part.shape for part in parts],
-        halfExtents=[[side / 2 for side in part.box] for part in parts],
-        radii=[part.radius for part in parts],
-        lengths=[part.length for part in parts],
-        rgbaColors=[colour for _ in parts],
-        visualFramePositions=[part.at for part in parts],
-        visualFrameOrientations=[
-            p.getQuaternionFromEuler((part.roll, 0.0, part.yaw)) for part in parts
-        ],
+        shapeTypes=shapes,
+        halfExtents=np.divide(boxes, 2.0).tolist(),
+        radii=radii,
+        lengths=lengths,
+        rgbaColors=[colour] * len(parts),
+        visualFramePositions=places,
+        visualFrameOrientations=list(map(p.getQuaternionFromEuler, angles)),
         physicsClientId=client,
     )
     return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))

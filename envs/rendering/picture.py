@@ -45,6 +45,7 @@ def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
     across = np.linspace(-1.0, 1.0, width, dtype=np.float32) * np.float32(slope * width / height)
     upwards = np.linspace(slope, -slope, height, dtype=np.float32)
     forward, right, up = camera.axes.astype(np.float32)
+    # One ray for each pixel, from the eye.
     rays = forward + across[:, None] * right + upwards[:, None, None] * up
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     sky = SKY_HORIZON + np.clip(1.6 * rays[..., 2:], 0.0, 1.0) * (SKY_ZENITH - SKY_HORIZON)
@@ -58,9 +59,11 @@ def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
     wave = np.sin(np.pi / SQUARE * points).prod(axis=2) / np.maximum(2.0 * footprint, 0.02)
     dark = 0.5 + 0.5 * np.clip(wave, -1.0, 1.0) * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
     ground = GROUND_LIGHT + dark[..., None] * (GROUND_DARK - GROUND_LIGHT)
+    # Shadows have soft edges.
     for *centre, radius in shadows.tolist():
         away = np.linalg.norm(points - np.float32(centre), axis=2) / radius
         ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
+    # The share of the ground that is seen through the haze.
     haze = np.exp(distance / -VISIBILITY)[..., None]
     return np.asarray(sky + haze * (ground - sky), dtype=np.float32)
 

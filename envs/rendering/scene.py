@@ -51,23 +51,24 @@ class Scene:
         n_targets: int = 1,
         size: float = 1.0,
     ) -> None:
-        self.client = int(p.connect(p.DIRECT)) if client is None else client
         if client is None:
+            client = int(p.connect(p.DIRECT))
             # PyBullet's clients are limited. So this one is also given back when the object is
             # forgotten without close().
-            self._close = weakref.finalize(self, p.disconnect, self.client)
+            self._close = weakref.finalize(self, p.disconnect, client)
+        self.client = client
         # Distances in pictures are multiples of the scale.
         self.scale = size * vehicle.arm_length / REFERENCE_ARM
         self.span = size * models.span(vehicle)
         self._vehicles = [
-            _VehicleBodies(vehicle, self.client, size, self.scale) for _ in range(n_vehicles)
+            _VehicleBodies(vehicle, client, size, self.scale) for _ in range(n_vehicles)
         ]
         # A target is a ball within two hoops that cross.
         shapes = [[models.Part(p.GEOM_SPHERE, radius=0.14)]]
         for yaw in (0.0, math.pi / 2):
             shapes.append(models.hoop(RING * self.scale, 0.014 * self.scale, yaw))
         self._targets = [
-            [add_body(parts, MARKER, self.client) for parts in shapes] for _ in range(n_targets)
+            [add_body(parts, MARKER, client) for parts in shapes] for _ in range(n_targets)
         ]
         self._shadows = np.zeros((0, 3))
 
@@ -89,6 +90,7 @@ class Scene:
 
     def picture(self, camera: Camera, trails: Sequence[Trail] = ()) -> Image:
         """Draw the scene: uint8 (height, width, 3)."""
+        # PyBullet draws the bodies larger, since its edges are hard.
         wide = SUPERSAMPLING * camera.lens.width
         high = SUPERSAMPLING * camera.lens.height
         forward, _, up = camera.axes

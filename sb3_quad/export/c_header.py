@@ -32,14 +32,12 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
+    # The constants of the file, by name.
     tables = {"mean": network.mean, "inverse_std": network.inverse_std}
-    layers = []
-    for number, (layer, activation) in enumerate(network.steps):
+    for number, (layer, _) in enumerate(network.steps):
         tables[f"weight_{number}"] = layer.weight
         tables[f"bias_{number}"] = layer.bias
-        layers.append(
-            {"inputs": layer.in_features, "outputs": layer.out_features, "activation": activation}
-        )
+    # A policy of the present features alone has no state, and gets a shorter function.
     state: dict[str, Any] = {}
     if isinstance(network, StatefulNetwork):
         names = ("gain", "distance2", "speed2", "limit")
@@ -60,7 +58,7 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
         guard=f"{name.upper()}_POLICY_H",
         comment=_comment(metadata),
         tables=[_table(f"{name}_policy_{key}", value.numpy()) for key, value in tables.items()],
-        layers=layers,
+        layers=network.shapes,
         features=OBSERVATION_SIZE,
         position=F.position,
         velocity=F.velocity,
@@ -89,6 +87,7 @@ def _number(value: Any) -> str:
 
 def _table(name: str, values: Float32Array) -> str:
     size = "".join(f"[{length}]" for length in values.shape)
+    # NumPy's brackets become C's braces.
     with np.printoptions(threshold=values.size, linewidth=WIDTH, formatter={"float_kind": _number}):
         rows = np.array2string(values, separator=", ").translate(str.maketrans("[]", "{}"))
     return f"{name}{size} =\n{rows}"

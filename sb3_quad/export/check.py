@@ -74,6 +74,7 @@ class Reference(NamedTuple):
             "velocity": axes,
             "body_rates": axes,
         }
+        # Every feature needs a rule: a missing one must not turn into a wrong file.
         for feature in FEATURES:
             block = blocks.get(feature.name)
             if block is None and feature.parts == PER_ROTOR:
@@ -140,6 +141,7 @@ class Comparison(Hook):
         for group, limit in self._limits.items():
             norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
             self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
+        # The file flies the vehicle in its own axes and order of rotors.
         results, self._state = self._call(features @ self._turned, self._state)
         self._results = results[:, self._order]
         self._compared = flying & self._sure
@@ -166,6 +168,7 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
     """
+    # Far and fast starts, or long flights for a policy with a state.
     changes: dict[str, Any] = {"task": "recovery_and_tracking", "task_kwargs": WIDE, "noise": 0.05}
     steps = SHORT
     if reference.observation.is_extended:

@@ -30,6 +30,7 @@ the next states. The state None begins flights.
 
 def load_torchscript(content: bytes) -> tuple[Call, str]:
     """Load the file by torch on the CPU. Return its call and torch's version."""
+    # torch fills in the files that it is asked for.
     extra = {"metadata.json": ""}
     module = th.jit.load(io.BytesIO(content), "cpu", extra)  # type: ignore[no-untyped-call]
     size = int(json.loads(extra["metadata.json"]).get("state_size", 0))
@@ -45,7 +46,7 @@ def load_torchscript(content: bytes) -> tuple[Call, str]:
 
 
 def load_onnx(content: bytes) -> tuple[Call, str]:
-    """As :func:`load_torchscript`, by onnxruntime on one thread of the CPU.
+    """Load the file by onnxruntime on one thread of the CPU, see :func:`load_torchscript`.
 
     :raises ConfigError: it is not installed.
     """
@@ -53,6 +54,7 @@ def load_onnx(content: bytes) -> tuple[Call, str]:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
     session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    # The second input is the state, if there is one.
     ports = session.get_inputs()
     size = ports[1].shape[1] if len(ports) > 1 else 0
 
@@ -69,6 +71,7 @@ def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
     def call(rows: Float32Array, state: Float32Array | None = None) -> tuple[Float32Array, Any]:
         if not size:
             return run(rows)[0], None
+        # Zeros begin a flight.
         if state is None:
             state = np.zeros((len(rows), size), dtype=np.float32)
         results, following = run(rows, state)
@@ -78,7 +81,7 @@ def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
 
 
 def load_header(content: bytes, name: str) -> tuple[Call, str]:
-    """As :func:`load_torchscript`, of a C header by the machine's compiler.
+    """Load a C header by the machine's compiler, see :func:`load_torchscript`.
 
     :param name: the beginning of the header's identifiers.
     :raises ConfigError: there is no compiler.

@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
+from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.imports import require
@@ -55,6 +56,7 @@ class Network(th.nn.Module):
         self.result, self.unit = OUTPUTS[self.output]
         self.inputs = ["observation"]
         self.outputs = [self.result]
+        # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
         limits = np.array(reference.vehicle.thrust_range)
         if self.output == "speeds":
             limits /= reference.vehicle.thrust_coefficient
@@ -91,6 +93,14 @@ class Network(th.nn.Module):
             (layer, ACTIVATIONS.get(type(after), "none"))
             for layer, after in itertools.pairwise([*self.layers, None])
             if isinstance(layer, th.nn.Linear)
+        ]
+
+    @property
+    def shapes(self) -> list[dict[str, Any]]:
+        """Inputs, outputs and activation of each linear layer."""
+        return [
+            {"inputs": layer.in_features, "outputs": layer.out_features, "activation": activation}
+            for layer, activation in self.steps
         ]
 
 
@@ -169,6 +179,7 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     """
     if reference.output not in OUTPUTS:
         raise ConfigError(unknown("output", reference.output, OUTPUTS))
+    # The policy must be one whose layers we know, on the spaces that its settings describe.
     model = reference.model
     layers = deterministic_layers(model.policy, where)
     expected = (reference.observation.size,)
@@ -181,13 +192,14 @@ def build_network(reference: Reference, where: str = "model") -> Network:
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
         )
+    # C knows these layers only, and a file with NaN would fail in flight.
     for layer in layers:
         if type(layer) is not th.nn.Linear and type(layer) not in ACTIVATIONS:
             raise ConfigError(
                 f"{where}: its network has a layer {layer}; "
                 "only linear layers, Tanh and ReLU export"
             )
-    if not all(bool(parameter.isfinite().all()) for parameter in layers.parameters()):
+    if not parameters_to_vector(layers.parameters()).isfinite().all():
         raise ConfigError(f"{where}: holds parameters that are not finite")
     if reference.observation.is_extended:
         return StatefulNetwork(layers, reference)
@@ -212,6 +224,7 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     frame[:OBSERVATION_SIZE, :OBSERVATION_SIZE] = reference.turned_features * std / std[:, None]
     if observation.last_action:
         frame[OBSERVATION_SIZE:, OBSERVATION_SIZE:] = np.eye(4)[[*turn.order]]
+    # Every observed frame is turned alike; the weights absorb it, so that files stay as fast.
     frames = np.kron(np.eye(len(observation.ages)), frame)
     linear[0].weight.copy_(linear[0].weight @ th.from_numpy(frames))
     linear[-1].weight.copy_(linear[-1].weight[turn.own])
@@ -225,6 +238,7 @@ def deterministic_layers(policy: Any, where: str) -> th.nn.Sequential:
 
     :raises ConfigError: see :func:`check_policy`.
     """
+    # SAC and TD3 keep their policy in an actor.
     actor = getattr(policy, "actor", None)
     if actor is not None and type(actor.features_extractor) is FlattenExtractor:
         if type(policy) is TD3Policy:
@@ -244,12 +258,12 @@ def check_policy(policy: Any, where: str) -> None:
     """:raises ConfigError: a policy that is not ``MlpPolicy`` of an on-policy algorithm, or has
     extractors of its own.
     """
-    names = ("pi_features_extractor", "mlp_extractor")
-    parts = [policy, *(getattr(policy, name, None) for name in names)]
-    if [type(part) for part in parts] != [ActorCriticPolicy, FlattenExtractor, MlpExtractor]:
-        kinds = " with ".join(type(part).__name__ for part in parts if part is not None)
+    extractor = getattr(policy, "pi_features_extractor", None)
+    kinds = [type(policy), type(extractor), type(getattr(policy, "mlp_extractor", None))]
+    if kinds != [ActorCriticPolicy, FlattenExtractor, MlpExtractor]:
+        names = " with ".join(kind.__name__ for kind in kinds if kind is not type(None))
         raise ConfigError(
-            f"{where}: its policy is {kinds}; "
+            f"{where}: its policy is {names}; "
             "only MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC, TD3) will do, "
             "without a features extractor of its own"
         )
@@ -259,6 +273,7 @@ def write_torchscript(network: Network, metadata: Mapping[str, str]) -> bytes:
     """Return the file that ``torch.jit.load`` reads, in Python and in C++, with ``metadata`` as the
     extra file ``metadata.json``.
     """
+    # Tracing writes out the computation of an example, without this package's classes.
     buffer = io.BytesIO()
     traced = th.jit.trace(network, network.examples)  # type: ignore[no-untyped-call]
     th.jit.save(traced, buffer, _extra_files={"metadata.json": json.dumps(dict(metadata))})

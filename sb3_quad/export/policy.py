@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torch.nn.utils import parameters_to_vector
+
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.version import __version__
 from sb3_quad.controllers.agent_settings import agent_settings
@@ -73,6 +75,7 @@ def export_policy(
             f"--name {name!r}: must be a C identifier: "
             "letters, digits and underscores, a letter first"
         )
+    # Each format has a writer, and a reader for the check.
     formats: dict[str, tuple[Any, Any]] = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
@@ -81,6 +84,7 @@ def export_policy(
     if file_format not in formats:
         raise ConfigError(unknown("format", file_format, formats))
     write, read = formats[file_format]
+    # The zip says how its agent flies, unless another vehicle is given.
     algorithm = saved_algorithm(path)
     model = load_model(path)
     settings, source = agent_settings(path)
@@ -110,6 +114,7 @@ def export_policy(
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
+        # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata))
         checked = compare(reference, call, by, n_observations)
         metadata["check"] = (
@@ -125,11 +130,13 @@ def _describe(
 ) -> dict[str, str]:
     """Return what users of the file must know; ASCII but for names."""
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    # The limits of the results are those of the extreme actions.
     low, high = reference.results([-1.0, 1.0])
     places = zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True)
-    sizes = [network.steps[0][0].in_features, *(layer.out_features for layer, _ in network.steps)]
-    hidden = ", ".join(activation for _, activation in network.steps[:-1]) or "none"
-    n_parameters = sum(parameter.numel() for parameter in network.parameters())
+    shapes = network.shapes
+    sizes = [shapes[0]["inputs"], *(shape["outputs"] for shape in shapes)]
+    hidden = ", ".join(shape["activation"] for shape in shapes[:-1]) or "none"
+    n_parameters = parameters_to_vector(network.parameters()).numel()
     return {
         "policy": f"{path.name} ({algorithm}), sha256 {digest}",
         "made_by": f"sb3_quad {__version__}",

@@ -47,6 +47,7 @@ class Recording:
     @property
     def targets(self) -> FloatArray:
         """The targets flown to, one after the other, (k, 3), world frame, m."""
+        # The first target counts as a change, from NaN.
         changed = np.diff(self.state.target, axis=0, prepend=np.nan).any(axis=1)
         return self.state.target[changed]
 
@@ -58,6 +59,7 @@ class Recording:
     @property
     def disturbances(self) -> list[int]:
         """The steps after which a wrench has begun to act."""
+        # A wrench begins to act where it acts in a step and not in the one before.
         acts = np.asarray(self.wrench.any(axis=1))
         return (np.flatnonzero(acts[1:] & ~acts[:-1]) + 1).tolist()
 
@@ -142,11 +144,13 @@ def fly_all(
     :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
+    # Without n_timesteps one whole episode is flown.
     longest = setting.settings.longest_episode
     left = longest if n_timesteps is None else n_timesteps
     while left > 0:
         settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
         episode: list[Recording] = []
+        # All controllers fly the same seeds, each with the observations that it was trained on.
         for name, controller in controllers.items():
             own = settings.with_changes(**setting.own.get(name, {}))
             for episode_seed in range(seed, seed + n_envs):
@@ -163,6 +167,7 @@ def fly_all(
         yield episode
         if n_timesteps is None:
             return
+        # The longest flight counts, since the others wait for it.
         left -= max(len(recording.times) - 1 for recording in episode)
         seed += n_envs
 

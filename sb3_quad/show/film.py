@@ -63,7 +63,7 @@ def write_film(path: Path, frames: Iterable[Image]) -> None:
     options: dict[str, Any] = {"duration": 1000 / FPS, "loop": 0}
     if suffix == ".mp4":
         options = {"fps": FPS, **MP4}
-    # In another folder: after an interruption, the encoder may go on writing for a moment.
+    # In another folder: after an interruption, the encoder may still write for a moment.
     with tempfile.TemporaryDirectory(prefix="sb3_quad_", ignore_cleanup_errors=True) as folder:
         draft = Path(folder, f"film{suffix}")
         try:
@@ -93,8 +93,11 @@ def film_frames(
     :param speed: of time in the film; 0.5 is slow motion.
     """
     times = frame_times(recordings, speed)
+    # One direction for all panels, so that their flights can be compared.
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-    panels = [_panel(recording, times, forward, Lens(width, height)) for recording in recordings]
+    lens = Lens(width, height)
+    panels = [_panel(recording, times, forward, lens) for recording in recordings]
+    # Frame by frame, because a film does not fit into memory.
     for pictures in zip(*panels, strict=True):
         yield side_by_side(pictures, PANELS_ABREAST)
 
@@ -112,10 +115,12 @@ def following_cameras(
     :param scale: the vehicles' size, in that of the default one.
     :param forward: the direction in which the cameras look, a unit vector, (3,), not vertical.
     """
+    # The share of a jump that the camera follows from one frame to the next.
     share = 1.0 - math.exp(-(times[1] - times[0]) / LAG)
     eye = None
     for seconds in times:
         points = []
+        # The vehicles, and their targets, or at most AHEAD of the way there.
         for recording in recordings:
             vehicle, target = recording.vehicle_and_target(recording.at(seconds))
             way = target - vehicle
@@ -138,6 +143,7 @@ def _panel(
         cameras = following_cameras([recording], times, scene.scale, forward, lens)
         for seconds, camera in zip(times, cameras, strict=True):
             step = recording.at(seconds)
+            # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
             flown = recording.state.position[: step + 1 : 2]
             pixels = scene.picture(camera, [Trail(flown, recording.colour, 0.03 * scene.scale)])
@@ -152,6 +158,7 @@ def _caption(recording: Recording, step: int) -> str:
     distance = recording.state.distance[step]
     height = recording.state.position[step, 2]
     caption = f"{seconds}   {distance:.2f} m from target   {height:.1f} m high"
+    # Only disturbed flights have a force to tell.
     force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
     if force:
         caption += f"   force {force:.1f} N"
@@ -167,6 +174,7 @@ def show_in_window(
     """
     client = open_window(width, height)
     try:
+        # All bodies are added before the window draws: it shows each one as it comes.
         n = len(episodes[0])
         scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
         start_drawing(client)
@@ -186,6 +194,7 @@ def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: floa
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
     cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
     trail_ends = [0] * len(recordings)  # the steps up to which trails are drawn
+    # The number of the frame follows the clock, so that flights are shown in real time.
     begun = time.perf_counter()
     number = 0
     while number < len(times):
@@ -193,6 +202,7 @@ def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: floa
         flights = list(zip(recordings, steps, strict=True))
         poses = [recording.pose(step) for recording, step in flights]
         scene.place(poses, np.stack([flight.state.target[step] for flight, step in flights]))
+        # PyBullet keeps the lines, so each frame adds the latest piece only.
         for row, (recording, step) in enumerate(flights):
             if step > trail_ends[row]:
                 p.addUserDebugLine(

@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from PIL import Image as Pillow
-from PIL import ImageDraw, ImageFont
+from PIL import ImageDraw, ImageFont, ImageOps
 
 from sb3_quad.base.arrays import Image
 
@@ -51,10 +51,10 @@ def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, 
     :param colour: as ``#rrggbb``.
     :param size: of the font, pixels.
     """
+    # The band is as high as its lines, with a margin above and below them.
     band = round((0.7 + STEP * (1 + len(lines))) * size)
     bar = 0.45 * size
-    image = Pillow.new("RGB", (pixels.shape[1], band + pixels.shape[0]), "white")
-    image.paste(Pillow.fromarray(pixels), (0, band))
+    image = ImageOps.expand(Pillow.fromarray(pixels), (0, band, 0, 0), "white")
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, 0, bar, band - 1), fill=colour)
     column = bar + 0.7 * size
@@ -69,6 +69,7 @@ def side_by_side(pictures: Sequence[Image], columns: int) -> Image:
     """Pictures of one size in rows of ``columns``, on white; even in width and height, as video
     codecs ask for.
     """
+    # Each picture stands in the top left corner of its field; the gap is on its other sides.
     columns = min(columns, len(pictures))
     rows = math.ceil(len(pictures) / columns)
     height, width, _ = np.add(pictures[0].shape, (GAP, GAP, 0))

@@ -16,7 +16,7 @@ from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.show.episodes import Recording
 from sb3_quad.show.labels import side_by_side, tag_size, with_header, with_tags
 
-SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near its target
+SETTLED = 0.25  # m: for a sequence, a flight is over once it stays within that of its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
 LARGEST = 6.0  # how much larger than life it is drawn at most
 APART = 0.8  # between poses in the picture, in the vehicle's drawn breadth
@@ -45,6 +45,7 @@ def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
     :param width: of a panel, its header not counted, pixels; ``height`` likewise.
     :return: uint8 (height, about panels * width, 3).
     """
+    # One view for all panels, so that their poses can be compared.
     ends = [last_step(recording) for recording in recordings]
     view = view_of(recordings, ends, Lens(width, height))
     panels = []
@@ -61,6 +62,7 @@ def last_step(recording: Recording) -> int:
 
 def view_of(recordings: Sequence[Recording], ends: Sequence[int], lens: Lens) -> View:
     """The view that has all flights up to the steps ``ends`` in its picture."""
+    # Everything that must be in the picture: flown paths and targets.
     paths = []
     for recording, end in zip(recordings, ends, strict=True):
         paths += [recording.state.position[: end + 1], recording.targets]
@@ -79,9 +81,11 @@ def view_of(recordings: Sequence[Recording], ends: Sequence[int], lens: Lens) ->
 def pose_steps(recording: Recording, end: int, view: View) -> list[int]:
     """The steps of the poses: each that hides none before it, the disturbances, and the crash."""
     places, breadth = view.project(recording.state.position[: end + 1])
+    # The start, the disturbances and the crash are shown in any case.
     shown = [0, *(step for step in recording.disturbances if step <= end)]
     if recording.lost:
         shown.append(end)
+    # Of the others, those are shown that are clear of all poses before them.
     for step in range(1, end + 1):
         apart = np.linalg.norm(places[shown] - places[step], axis=1).min()
         if apart > APART * breadth[step]:
@@ -96,6 +100,7 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: View) -> 
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
         pixels = scene.picture(view.camera, [trail])
+    # The texts grow with the picture, but stay legible in a small one.
     size = max(12, round(view.camera.lens.height / 34))
     tag = round(0.92 * size)
     pixels = with_tags(pixels, time_tags(recording, steps, view, tag), tag)
@@ -105,6 +110,7 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: View) -> 
 
 def _explanation(recording: Recording, steps: Sequence[int], end: int, view: View) -> list[str]:
     """The lines of text above a panel."""
+    # The end of the flight comes first.
     seconds = f"{recording.times[end]:.2f} s"
     if recording.lost:
         lines = [f"{recording.lost} after {recording.times[-1]:.2f} s"]
@@ -112,6 +118,7 @@ def _explanation(recording: Recording, steps: Sequence[int], end: int, view: Vie
         lines = [f"within {SETTLED:g} m of its target from {seconds} on"]
     else:
         lines = [f"{recording.state.distance[end]:.2f} m from its target after {seconds}"]
+    # Then whatever a reader could misunderstand: an enlarged vehicle, hoops and arrows.
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
     signs = "green hoops: target"
@@ -128,6 +135,7 @@ def time_tags(
     tags = []
     for step, place, breadth in zip(steps, places, breadths, strict=True):
         text = f"{recording.times[step]:.2f} s"
+        # Its centre is clipped so that the whole text is inside the picture.
         half = 0.5 * np.array(tag_size(text, size))
         above = place - (0.0, 0.4 * breadth + half[1])
         column, row = np.clip(above, half, view.camera.lens[:2] - half).tolist()

@@ -32,8 +32,8 @@ REWARD = "reward"
 ERROR = "final_error"
 TIME = "time"
 MEASURES = (SUCCESS, SURVIVAL, REWARD, ERROR, TIME)
-"""Of an episode: 0 or 1, 0 or 1, sum, m (None: crashed or out of range), s to the tightest
-tolerance, or, where it starts at its target, until stable (None: never)."""
+"""The numbers of an episode: 0 or 1, 0 or 1, sum, m (None: crashed or out of range), s to the
+tightest tolerance, or, where it starts at its target, until stable (None: never)."""
 
 
 class RunResult(Frozen, use_attribute_docstrings=True):

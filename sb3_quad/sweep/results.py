@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
@@ -58,6 +59,17 @@ COLUMNS = (
 )
 
 
+class Comparison(Estimate, use_attribute_docstrings=True):
+    """The difference of two configurations, the first less the second."""
+
+    scenario: str
+    measure: str
+    first: str
+    second: str
+    verdict: str
+    """whether the first is better or worse"""
+
+
 @dataclass(frozen=True)
 class SweepResults:
     """The results of the finished runs of a sweep.
@@ -65,42 +77,46 @@ class SweepResults:
     :param results: of all runs that ended, by name.
     :param groups: by configuration, its finished runs, in the order of the seeds; only
         configurations that have any.
-    :param scenarios: all scenarios that were flown, in order.
     :param estimates: by configuration, scenario and measure; None: not measured.
-    :param comparisons: by scenario, measure and pair of configurations, the first less the second.
     """
 
     sweep: Sweep
     results: Mapping[str, RunResult]
     groups: dict[str, list[RunResult]]
-    scenarios: list[str]
-    estimates: dict[tuple[str, str, str], Estimate | None]
-    comparisons: dict[tuple[str, str, str, str], Estimate]
+    estimates: dict[str, dict[str, dict[str, Estimate | None]]]
+    comparisons: list[Comparison]
 
     @property
     def finished(self) -> int:
         """The number of finished runs."""
-        return sum(len(group) for group in self.groups.values())
+        return sum(map(len, self.groups.values()))
+
+    @property
+    def scenarios(self) -> list[str]:
+        """All scenarios that were flown, in order."""
+        return [*dict.fromkeys(itertools.chain.from_iterable(self.estimates.values()))]
 
 
 def summarize(sweep: Sweep, results: Mapping[str, RunResult]) -> SweepResults:
     """Return means, intervals and comparisons of all runs that are finished."""
+    # In the order of the plan, not in that in which runs ended.
     groups: dict[str, list[RunResult]] = {}
-    scenarios: dict[str, None] = {}
     for run in sweep.runs:
         result = results.get(run.name)
         if result is not None and result.state == "finished":
             groups.setdefault(run.configuration, []).append(result)
-            scenarios |= dict.fromkeys(result.flights)
-    estimates = {
-        (name, scenario, measure): over_seeds(
-            _matrix(groups[name], scenario, measure), STATISTICS[measure]
-        )
-        for name, scenario, measure in itertools.product(groups, scenarios, MEASURES)
-    }
-    return SweepResults(
-        sweep, results, groups, [*scenarios], estimates, _compare(groups, [*scenarios])
-    )
+    # All runs of a configuration fly the same scenarios.
+    estimates: dict[str, dict[str, dict[str, Estimate | None]]] = {}
+    for name, group in groups.items():
+        estimates[name] = {}
+        for scenario in group[0].flights:
+            estimates[name][scenario] = {
+                measure: over_seeds(_matrix(group, scenario, measure), STATISTICS[measure])
+                for measure in MEASURES
+            }
+    summary = SweepResults(sweep, results, groups, estimates, [])
+    _compare(summary)
+    return summary
 
 
 def over_seeds(
@@ -109,11 +125,13 @@ def over_seeds(
     """Estimate the mean over seeds of a statistic of a run's episodes; of the difference of two
     configurations, a paired bootstrap.
 
-    :param values: of a measure, (seeds, episodes), NaN where there is none.
+    :param values: of a measure, (seeds, episodes), NaN without a number.
     :return: None if a run has no number at all.
     """
+    # Without a number from some run, there is no mean over seeds.
     if not np.isfinite(values).any(axis=1).all():
         return None
+    # The same resamples each time: equal values give equal intervals.
     random = np.random.default_rng(0)
     seeds, episodes = (random.integers(0, n, (RESAMPLES, n)) for n in values.shape)
     with warnings.catch_warnings():
@@ -122,6 +140,7 @@ def over_seeds(
         # (resamples, seeds)
         runs = np.stack([statistic(row[episodes], axis=1) for row in values], axis=1)
         means = np.nanmean(np.take_along_axis(runs, seeds, axis=1), axis=1)
+    # The interval holds the value, even if every resample misses it.
     low, high = np.nanpercentile(means, [2.5, 97.5])
     value = float(statistic(values, axis=1).mean())
     return Estimate(
@@ -129,23 +148,29 @@ def over_seeds(
     )
 
 
-def _compare(
-    groups: Mapping[str, Sequence[RunResult]], scenarios: Sequence[str]
-) -> dict[tuple[str, str, str, str], Estimate]:
-    """Compare all pairs of configurations, on the seeds that both have."""
-    differences = {}
-    pairs = list(itertools.combinations(groups, 2))
-    for scenario, measure, (first, second) in itertools.product(scenarios, COMPARED, pairs):
-        by_seed = {result.seed: result for result in groups[second]}
-        ours = [result for result in groups[first] if result.seed in by_seed]
+def _compare(summary: SweepResults) -> None:
+    """Add the comparisons of all pairs of configurations, on the seeds that both have."""
+    pairs = list(itertools.combinations(summary.groups, 2))
+    for scenario, measure, (first, second) in itertools.product(summary.scenarios, COMPARED, pairs):
+        # The same seeds and the same episodes, so that differences are paired.
+        by_seed = {result.seed: result for result in summary.groups[second]}
+        ours = [result for result in summary.groups[first] if result.seed in by_seed]
         theirs = [by_seed[result.seed] for result in ours]
         values = _matrix(ours, scenario, measure)
         others = _matrix(theirs, scenario, measure)
-        if ours and values.shape == others.shape:
-            difference = over_seeds(values - others)
-            if difference is not None:
-                differences[scenario, measure, first, second] = difference
-    return differences
+        if not ours or values.shape != others.shape:
+            continue
+        difference = over_seeds(values - others)
+        if difference is not None:
+            comparison = Comparison(
+                **difference.model_dump(),
+                scenario=scenario,
+                measure=measure,
+                first=first,
+                second=second,
+                verdict=verdict(difference),
+            )
+            summary.comparisons.append(comparison)
 
 
 def verdict(difference: Estimate) -> str:
@@ -162,51 +187,27 @@ def write_results(place: SweepFolder, summary: SweepResults) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
+    # The table holds every run that ended, also those that failed.
     results = summary.results
     ended = [results[run.name] for run in summary.sweep.runs if run.name in results]
     lines = itertools.chain.from_iterable(map(_lines, ended))
     write_csv(place.path / "results.csv", COLUMNS, lines)
+    failed = {name: result.message for name, result in results.items() if result.state == "failed"}
+    configurations = {}
+    for name, group in summary.groups.items():
+        seeds = [result.seed for result in group]
+        configurations[name] = {"seeds": seeds, "scenarios": summary.estimates[name]}
     content = {
         "sweep": summary.sweep.spec.name,
         "package_version": __version__,
         "runs": len(summary.sweep.runs),
         "finished": summary.finished,
-        "failed": {
-            name: result.message for name, result in results.items() if result.state == "failed"
-        },
-        "configurations": {
-            name: {
-                "seeds": [result.seed for result in group],
-                "scenarios": {
-                    scenario: _summary(summary, name, scenario)
-                    for scenario in summary.scenarios
-                    if scenario in group[0].flights
-                },
-            }
-            for name, group in summary.groups.items()
-        },
-        "comparisons": [
-            {
-                "scenario": scenario,
-                "measure": measure,
-                "first": first,
-                "second": second,
-                "verdict": verdict(difference),
-                **difference.model_dump(),
-            }
-            for (scenario, measure, first, second), difference in summary.comparisons.items()
-        ],
+        "failed": failed,
+        "configurations": configurations,
+        "comparisons": summary.comparisons,
     }
-    write_text(place.path / "results.json", json.dumps(content, indent=1) + "\n")
-
-
-def _summary(summary: SweepResults, configuration: str, scenario: str) -> dict[str, Any]:
-    """Return the estimates of a configuration in a scenario, by measure."""
-    estimates = {}
-    for measure in MEASURES:
-        estimate = summary.estimates[configuration, scenario, measure]
-        estimates[measure] = estimate and estimate.model_dump()
-    return estimates
+    text = json.dumps(to_jsonable_python(content), indent=1)
+    write_text(place.path / "results.json", f"{text}\n")
 
 
 def _lines(result: RunResult) -> Iterator[dict[str, Any]]:
@@ -228,34 +229,36 @@ def tables(summary: SweepResults) -> dict[str, list[Table]]:
     """Return by scenario a table with a column for each configuration, and one that compares
     them.
     """
-    columns = [
-        Column(f"{name} ({len(group)} seed{'s' * (len(group) > 1)})")
-        for name, group in summary.groups.items()
-    ]
+    columns = []
+    for name, group in summary.groups.items():
+        seeds = "1 seed" if len(group) == 1 else f"{len(group)} seeds"
+        columns.append(Column(f"{name} ({seeds})"))
     by_scenario = {}
     for scenario in summary.scenarios:
+        # A measure that no configuration has gets no row.
         rows = []
         for measure, (row, _, _) in ROWS.items():
-            cells = [
-                _cell(summary.estimates[name, scenario, measure], measure)
-                for name in summary.groups
-            ]
-            if any(cell != Cell() for cell in cells):
+            cells = []
+            for estimates in summary.estimates.values():
+                cells.append(_cell(estimates.get(scenario, {}).get(measure), measure))
+            if cells != [Cell()] * len(cells):
                 rows.append(Row(row.name, row.unit, cells))
         by_scenario[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
+        # A second table compares the configurations, if there are several.
         lines = []
-        for (where, measure, first, second), difference in summary.comparisons.items():
-            if where == scenario:
-                cells = [Cell(words=verdict(difference)), _cell(difference, measure)]
-                lines.append(Row(f"{first} than {second}", ROWS[measure][0].heading, cells))
+        for comparison in summary.comparisons:
+            if comparison.scenario == scenario:
+                name = f"{comparison.first} than {comparison.second}"
+                cells = [Cell(words=comparison.verdict), _cell(comparison, comparison.measure)]
+                lines.append(Row(name, ROWS[comparison.measure][0].heading, cells))
         if lines:
-            comparison = Table(
+            table = Table(
                 [Column("is", align="left"), Column("difference")],
                 lines,
                 title=f"{scenario}: better, worse, cannot tell",
                 caption="paired bootstrap over the seeds and episodes that both have",
             )
-            by_scenario[scenario].append(comparison)
+            by_scenario[scenario].append(table)
     return by_scenario
 
 
@@ -306,6 +309,7 @@ def _curves(place: SweepFolder, summary: SweepResults) -> list[Plot]:
     """Plot the evaluations along the way; of pipelines, one plot for each algorithm and environment
     of a stage.
     """
+    # A run folder is <algo>/<Env>_<number>; its stages have curves of their own.
     curves: dict[str, dict[str, list[Curve]]] = {}
     for name, group in summary.groups.items():
         for result in group:

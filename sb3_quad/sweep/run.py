@@ -64,6 +64,7 @@ def execute(
     :return: the results of all runs that ended, those of earlier calls included, by name.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
+    # Finished runs stay as they are; failed ones are tried again.
     known = place.results(sweep.runs)
     results = {name: result for name, result in known.items() if result.state == "finished"}
     calls: dict[Future[RunResult], Run] = {}
@@ -78,6 +79,7 @@ def execute(
         begun = pipeline_folder(place.run(run)) is not None
         return "resumes where it stopped" if begun else "begins again"
 
+    # All runs are submitted at once; the executor starts as many as it has workers.
     for run in sweep.runs:
         if run.name in results:
             continue
@@ -91,6 +93,7 @@ def execute(
         try:
             result = future.result()
         except WorkerDied as died:
+            # After a signal a worker may have been ended by it.
             if signals.received is not None:
                 continue
             if tries[run.name] < TRIES:
@@ -118,6 +121,7 @@ def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> 
     :param suite: the scenarios of the agent; None: fresh episodes of both tasks, as many as
         ``evaluation`` says.
     """
+    # One core for each run: so the same weights come out on any machine.
     use_cpus(1)
     place = Path(folder)
     interrupted = _result(run, state="interrupted")
@@ -200,7 +204,8 @@ def _fly(
         config = job.for_evaluation()
         with closing(make_environments(config, 1, seed)) as env:
             rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
-        return {config.env_id: {REWARD: tuple(float(reward) for reward in rewards)}}
+        return {config.env_id: {REWARD: tuple(np.ravel(rewards).tolist())}}
+    # Without a suite, the episodes are those of the closing table of train.
     if suite is None:
         seeds = row_seeds(seed, episodes)
         settings = job.flight_settings.in_any_task()
@@ -218,6 +223,7 @@ def _fly(
 
 def _numbers(flights: Flights) -> dict[str, Numbers]:
     """Return the measures of all episodes, None where there is no number."""
+    # The time to the tightest tolerance.
     arrival = np.full(flights.n, np.nan)
     if flights.time_to:
         arrival = flights.time_to[min(flights.time_to)]
@@ -230,7 +236,6 @@ def _numbers(flights: Flights) -> dict[str, Numbers]:
         np.where(flights.survival, flights.final_error, np.nan),
         np.where(has_way, arrival, flights.recovery_time),
     )
-    return {
-        name: tuple(float(value) if np.isfinite(value) else None for value in column)
-        for name, column in zip(MEASURES, columns, strict=True)
-    }
+    numbers = np.array(columns, dtype=np.float64)
+    rows = np.where(np.isfinite(numbers), numbers, np.array(None)).tolist()
+    return dict(zip(MEASURES, map(tuple, rows), strict=True))

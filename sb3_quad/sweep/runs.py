@@ -51,6 +51,7 @@ def make_runs(spec: SweepSpec) -> list[Run]:
     :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
         two configurations of one name, too many runs.
     """
+    # Every configuration is checked before the first run starts.
     runs: dict[str, list[Run]] = {}
     for varied, data in _cells(spec):
         label = _name(varied)
@@ -95,6 +96,7 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
     for key, values in spec.grid.items():
         if not isinstance(values, list) or not values:
             raise ConfigError(f"grid: {key}: must be a list of at least one value, not {values!r}")
+    # Without a list there is one configuration, that of the shared keys.
     listed = spec.configurations or ({},)
     count = len(listed) * len(spec.seed) * math.prod(map(len, spec.grid.values()))
     if count > MAX_RUNS:
@@ -110,6 +112,7 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
                 if data.get(outer) is None:
                     data.pop(outer, None)
                 put_key(data, key, value, f"grid: {key}")
+            # A named configuration keeps its name in each cell of the grid.
             if own.get("name"):
                 data["name"] = ",".join(filter(None, [str(own["name"]), _name(cell)]))
             yield {**own, **cell}, data
@@ -134,18 +137,20 @@ def _folder_name(configuration: Configuration, label: str) -> str:
 
 def _stages(configuration: Configuration) -> tuple[dict[str, Any], list[Stage]]:
     """Return the job of a configuration's runs and their stages, with all settings."""
-    given = configuration.given
+    # A vehicle is a keyword of the environment.
+    changes: dict[str, Any] = {}
     if configuration.vehicle is not None:
-        given["env_kwargs"] = {**(configuration.env_kwargs or {}), "vehicle": configuration.vehicle}
-    options = {key: given[key] for key in SettingsOptions.model_fields if key in given}
-    changes = {**configuration.hyperparams, **options}
-    if "trained_agent" in given:
-        agent = agent_path(given["trained_agent"])
-        if not Path(agent).is_file():
-            raise ConfigError(f"trained_agent {given['trained_agent']}: no such file")
-        given["trained_agent"] = agent
-    job = {key: given[key] for key in RunOptions.model_fields if key in given}
-    pipeline = _pipeline(configuration, given, changes)
+        kwargs = configuration.env_kwargs or {}
+        changes["env_kwargs"] = {**kwargs, "vehicle": configuration.vehicle}
+    # The agent that the training starts from, as a path that workers find.
+    if configuration.trained_agent is not None:
+        changes["trained_agent"] = agent_path(configuration.trained_agent)
+        if not Path(changes["trained_agent"]).is_file():
+            raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
+    configuration = configuration.model_copy(update=changes)
+    job = configuration.model_dump(include={*RunOptions.model_fields}, exclude_defaults=True)
+    # Resolve all settings now, so that later changes of files do not matter.
+    pipeline = _pipeline(configuration)
     stages = []
     for stage, planned in zip(pipeline.stages, stage_jobs(pipeline, job), strict=True):
         if planned.config.task is not None:
@@ -155,10 +160,14 @@ def _stages(configuration: Configuration) -> tuple[dict[str, Any], list[Stage]]:
     return job, stages
 
 
-def _pipeline(
-    configuration: Configuration, given: Mapping[str, Any], changes: dict[str, Any]
-) -> Pipeline:
+def _pipeline(configuration: Configuration) -> Pipeline:
     """Return the pipeline of a configuration; a single run is one of one stage."""
+    given = configuration.given
+    # Options with flags of their own are settings, too.
+    options = configuration.model_dump(
+        include={*SettingsOptions.model_fields}, exclude_defaults=True
+    )
+    settings = {**configuration.hyperparams, **options}
     file = configuration.conf_file
     if file is not None and is_pipeline(file):
         for key in ("algo", "env", "n_timesteps", "trained_agent"):
@@ -167,20 +176,21 @@ def _pipeline(
                     f"{key} goes with a single run; "
                     f"the stages of a pipeline have their own in {file}"
                 )
-        return with_settings(load_pipeline(file), changes)
+        return with_settings(load_pipeline(file), settings)
     for key in ("algo", "env"):
         if key not in given:
             raise ConfigError(
                 f"{key} is missing; give algo and env, or a conf_file with the stages of a pipeline"
             )
     stage = Stage(
-        name=given["algo"], algo=given["algo"], env=given["env"], conf_file=file, settings=changes
+        name=given["algo"], algo=given["algo"], env=given["env"], conf_file=file, settings=settings
     )
     return Pipeline(stages=(stage,))
 
 
 def _name(varied: Mapping[str, Any]) -> str:
     """Return the keys in which a configuration differs as words: ``pid,learning_rate=0.001``."""
+    # Some values say enough without their key.
     words = []
     for key, value in varied.items():
         word = value if isinstance(value, str) else json.dumps(value, default=str)

@@ -2,7 +2,7 @@
 the seeds.
 
 The words are rl-zoo's. Keys at the top hold for every configuration; ``grid`` maps keys, dotted
-where they lie deeper, to lists of values, of which every combination is a configuration, such as
+where they lie deeper, to lists of values. Every combination of them is a configuration, such as
 ``grid: {hyperparams.learning_rate: [1e-3, 5e-3]}``; ``configurations`` lists some one by one.
 """
 

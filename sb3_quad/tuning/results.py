@@ -22,12 +22,14 @@ def write_results(search: Search) -> None:
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     folder = Path(search.job.log_folder)
+    # The table is written after each trial, so that an interruption loses none.
     columns = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds"]
     columns += [*search.space.dimensions, RUN, ERROR]
     write_csv(folder / TRIALS, columns, [_row(search, trial) for trial in search.trials()])
     best = search.best
     if best is None:
         return
+    # The best settings say where they come from, in comments that train skips.
     comments = [
         f"Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, "
         f"study {search.name}.",

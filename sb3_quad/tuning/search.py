@@ -109,11 +109,12 @@ class Search:
         self.name = name
         self.storage = storage
         self.n_evaluations = n_evaluations
-        # As a storage gives it back.
+        # Only trials of one kind compare. This is the kind, as a storage gives it back.
         wanted = json.loads(json.dumps(self._shared(), default=str))
         self.study = open_study(name, storage)
         if BEGUN_WITH not in self.study.user_attrs and not self.study.trials:
             self.study.set_user_attr(BEGUN_WITH, wanted)
+            # The first trial has the settings as they are, if the space holds them.
             first = space.start()
             if first is not None:
                 self.study.enqueue_trial(first)
@@ -127,6 +128,7 @@ class Search:
                 f"{where}: was begun with other settings ({', '.join(sorted(differing))}); "
                 "give the same again, or another --study-name"
             )
+        # Sampler and pruner may differ from one session to the next.
         self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
         self.study.sampler = NumberedSampler(sampler, job.seed, n_startup_trials)
 
@@ -139,6 +141,7 @@ class Search:
         :raises ConfigError: a storage that fails meanwhile.
         """
         try:
+            # A trial that another process left behind counts no longer, but is tried again.
             retry_dead_trials(self.study)
             if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
                 return None
@@ -158,7 +161,7 @@ class Search:
 
     @property
     def best(self) -> FrozenTrial | None:
-        """The best trial that was finished, of any process; None if there is none."""
+        """The best trial that was finished, of any process; None before the first one."""
         return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
 
     def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
@@ -202,6 +205,7 @@ class Search:
             trial.set_user_attr(REWARD, reward)
             return len(values) >= self.n_evaluations or not trial.should_prune()
 
+        # SB3 warns of each batch size that does not divide the rollout, which a search often tries.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
@@ -210,6 +214,7 @@ class Search:
                 on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
                 should_continue=should_continue,
             )
+        # The training ends early by a signal, or because the pruner stopped it.
         if result.exit_code != 0:
             raise KeyboardInterrupt
         if result.model.num_timesteps < total:
@@ -221,6 +226,7 @@ class Search:
     def _shared(self) -> dict[str, Any]:
         """Return all that the trials of a study must share to be compared."""
         job = self.job
+        # The agent counts by its content, since its file may move.
         agent = None
         if job.trained_agent is not None:
             try:
@@ -258,6 +264,7 @@ class NumberedSampler(BaseSampler):
     def infer_relative_search_space(
         self, study: optuna.Study, trial: FrozenTrial
     ) -> dict[str, BaseDistribution]:
+        # A retry has the parameters of an earlier trial, and no number of its own.
         before = study.get_trials(deepcopy=False)[: trial.number]
         number = sum("again" not in earlier.user_attrs for earlier in before)
         seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
@@ -285,7 +292,7 @@ def open_study(name: str, storage: str | Path) -> optuna.Study:
         return optuna.create_study(
             study_name=name, storage=backend, direction="maximize", load_if_exists=True
         )
-    except Exception as error:  # databases and damaged journals raise what they like
+    except Exception as error:  # databases and damaged journals raise anything
         reason = f"{type(error).__name__}: {one_line(error)}"
         raise ConfigError(f"storage {storage}: cannot be used ({reason})") from None
 
@@ -307,7 +314,7 @@ def retry_dead_trials(study: optuna.Study) -> None:
         machine, process = trial.user_attrs.get(OWNER, ["", 0])
         if machine == platform.node():
             try:
-                os.kill(process, 0)  # does nothing but fail where there is none
+                os.kill(process, 0)  # does nothing, but fails without such a process
             except ProcessLookupError:
                 study.tell(trial.number, state=TrialState.FAIL)
                 study.enqueue_trial(trial.params, AGAIN)

@@ -86,6 +86,7 @@ class SearchSpace:
         """
         start: dict[str, Any] = {}
         for name, dimension in self.dimensions.items():
+            # A list must hold the value, a range must include it.
             value = current(self.algo, self.base, name)
             if isinstance(dimension, CategoricalDistribution):
                 start[name] = _label(value)
@@ -102,8 +103,9 @@ class SearchSpace:
         """Return the value that a parameter stands for."""
         dimension = self.dimensions[name]
         if isinstance(dimension, CategoricalDistribution):
-            is_json = isinstance(parameter, str) and parameter[:1] in ("[", "{")
-            return json.loads(parameter) if is_json else parameter
+            if isinstance(parameter, str) and parameter[:1] in ("[", "{"):
+                return json.loads(parameter)
+            return parameter
         if not isinstance(dimension, FloatDistribution):
             return parameter
         # Four digits, but not beyond a bound.
@@ -127,10 +129,12 @@ def load_space(
         raise ConfigError(
             f"{where}: must hold settings with their ranges, such as 'learning_rate: {{around: 5}}'"
         )
+    # The algorithm's arguments and the training's own settings may vary.
     parameters = constructor_parameters(get_algorithm(algo))
     valid = [*parameters, *JOB_SETTINGS]
     if {"n_steps", "batch_size"} <= parameters.keys() and not is_off_policy(get_algorithm(algo)):
         valid.append(MINIBATCHES)
+    # Of mappings, any entry may vary.
     for name in content:
         outer, _, inner = str(name).partition(".")
         if name not in valid and not (inner and outer in MAPPINGS):
@@ -149,6 +153,7 @@ def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
     algorithm's default.
     """
     outer, dot, inner = name.partition(".")
+    # An entry of a mapping, such as policy_kwargs.net_arch.
     if dot:
         return _plain(settings.get(outer)).get(inner)
     if name == MINIBATCHES:
@@ -173,6 +178,7 @@ def _dimension(
         )
     parameter = constructor_parameters(get_algorithm(algo)).get(name)
     whole = name in (MINIBATCHES, "n_envs") or (parameter is not None and takes_whole(parameter))
+    # Both kinds of ranges become bounds; whole numbers get whole bounds.
     if "around" in values:
         bounds = _around(current(algo, settings, name), values, whole, where)
     else:
@@ -210,18 +216,23 @@ def _rollout(algo: str, settings: Mapping[str, Any]) -> float:
 
 def _plain(value: Any) -> dict[str, Any]:
     """Return a mapping of the settings with its values as written, also one like ``dict(…)``."""
-    mapping = parse_value(value) if isinstance(value, str) else value
-    return dict(mapping) if isinstance(mapping, dict) else {}
+    if isinstance(value, str):
+        value = parse_value(value)
+    return dict(value) if isinstance(value, dict) else {}
 
 
 def _label(value: Any) -> Any:
     """Return a value of a list as Optuna holds it: a plain one as it is, others as JSON."""
-    return value if isinstance(value, (bool, int, float, str, type(None))) else json.dumps(value)
+    if isinstance(value, (bool, int, float, str, type(None))):
+        return value
+    return json.dumps(value)
 
 
 def _number_of(value: Any) -> float | None:
-    """Return a number, also that of ``lin_x``; None if there is none."""
-    number = parse_number(value.removeprefix(LINEAR) if isinstance(value, str) else value)
+    """Return a number, also that of ``lin_x``; None for anything else."""
+    if isinstance(value, str):
+        value = value.removeprefix(LINEAR)
+    number = parse_number(value)
     if isinstance(number, bool) or not isinstance(number, (int, float)):
         return None
     return number

@@ -1,5 +1,5 @@
 /**
- * What a pointer does to the picture: it throws or pushes vehicles, drags the target, turns the camera, zooms.
+ * Gestures of a pointer: throw or push vehicles, drag the target, turn the camera, zoom.
  *
  * @typedef {import("./camera.js").Camera} Camera
  *
@@ -46,7 +46,7 @@ export function listen(canvas, camera, gestures) {
     return best;
   };
 
-  /** The velocity of what is held, m/s. @param {PointerEvent} event of the moment */
+  /** The velocity of what is held, m/s. @param {PointerEvent} event the latest one */
   const velocity = (event) => {
     const samples = held?.samples ?? [];
     const now = event.timeStamp / 1000, last = samples[samples.length - 1];
@@ -65,8 +65,8 @@ export function listen(canvas, camera, gestures) {
       return;
     }
     const thing = find(at, event.pointerType === "mouse" ? REACH.mouse : REACH.touch);
-    const pushes = gestures.tool === "push" || event.button === 2 || event.shiftKey;
-    const kind = !thing ? "camera" : thing.kind === "target" ? "target" : pushes ? "push" : "throw";
+    const isPush = gestures.tool === "push" || event.button === 2 || event.shiftKey;
+    const kind = !thing ? "camera" : thing.kind === "target" ? "target" : isPush ? "push" : "throw";
     const { index, depth } = thing ?? { index: 0, depth: 1 };
     held = { kind, index, depth, ...at, samples: [[event.timeStamp / 1000, at.x, at.y]] };
     if (kind === "throw") gestures.grab(held.index);

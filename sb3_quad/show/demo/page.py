@@ -15,6 +15,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.colours import COLOURS, colours_of
@@ -73,7 +74,7 @@ TABLES = {
 }
 # Parts of a script: strings, templates (also with a template in them) and comments at the end of a
 # line are kept as they are; documentation, imports, the word export, indentation and comment lines
-# are left out.
+# are removed.
 PARTS = re.compile(
     r"""
     (?P<kept>
@@ -97,6 +98,7 @@ def make_page(
     :param vehicle: that all fly at first; None: the first agent's own, else ``itm``.
     :raises ConfigError: a controller that the page cannot fly, or settings that cannot be read.
     """
+    # A vehicle that is given comes first, then those of the agents, each under a name of its own.
     colours = colours_of([spec.label for spec in specs])
     vehicles = {name: load_vehicle(name) for name in VEHICLES.names()}
     first = vehicle and _add(vehicles, vehicle)
@@ -117,6 +119,7 @@ def make_page(
         "colours": COLOURS,
         "agents": agents,
     }
+    # Round one network after the other, the largest first, until the page is small enough.
     by_size = sorted(networks, key=lambda label: -numbers(networks[label]).size)
     for count in range(len(by_size) + 1):
         rounded = by_size[:count]
@@ -175,19 +178,14 @@ def describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
         "observation": row.observation.model_dump(mode="json"),
         "mean": reference.mean.tolist(),
         "std": reference.std.tolist(),
-        "shapes": [
-            {"inputs": layer.in_features, "outputs": layer.out_features, "activation": activation}
-            for layer, activation in network.steps
-        ],
+        "shapes": network.shapes,
     }
     return described, network
 
 
 def numbers(network: Network) -> Float32Array:
     """Weights and biases, layer by layer."""
-    layers = [layer for layer, _ in network.steps]
-    parts = [part.detach().numpy().ravel() for it in layers for part in (it.weight, it.bias)]
-    return np.concatenate(parts)
+    return parameters_to_vector(network.parameters()).numpy()
 
 
 def pack(network: Network, rounded: bool) -> dict[str, Any]:
@@ -196,6 +194,7 @@ def pack(network: Network, rounded: bool) -> dict[str, Any]:
 
     :param rounded: whether to half precision.
     """
+    # Sorted by byte, the signs and exponents stand together and deflate better.
     values = numbers(network).astype("<f2" if rounded else "<f4")
     planes = np.frombuffer(values.tobytes(), np.uint8).reshape(values.size, -1).T.tobytes()
     return {
@@ -225,6 +224,7 @@ def _render(data: dict[str, Any], rounded: Sequence[str]) -> str:
     )
     if rounded:
         notes += f" Weights of {' and '.join(rounded)} are rounded to half precision."
+    # Without "<", no text in the data can end the script element.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(__package__, ""), undefined=jinja2.StrictUndefined
