@@ -17,17 +17,20 @@ import pytest
 import torch
 from stable_baselines3 import A2C, PPO, SAC, TD3
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.controllers.agent_settings import env_kwargs
 from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
+from sb3_quad.show.demo import page as page_module
 from sb3_quad.show.demo.page import (
     DEFAULT_AGENTS,
     LIMIT,
     MODEL,
     describe,
+    join_modules,
     make_page,
     numbers,
     pack,
@@ -55,7 +58,8 @@ if (job.zip) {
   }
 }
 if (job.observations) {
-  console.log(JSON.stringify(job.observations.map((each) => [...forward(agent.layers, Float32Array.from(each))])));
+  const results = job.observations.map((row) => forward(agent.layers, Float32Array.from(row)));
+  console.log(JSON.stringify(results.map((row) => [...row])));
   process.exit();
 }
 const flight = new Flight(job.vehicle, agent);
@@ -85,18 +89,10 @@ def in_node(tmp_path, **job):
 
 
 def start_of(env):
-    """How the episode of an environment's only row begins."""
+    """The start of the episode of an environment's only row."""
     state = env.true_state()
-    names = {
-        "position": "position",
-        "quaternion": "quaternion",
-        "velocity": "velocity",
-        "rates": "body_rates",
-    }
-    return {
-        ours: getattr(state, theirs)[0].tolist()
-        for ours, theirs in {**names, "target": "target"}.items()
-    }
+    names = ("position", "quaternion", "velocity", "body_rates", "target")
+    return {name: getattr(state, name)[0].tolist() for name in names}
 
 
 def fly(env, actions, steps=STEPS):
@@ -236,7 +232,7 @@ def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path):
         w, x, y, z = start["quaternion"]
         c, s = math.cos(turn.angle / 2), math.sin(turn.angle / 2)
         start["quaternion"] = [w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]
-        start["rates"] = (turn.axes.T @ start["rates"]).tolist()
+        start["body_rates"] = (turn.axes.T @ start["body_rates"]).tolist()
     source = {"zip": str(pretrained(name))} if how == "zip" else {"agent": agent}
     path = in_node(
         tmp_path, vehicle=flown.model_dump(mode="json"), **source, start=start, steps=STEPS
@@ -325,6 +321,37 @@ def test_a_page_is_one_file_that_needs_no_other(tmp_path, capsys):
     ] and data["vehicle"] == "crazyflie"
     assert main(["demo", "pid", "-o", str(file)]) == 2  # exists
     assert "--overwrite" in capsys.readouterr().err
+
+
+LITERALS = """
+export const text = `first
+    indented
+  // no comment
+  import nothing;
+${[1].map((k) => `a
+   b ${k}`)} /** kept */
+`;
+export const other = "/** kept */"; // it's a `comment`
+  // dropped
+const last = '// kept';
+"""
+
+
+def test_strings_of_the_scripts_stay_as_they_are():
+    """Literals with leading spaces, and with what looks like code or a comment."""
+    text = join_modules(LITERALS)
+    literal = LITERALS.split("`;")[0].partition("`")[2]
+    assert f"const text = `{literal}`;" in text
+    assert 'const other = "/** kept */"; // it\'s a `comment`\n' in text
+    assert "dropped" not in text and "const last = '// kept';" in text
+    assert not re.search(r"^export", text, re.M)
+
+
+def test_a_feature_that_the_page_does_not_compute_is_refused(monkeypatch):
+    (spec,) = parse_controllers(["itm-recovery"])
+    monkeypatch.setattr(page_module, "FEATURES", {"position", "rotation", "velocity"})
+    with pytest.raises(ConfigError, match=r"itm-recovery.*does not compute body_rates"):
+        describe(spec)
 
 
 @functools.cache
@@ -529,7 +556,8 @@ def test_everything_has_a_name_and_fits(browser, page, width, height):
     browser.open(page, width, height)
     assert browser.value("document.documentElement.scrollWidth") <= width
     nameless = """[...document.querySelectorAll("button, input, select, canvas")].filter((each) =>
-        !(each.ariaLabel || each.textContent.trim() || [...(each.labels ?? [])].some((label) => label.textContent.trim())))
+        !(each.ariaLabel || each.textContent.trim() ||
+          [...(each.labels ?? [])].some((label) => label.textContent.trim())))
         .map((each) => each.outerHTML)"""
     assert browser.value(nameless) == []
     browser.value("dispatchEvent(new KeyboardEvent('keydown', { key: 'r' }))")

@@ -3,6 +3,7 @@ package.
 """
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -17,13 +18,14 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import A2C, PPO, SAC, TD3
+from test_extending import DIFFS, ROOT, apply
 
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, network, policy
-from sb3_quad.export.check import Reference, physical_features
+from sb3_quad.export.check import Reference
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
 from sb3_quad.export.network import StatefulNetwork, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
@@ -71,6 +73,14 @@ def zips(tmp_path_factory):
     for kind in MODELS:
         untrained(kind, QuadcopterVecEnv(2, seed=0)).save(folder / f"{kind}.zip")
     return folder
+
+
+def physical_features(state):
+    """The 18 features of the true state, (n, 18), float32, as docs/export.md lists them."""
+    to_body = state.rotation.transpose(0, 2, 1)
+    velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
+    parts = (state.position - state.target, to_body.reshape(-1, 9), velocity, state.body_rates)
+    return np.concatenate(parts, axis=1).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -491,3 +501,44 @@ def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, c
     np.testing.assert_allclose(
         [float(word) for word in done], np.ravel(scope["thrust"][:1]), atol=1e-5
     )
+
+
+FEATURE = next(diff for diff in DIFFS if "FEATURES = (" in diff)
+EXPORT = """
+from stable_baselines3 import PPO
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.export.policy import export_policy
+from sb3_quad.simulation.settings import FlightSettings
+
+sees = {"history": [0, 2], "last_action": True, "position_integral": {}}
+env = QuadcopterVecEnv(1, seed=0, **sees)
+model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [16]}, seed=0, device="cpu")
+FlightSettings(**sees).write_into(model)
+model.save("agent.zip")
+for vehicle in ("itm", "hummingbird"):
+    exported = export_policy("agent.zip", "torchscript", vehicle=vehicle, n_observations=2000)
+    print(exported.metadata["observation"])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1300)
+def test_a_policy_that_sees_a_further_feature_exports(tmp_path):
+    """The feature of docs/extending.md, also for rotors in another order and turned axes."""
+    for name in ("sb3_quad", "envs", "callbacks", "zoo_configs"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    apply(FEATURE, tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", EXPORT],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2
+    for line in lines:
+        assert line.startswith("22 numbers")
+        assert "15-17 body rates, body frame, rad/s; 18-21 rotor_speeds, rad/s" in line

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 import yaml
-from test_export import compiled, load
+from test_export import compiled, load, physical_features
 
 import sb3_quad
 from sb3_quad.base.errors import ConfigError
@@ -16,7 +16,6 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.export.check import physical_features
 from sb3_quad.export.policy import export_policy
 from sb3_quad.vehicles.vehicle import load_vehicle
 

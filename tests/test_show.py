@@ -89,13 +89,13 @@ def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
     np.testing.assert_array_equal(
         acting, [11, 12]
     )  # during the steps that begin at 0.10 and 0.11 s
-    assert hit.pushes == [11]
+    assert hit.disturbances == [11]
     np.testing.assert_array_equal(hit.wrench_around(40)[:3], [-20, -20, 0])
     assert not hit.wrench_around(10).any() and not hit.wrench_around(59).any()
     np.testing.assert_array_equal(hit.targets, [[3, 0, 16]])
 
 
-def test_what_randomize_pushes_with_is_recorded():
+def test_disturbances_of_randomize_are_recorded():
     setting = fixed_setting(
         FlightSettings(
             task="target_tracking", randomize={"force": {"magnitude": [3, 3]}, "gusts": {"std": 1}}
@@ -103,7 +103,7 @@ def test_what_randomize_pushes_with_is_recorded():
     )
     recording = flown(setting, 20)
     np.testing.assert_allclose(recording.wrench[1:], recording.state.wrench[:, :-1].T)
-    assert recording.wrench[1:, :3].any() and recording.pushes == [1]
+    assert recording.wrench[1:, :3].any() and recording.disturbances == [1]
 
 
 def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
@@ -207,9 +207,10 @@ def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
 
 def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
     ends = [len(fall.times) - 1, 60]
-    view = sequence._view([fall, hit], ends, Lens(300, 400))
-    chosen = [sequence._steps(each, end, view) for each, end in zip((fall, hit), ends, strict=True)]
-    assert chosen[0][0] == 0 and chosen[0][-1] == ends[0] and hit.pushes[0] in chosen[1]
+    view = sequence.view_of([fall, hit], ends, Lens(300, 400))
+    flights = zip((fall, hit), ends, strict=True)
+    chosen = [sequence.pose_steps(flight, end, view) for flight, end in flights]
+    assert chosen[0][0] == 0 and chosen[0][-1] == ends[0] and hit.disturbances[0] in chosen[1]
     for steps, flight in zip(chosen, (fall, hit), strict=True):
         places, breadth = view.project(flight.state.position[steps])
         gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[
@@ -222,10 +223,10 @@ def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
 
 @pytest.mark.parametrize("size", [(300, 400), (600, 200)])
 def test_texts_of_a_sequence_are_inside_the_picture_beside_their_poses(fall, size):
-    view = sequence._view([fall], [len(fall.times) - 1], Lens(*size))
-    steps = sequence._steps(fall, len(fall.times) - 1, view)
+    view = sequence.view_of([fall], [len(fall.times) - 1], Lens(*size))
+    steps = sequence.pose_steps(fall, len(fall.times) - 1, view)
     places, breadth = view.project(fall.state.position[steps])
-    tags = sequence._time_tags(fall, steps, view, 12)
+    tags = sequence.time_tags(fall, steps, view, 12)
     assert [text for text, _ in tags] == [f"{fall.times[step]:.2f} s" for step in steps]
     for (text, centre), own in zip(tags, places, strict=True):
         half = 0.5 * np.array(tag_size(text, 12))

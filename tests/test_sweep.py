@@ -25,10 +25,10 @@ from sb3_quad.base.process import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.cli import main
 from sb3_quad.executors import as_they_end, start_executor
-from sb3_quad.sweep.expand import expand
-from sb3_quad.sweep.folder import Plan, SweepFolder
+from sb3_quad.sweep.folder import Sweep, SweepFolder
 from sb3_quad.sweep.results import over_seeds, verdict
 from sb3_quad.sweep.run import digest
+from sb3_quad.sweep.runs import make_runs
 from sb3_quad.sweep.spec import SWEEPS, SweepSpec, load_sweep
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -93,7 +93,7 @@ def write(path, **keys):
     seeds=st.lists(st.integers(0, 99), min_size=1, max_size=3, unique=True),
 )
 def test_the_runs_are_the_product_of_grid_and_seeds(noise, rate, seeds):
-    runs = expand(
+    runs = make_runs(
         spec(seed=seeds, grid={"env_kwargs.noise": noise, "hyperparams.learning_rate": rate})
     )
     settings = [(run.stages[0].settings, run.seed) for run in runs]
@@ -108,7 +108,7 @@ def test_entries_of_a_list_have_their_names_and_inherit():
         {"name": "calm", "env_kwargs": {"noise": 0}},
         {"hyperparams": {"n_epochs": 2}, "eval_freq": "1e3"},
     ]
-    calm, other = expand(spec(configurations=own))
+    calm, other = make_runs(spec(configurations=own))
     settings, others = calm.stages[0].settings, other.stages[0].settings
     assert (
         calm.name == "calm/seed_0"
@@ -179,12 +179,12 @@ def test_dry_run_lists_the_runs(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", SWEEPS.names())
-def test_sweeps_of_the_package_expand(name, trained_runs, tmp_path, monkeypatch):
+def test_sweeps_of_the_package_make_runs(name, trained_runs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(
         trained_runs("dagger"), "logs/dagger/QuadTargetTracking-v0_1"
     )  # from which `cloning` starts
-    assert {run.seed for run in expand(load_sweep(name))} == {0, 1, 2}
+    assert {run.seed for run in make_runs(load_sweep(name))} == {0, 1, 2}
 
 
 def test_who_is_better_is_known_where_it_is_clear():
@@ -270,12 +270,12 @@ def test_resuming_rereads_no_settings_file(tmp_path, monkeypatch):
         json.dumps({"stages": [STAGE, {**STAGE, "name": "two", "seed_offset": 1}]})
     )
     keys = {"algo": None, "env": None, "n_timesteps": None, "conf_file": "two.yml"}
-    plan = Plan(spec=spec(**keys), runs=tuple(expand(spec(**keys))))
+    sweep = Sweep(spec=spec(**keys), runs=tuple(make_runs(spec(**keys))))
     place = SweepFolder("logs/s_1")
-    place.write(plan)
+    place.write(sweep)
     (tmp_path / "two.yml").unlink()
     assert main(["sweep", "--resume", "logs/s_1", "--no-progress"]) == 0
-    (record,) = place.records(plan.runs).values()
+    (record,) = place.results(sweep.runs).values()
     assert record.state == "finished" and record.timesteps == 320
 
 
@@ -312,7 +312,7 @@ def test_a_sweep_gives_what_train_gives(tmp_path, monkeypatch):
         main(["sweep", write(tmp_path / "s.yaml", **keys), "--workers", "2", "--no-progress"]) == 0
     )
     place = SweepFolder("logs/sweep/s_1")
-    records = place.records(place.read().runs)
+    records = place.results(place.read().runs)
     hyperparams = [
         "n_steps:20",
         "batch_size:80",
@@ -407,5 +407,5 @@ def test_a_grid_fills_what_a_configuration_leaves_empty():
         "env": "QuadStateRecovery-v0",
         "configurations": [{"name": "one", "env_kwargs": None}],
     }
-    runs = expand(SweepSpec(**data, grid={"env_kwargs.noise": [0.0, 0.1]}))
+    runs = make_runs(SweepSpec(**data, grid={"env_kwargs.noise": [0.0, 0.1]}))
     assert [run.stages[0].settings["env_kwargs"]["noise"] for run in runs] == [0.0, 0.1]

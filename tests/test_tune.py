@@ -342,7 +342,7 @@ def test_bad_input_is_one_line(command, arguments, message, capsys):
         ({"n_steps": {"low": 1.5, "high": 20}}, "whole"),
         ({"bc_loss": []}, "list of values"),
         ({"bc_loss": "mse"}, "list"),
-        ({"n_minibatches": [2], "batch_size": [2]}, "leave one"),
+        ({"n_minibatches": [2], "batch_size": [2]}, "remove one"),
         ({}, "must hold"),
     ],
 )

@@ -1,1 +1,1 @@
-"""What is drawn: vehicles, targets, trails, cameras and labels."""
+"""Pictures of flights: vehicles, targets, trails and cameras."""

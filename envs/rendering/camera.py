@@ -1,4 +1,4 @@
-"""Cameras, and where to put them so that everything is in the picture. The world frame has z up;
+"""Cameras, and their places from which everything is in the picture. The world frame has z up;
 lengths are in m.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.simulation.state import POSITION, TARGET
 
-SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that near and far are nearly of one size
+SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that distance hardly changes sizes
 CHASE_SLOPE = math.tan(math.radians(27.0))
 CHASE_MARGIN = 0.6  # around vehicle and target, m, for the default vehicle
 ASIDE = math.radians(9.0)  # between the direction to the target and that of a chasing camera
@@ -20,7 +20,7 @@ LOWEST = (-math.inf, -math.inf, 0.3)  # where a camera is at least, m
 
 
 class Lens(NamedTuple):
-    """What a camera's pictures are like."""
+    """The size of a camera's pictures and its field of view."""
 
     width: int  # pixels
     height: int
@@ -40,48 +40,55 @@ class Camera(NamedTuple):
     lens: Lens
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Column, row (pixels from the top left corner) and depth (m) at which points, (n, 3), are
-        seen; (n, 3).
+        """Return column, row (pixels from the top left corner) and depth (m) of points, (n, 3), in
+        the picture; (n, 3).
         """
         width, height, slope = self.lens
         forward, right, up = self.axes @ (points - self.eye).T
+        # A point at or behind the camera gets a place far outside the picture.
         scale = height / 2.0 / (np.maximum(forward, 1e-6) * slope)
         return np.stack([width / 2.0 + scale * right, height / 2.0 - scale * up, forward], axis=1)
 
 
 def direction(course: float, elevation: float) -> FloatArray:
-    """The unit vector, (3,), at an angle ``course`` about z and an angle ``elevation`` above the
-    horizon, rad.
+    """Return the unit vector, (3,), at an angle ``course`` about z and an angle ``elevation`` above
+    the horizon, rad.
     """
     level = math.cos(elevation)
     return np.array([level * math.cos(course), level * math.sin(course), math.sin(elevation)])
 
 
 def broadside(points: FloatArray) -> FloatArray:
-    """The direction, (3,), in which a camera sees the spread of ``points``, (n, 3), best; a little
-    downwards.
+    """Return the direction, (3,), in which a camera sees the spread of ``points``, (n, 3), best; a
+    little downwards.
     """
-    spread = np.cov(points[:, :2].T) if len(points) > 2 else np.eye(2)
+    spread = np.eye(2)
+    if len(points) > 2:
+        spread = np.cov(points[:, :2].T)
+    # The direction of the least spread. Of its two signs always the same one is taken, so that
+    # similar flights are seen from the same side.
     x, y = np.linalg.eigh(spread)[1][:, 0]
-    return direction(math.atan2(y, x) if (y, x) > (0.0, 0.0) else math.atan2(-y, -x), -DOWN)
+    sign = 1.0 if (y, x) > (0.0, 0.0) else -1.0
+    return direction(math.atan2(sign * y, sign * x), -DOWN)
 
 
 def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens: Lens) -> Camera:
-    """The nearest camera that sees balls of radius ``margin`` at all points.
+    """Return the nearest camera that sees balls of radius ``margin`` at all points.
 
     :param points: (n, 3), world frame, m.
-    :param forward: where it looks, a unit vector, (3,), not vertical.
+    :param forward: its direction, a unit vector, (3,), not vertical.
     """
-    axes, slopes = _axes(forward), lens.slopes
+    axes = _axes(forward)
     local = points @ axes.T
-    across, room = local[:, 1:], margin - slopes * local[:, :1]
+    across = local[:, 1:]
+    room = margin - lens.slopes * local[:, :1]
     # How far it must see, in the plane through the origin, to the left and down, and to the right
     # and up.
-    before, after = (room - across).max(axis=0), (room + across).max(axis=0)
-    distance = float((0.5 * (before + after) / slopes).max())
-    return Camera(
-        np.maximum(np.array([-distance, *(0.5 * (after - before))]) @ axes, LOWEST), axes, lens
-    )
+    before = (room - across).max(axis=0)
+    after = (room + across).max(axis=0)
+    distance = float((0.5 * (before + after) / lens.slopes).max())
+    eye = np.array([-distance, *(0.5 * (after - before))]) @ axes
+    return Camera(np.maximum(eye, LOWEST), axes, lens)
 
 
 class ChaseCamera:
@@ -93,28 +100,31 @@ class ChaseCamera:
     """
 
     def __init__(self, scale: float, width: int, height: int) -> None:
-        self.scale, self.lens = scale, Lens(width, height, CHASE_SLOPE)
-        self.course, self.elevation = ASIDE, -ASIDE
+        self.scale = scale
+        self.lens = Lens(width, height, CHASE_SLOPE)
+        self.course = ASIDE
+        self.elevation = -ASIDE
 
     def follow(self, state: FloatArray, share: float) -> Camera:
-        """The camera for ``state``, (STATE_SIZE,), turned towards the target by a share of the
-        angle.
+        """Return the camera for ``state``, (STATE_SIZE,), turned towards the target by a share of
+        the angle.
         """
         x, y, z = state[TARGET] - state[POSITION]
-        if math.hypot(x, y, z) > self.scale:  # nearer targets would turn it to and fro
-            self.course += share * math.remainder(
-                math.atan2(y, x) + ASIDE - self.course, 2.0 * math.pi
-            )
-            elevation = float(np.clip(math.atan2(z, math.hypot(x, y)) - ASIDE, -STEEPEST, STEEPEST))
+        # Nearer targets would turn the camera to and fro.
+        if math.hypot(x, y, z) > self.scale:
+            course = math.atan2(y, x) + ASIDE
+            self.course += share * math.remainder(course - self.course, 2.0 * math.pi)
+            elevation = math.atan2(z, math.hypot(x, y)) - ASIDE
+            elevation = float(np.clip(elevation, -STEEPEST, STEEPEST))
             self.elevation += share * (elevation - self.elevation)
         both = np.stack([state[POSITION], state[TARGET]])
-        return framing_camera(
-            both, CHASE_MARGIN * self.scale, direction(self.course, self.elevation), self.lens
-        )
+        forward = direction(self.course, self.elevation)
+        return framing_camera(both, CHASE_MARGIN * self.scale, forward, self.lens)
 
 
 def _axes(forward: FloatArray) -> FloatArray:
     """Forward, right and up of a camera without roll, (3, 3)."""
+    # Level: the camera does not roll.
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     return np.stack([forward, right, np.cross(right, forward)])

@@ -20,15 +20,13 @@ DARK: Colour = (0.13, 0.14, 0.17, 1.0)
 GREY: Colour = (0.55, 0.58, 0.62, 1.0)
 FRONT: Colour = (0.93, 0.32, 0.10, 1.0)
 WHITE: Colour = (0.92, 0.93, 0.95, 1.0)
-# The drawn rotors turn that much slower than real ones, which would seem to stand or turn
-# backwards in a film
+# The drawn rotors turn so much slower than real ones, which would seem to stand or turn backwards
+# in a film.
 SLOWED = 12.0
-HEAD = (
-    (0.75, 2.4),
-    (0.85, 1.6),
-    (0.95, 0.8),
-)  # of an arrow: height of a step, of the length, and its width
+# The three steps of an arrow's head: height, in its length, and radius, in its radius.
+HEAD = ((0.75, 2.4), (0.85, 1.6), (0.95, 0.8))
 NOWHERE: Vector = (0.0, 0.0, -1000.0)
+NO_BOX: Vector = (0.0, 0.0, 0.0)
 
 
 class Part(NamedTuple):
@@ -38,7 +36,7 @@ class Part(NamedTuple):
 
     shape: int
     at: Vector = (0.0, 0.0, 0.0)
-    box: Vector = (0.0, 0.0, 0.0)
+    box: Vector = NO_BOX
     radius: float = 0.0
     length: float = 0.0
     roll: float = 0.0
@@ -46,17 +44,18 @@ class Part(NamedTuple):
 
 
 def add_body(parts: Sequence[Part], colour: Colour, client: int) -> int:
-    """A body of at most 16 parts, out of sight; its number."""
+    """Add a body of at most 16 parts, out of sight; return its number."""
+    # PyBullet takes lists only; tuples crash it.
+    shapes, places, boxes, radii, lengths, rolls, yaws = map(list, zip(*parts, strict=True))
+    angles = zip(rolls, [0.0] * len(parts), yaws, strict=True)
     shape = p.createVisualShapeArray(
-        shapeTypes=[part.shape for part in parts],
-        halfExtents=[[side / 2 for side in part.box] for part in parts],
-        radii=[part.radius for part in parts],
-        lengths=[part.length for part in parts],
-        rgbaColors=[colour for _ in parts],
-        visualFramePositions=[part.at for part in parts],
-        visualFrameOrientations=[
-            p.getQuaternionFromEuler((part.roll, 0.0, part.yaw)) for part in parts
-        ],
+        shapeTypes=shapes,
+        halfExtents=np.divide(boxes, 2.0).tolist(),
+        radii=radii,
+        lengths=lengths,
+        rgbaColors=[colour] * len(parts),
+        visualFramePositions=places,
+        visualFrameOrientations=list(map(p.getQuaternionFromEuler, angles)),
         physicsClientId=client,
     )
     return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
@@ -73,10 +72,9 @@ def move_body(
 
 
 def rotor_radius(vehicle: Vehicle) -> float:
-    """Radius at which neighbouring rotors are drawn just clear of each other, m."""
-    return 0.44 * min(
-        math.dist(one, other) for one, other in itertools.combinations(vehicle.rotor_positions, 2)
-    )
+    """Return the radius at which neighbouring rotors are drawn just clear of each other, m."""
+    pairs = itertools.combinations(vehicle.rotor_positions, 2)
+    return 0.44 * min(itertools.starmap(math.dist, pairs))
 
 
 def span(vehicle: Vehicle) -> float:
@@ -85,12 +83,13 @@ def span(vehicle: Vehicle) -> float:
 
 
 def rotor_turning(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
-    """How fast the drawn rotors turn about body z, from rotor speeds of any shape (..., 4), rad/s."""
+    """Return the rates of the drawn rotors about body z, of rotor speeds (..., 4), rad/s."""
     return np.asarray(-np.sign(vehicle.rotor_directions) * speeds / SLOWED)
 
 
 def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:
-    """A vehicle without its rotors, by colour: PyBullet's window gives a body one colour only.
+    """Return a vehicle without its rotors, by colour: PyBullet's window gives a body one colour
+    only.
 
     :param centres: of the rotors, (4, 3).
     """
@@ -102,47 +101,43 @@ def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:
         FRONT: [],
     }
     for x, y, z in centres.tolist():
-        beam = math.hypot(x, y), 0.09 * arm, 0.06 * arm
-        parts[FRONT if x > 0 else DARK].append(
-            Part(p.GEOM_BOX, (x / 2, y / 2, 0.02 * arm), beam, yaw=math.atan2(y, x))
-        )
-        parts[GREY].append(
-            Part(p.GEOM_CYLINDER, (x, y, 0.45 * z), radius=0.09 * arm, length=0.9 * z)
-        )
+        # A beam from the middle to the rotor, and a motor below it.
+        middle = (x / 2, y / 2, 0.02 * arm)
+        beam = (math.hypot(x, y), 0.09 * arm, 0.06 * arm)
+        colour = FRONT if x > 0 else DARK
+        parts[colour].append(Part(p.GEOM_BOX, middle, beam, yaw=math.atan2(y, x)))
+        motor = (x, y, 0.45 * z)
+        parts[GREY].append(Part(p.GEOM_CYLINDER, motor, radius=0.09 * arm, length=0.9 * z))
     return parts
 
 
 def rotor(radius: float, pitch: float) -> list[Part]:
-    """A hub and two blades in the plane z = 0, pitched by an angle, rad."""
+    """Return a hub and two blades in the plane z = 0, pitched by an angle, rad."""
+    parts = [Part(p.GEOM_CYLINDER, radius=0.09 * radius, length=0.16 * radius)]
     length = 0.94 * radius
-    blade = length, 0.15 * radius, 0.02 * radius
-    ends = [
-        Part(p.GEOM_BOX, (side * length / 2, 0.0, 0.0), blade, roll=side * pitch)
-        for side in (1.0, -1.0)
-    ]
-    return [Part(p.GEOM_CYLINDER, radius=0.09 * radius, length=0.16 * radius), *ends]
+    blade = (length, 0.15 * radius, 0.02 * radius)
+    for side in (1.0, -1.0):
+        middle = (side * length / 2, 0.0, 0.0)
+        parts.append(Part(p.GEOM_BOX, middle, blade, roll=side * pitch))
+    return parts
 
 
 def arrow(length: float, radius: float) -> list[Part]:
-    """An arrow along +z from the origin; its head has three steps."""
-    head = [
-        Part(p.GEOM_CYLINDER, (0.0, 0.0, z * length), radius=k * radius, length=0.1 * length)
-        for z, k in HEAD
-    ]
-    return [
-        Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.35 * length), radius=radius, length=0.7 * length),
-        *head,
-    ]
+    """Return an arrow along +z from the origin; its head has three steps."""
+    middle = (0.0, 0.0, 0.35 * length)
+    parts = [Part(p.GEOM_CYLINDER, middle, radius=radius, length=0.7 * length)]
+    for height, width in HEAD:
+        step = (0.0, 0.0, height * length)
+        parts.append(Part(p.GEOM_CYLINDER, step, radius=width * radius, length=0.1 * length))
+    return parts
 
 
 def hoop(radius: float, thickness: float, yaw: float) -> list[Part]:
-    """An upright ring around the origin, turned about z by an angle, rad."""
+    """Return an upright ring around the origin, turned about z by an angle, rad."""
     length = 2.06 * radius * math.tan(math.pi / 16)
     parts = []
     for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
-        level, height = radius * math.cos(angle), radius * math.sin(angle)
-        at = -level * math.sin(yaw), level * math.cos(yaw), height
-        parts.append(
-            Part(p.GEOM_CYLINDER, at, radius=thickness, length=length, roll=angle, yaw=yaw)
-        )
+        level = radius * math.cos(angle)
+        place = (-level * math.sin(yaw), level * math.cos(yaw), radius * math.sin(angle))
+        parts.append(Part(p.GEOM_CYLINDER, place, NO_BOX, thickness, length, angle, yaw))
     return parts

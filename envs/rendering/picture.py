@@ -1,4 +1,4 @@
-"""What PyBullet does not draw: sky and ground behind its bodies, and trails.
+"""The parts of a picture that PyBullet does not draw: sky and ground behind its bodies, and trails.
 
 Points are in the world frame, m; colours are red, green, blue in [0, 1]; row 0 of a picture is its
 top.
@@ -15,7 +15,8 @@ from PIL import ImageDraw
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.envs.rendering.camera import Camera, Lens
 
-NEAR, FAR = 0.05, 120.0
+NEAR = 0.05  # distances between which bodies are drawn, m
+FAR = 120.0
 SUPERSAMPLING = 2  # PyBullet's software renderer draws hard edges
 SKY_HORIZON = np.array([0.87, 0.92, 0.96], dtype=np.float32)
 SKY_ZENITH = np.array([0.36, 0.58, 0.86], dtype=np.float32)
@@ -36,7 +37,7 @@ class Trail(NamedTuple):
 
 
 def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
-    """Sky, and chequered ground with shadows and haze, (height, width, 3).
+    """Draw sky, and chequered ground with shadows and haze, (height, width, 3).
 
     :param shadows: centre x, y and radius of each shadow on the ground, (k, 3).
     """
@@ -44,29 +45,27 @@ def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
     across = np.linspace(-1.0, 1.0, width, dtype=np.float32) * np.float32(slope * width / height)
     upwards = np.linspace(slope, -slope, height, dtype=np.float32)
     forward, right, up = camera.axes.astype(np.float32)
+    # One ray for each pixel, from the eye.
     rays = forward + across[:, None] * right + upwards[:, None, None] * up
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     sky = SKY_HORIZON + np.clip(1.6 * rays[..., 2:], 0.0, 1.0) * (SKY_ZENITH - SKY_HORIZON)
     eye = camera.eye.astype(np.float32)
-    # So far away where there is no ground that haze hides it.
+    # Where a ray meets no ground, it goes so far that haze hides the ground.
     distance = np.maximum(eye[2], 0.0) / np.maximum(-rays[..., 2], 1e-6)
-    east, north = (eye[:2] + distance[..., None] * rays[..., :2]).transpose(2, 0, 1)
-    # What a pixel covers of the ground, in squares; finer squares blur into their mean instead of
+    points = eye[:2] + distance[..., None] * rays[..., :2]
+    # The size of a pixel on the ground, in squares. Finer squares blur into their mean instead of
     # flickering.
     footprint = distance * distance * np.float32(2.0 * slope / height / max(eye[2], 0.1) / SQUARE)
-    wave = (
-        np.sin(np.pi / SQUARE * east)
-        * np.sin(np.pi / SQUARE * north)
-        / np.maximum(2.0 * footprint, 0.02)
-    )
+    wave = np.sin(np.pi / SQUARE * points).prod(axis=2) / np.maximum(2.0 * footprint, 0.02)
     dark = 0.5 + 0.5 * np.clip(wave, -1.0, 1.0) * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
     ground = GROUND_LIGHT + dark[..., None] * (GROUND_DARK - GROUND_LIGHT)
-    for centre_x, centre_y, radius in shadows.tolist():
-        away = np.hypot(east - centre_x, north - centre_y) / radius
+    # Shadows have soft edges.
+    for *centre, radius in shadows.tolist():
+        away = np.linalg.norm(points - np.float32(centre), axis=2) / radius
         ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
-    return np.asarray(
-        sky + np.exp(distance / -VISIBILITY)[..., None] * (ground - sky), dtype=np.float32
-    )
+    # The share of the ground that is seen through the haze.
+    haze = np.exp(distance / -VISIBILITY)[..., None]
+    return np.asarray(sky + haze * (ground - sky), dtype=np.float32)
 
 
 def draw_trails(
@@ -76,18 +75,17 @@ def draw_trails(
     them.
     """
     high, wide = depth.shape
-    larger = camera._replace(lens=Lens(wide, high, camera.lens.slope))
+    slope = camera.lens.slope
+    larger = camera._replace(lens=Lens(wide, high, slope))
     draw = ImageDraw.Draw(picture)
     for trail in trails:
         column, row, away = larger.project(trail.points).T
-        widths = np.maximum(
-            trail.width * high / (2.0 * camera.lens.slope * np.maximum(away, NEAR)),
-            THINNEST * SUPERSAMPLING,
-        )
+        widths = trail.width * high / (2.0 * slope * np.maximum(away, NEAR))
+        widths = np.maximum(widths, THINNEST * SUPERSAMPLING).round().astype(int).tolist()
         before = depth[row.clip(0, high - 1).astype(int), column.clip(0, wide - 1).astype(int)]
-        seen = (away > NEAR) & (away < before)
+        is_seen = (away > NEAR) & (away < before)
         colour = tuple(round(255 * part) for part in to_rgb(trail.colour))
-        for k in np.flatnonzero(seen[:-1] & seen[1:]).tolist():
-            draw.line(
-                (column[k], row[k], column[k + 1], row[k + 1]), fill=colour, width=round(widths[k])
-            )
+        # A piece of the line is drawn where both its ends are seen.
+        for k in np.flatnonzero(is_seen[:-1] & is_seen[1:]).tolist():
+            piece = (column[k], row[k], column[k + 1], row[k + 1])
+            draw.line(piece, fill=colour, width=widths[k])

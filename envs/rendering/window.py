@@ -35,6 +35,7 @@ def open_window(width: int, height: int) -> int:
         raise ConfigError(
             "render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'"
         )
+    # Only the scene is shown: no controls, no shortcuts, and nothing before start_drawing().
     for option in (
         p.COV_ENABLE_RENDERING,
         p.COV_ENABLE_GUI,
@@ -44,6 +45,7 @@ def open_window(width: int, height: int) -> int:
         p.configureDebugVisualizer(option, 0, physicsClientId=client)
     import pybullet_data
 
+    # The ground is drawn only; vehicles must not collide with it.
     plane = f"{pybullet_data.getDataPath()}/plane.urdf"
     ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=client)
     p.setCollisionFilterGroupMask(ground, -1, 0, 0, physicsClientId=client)

@@ -35,7 +35,7 @@ def print_tables(
 
     :param settings: how the controllers fly in any task: vehicle, noise and scaling.
     """
-    result = compare(controllers, n_flights=n, seed=seed, thesis_columns=thesis_columns, **how)
+    result = compare(controllers, n_flights=n, seed=seed, thesis_columns=thesis_columns, **settings)
     for table in result.tables:
         console().print(table)
 

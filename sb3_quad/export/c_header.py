@@ -16,13 +16,13 @@ WIDTH = 110  # columns
 
 
 def c_name(text: str) -> str:
-    """``text`` as the beginning of C identifiers: what C does not allow becomes an underscore."""
+    """Return ``text`` as the beginning of C identifiers: other characters become underscores."""
     name = re.sub(r"[^A-Za-z0-9_]+", "_", text).strip("_")
     return name if name and not name[0].isdigit() else f"quad_{name}".rstrip("_")
 
 
 def write_header(network: Network, metadata: Mapping[str, str], name: str) -> bytes:
-    """The header, with ``static inline void NAME_policy(const float observation[18], float
+    """Return the header, with ``static inline void NAME_policy(const float observation[18], float
     thrust[4])``.
 
     For a policy with a state the function takes a ``NAME_state *`` before these, which
@@ -32,46 +32,40 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
-    tables, layers = {"mean": network.mean, "inverse_std": network.inverse_std}, []
-    for k, (layer, activation) in enumerate(network.steps):
-        tables |= {f"weight_{k}": layer.weight, f"bias_{k}": layer.bias}
-        layers.append(
-            {"inputs": layer.in_features, "outputs": layer.out_features, "activation": activation}
-        )
+    # The constants of the file, by name.
+    tables = {"mean": network.mean, "inverse_std": network.inverse_std}
+    for number, (layer, _) in enumerate(network.steps):
+        tables[f"weight_{number}"] = layer.weight
+        tables[f"bias_{number}"] = layer.bias
+    # A policy of the present features alone has no state, and gets a shorter function.
     state: dict[str, Any] = {}
     if isinstance(network, StatefulNetwork):
-        numbers = zip(
-            ("gain", "distance2", "speed2", "limit"), network.integral or (), strict=False
-        )
-        integral = {key: _number(value) for key, value in numbers}
+        names = ("gain", "distance2", "speed2", "limit")
         state = {
             "observation": network.observation,
-            "integral": integral,
+            "integral": dict(zip(names, map(_number, network.integral or ()), strict=False)),
             "keeps_actions": bool(network.actions),
         }
-    loader = jinja2.PackageLoader("sb3_quad.export", "")
-    options: dict[str, Any] = {
-        "trim_blocks": True,
-        "lstrip_blocks": True,
-        "keep_trailing_newline": True,
-    }
-    text = (
-        jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, **options)
-        .get_template("policy.h.j2")
-        .render(
-            name=name,
-            guard=f"{name.upper()}_POLICY_H",
-            comment=_comment(metadata),
-            tables=[_table(f"{name}_policy_{key}", value.numpy()) for key, value in tables.items()],
-            layers=layers,
-            features=OBSERVATION_SIZE,
-            position=F.position,
-            velocity=F.velocity,
-            result=network.result,
-            middle=_number(network.middle),
-            half_range=_number(network.half_range),
-            **{"keeps_actions": False, **state},
-        )
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sb3_quad.export", ""),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    text = environment.get_template("policy.h.j2").render(
+        name=name,
+        guard=f"{name.upper()}_POLICY_H",
+        comment=_comment(metadata),
+        tables=[_table(f"{name}_policy_{key}", value.numpy()) for key, value in tables.items()],
+        layers=network.shapes,
+        features=OBSERVATION_SIZE,
+        position=F.position,
+        velocity=F.velocity,
+        result=network.result,
+        middle=_number(network.middle),
+        half_range=_number(network.half_range),
+        **{"keeps_actions": False, **state},
     )
     return text.encode("ascii")
 
@@ -79,7 +73,7 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
 def _comment(metadata: Mapping[str, str]) -> list[str]:
     lines: list[str] = []
     for key, value in metadata.items():
-        # Nothing that a file may be called ends the comment, or is more than ASCII.
+        # A file may have any name, but the name must neither end the comment nor leave ASCII.
         text = f"{key}: {value}".replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
         text = text.encode("ascii", "backslashreplace").decode("ascii")
         lines += textwrap.wrap(text, WIDTH - 3, subsequent_indent="    ", break_on_hyphens=False)
@@ -87,11 +81,13 @@ def _comment(metadata: Mapping[str, str]) -> list[str]:
 
 
 def _number(value: Any) -> str:
-    return f"{np.float32(value)!s}f"  # the fewest digits that tell it from any other float32
+    """Return the fewest digits that tell a float32 from any other."""
+    return f"{np.float32(value)!s}f"
 
 
 def _table(name: str, values: Float32Array) -> str:
     size = "".join(f"[{length}]" for length in values.shape)
+    # NumPy's brackets become C's braces.
     with np.printoptions(threshold=values.size, linewidth=WIDTH, formatter={"float_kind": _number}):
         rows = np.array2string(values, separator=", ").translate(str.maketrans("[]", "{}"))
     return f"{name}{size} =\n{rows}"

@@ -9,12 +9,18 @@ import numpy.typing as npt
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
-from sb3_quad.base.errors import ExportError
+from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.frames import ObservationSettings
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.observation import (
+    DEFAULT_MEAN,
+    DEFAULT_STD,
+    FEATURES,
+    GROUPS,
+    OBSERVATION_SIZE,
+)
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import Task
@@ -22,23 +28,21 @@ from sb3_quad.vehicles.layout import Turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
-SHORT, LONG = (
-    2,
-    1000,
-)  # control steps of the flights of a policy of the present features, and of one with a state
-# Of the range between least and greatest output: far above rounding, far below any mistake
+# Control steps of a flight: of a policy that sees the present features only, of one with a state.
+SHORT, LONG = 2, 1000
+# Of the range between least and greatest output: far above rounding, far below any mistake.
 TOLERANCE = 1e-4
-_WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "body_rates_std": 8.0}
-_NEAR = Task(
-    name="near", target_distance=1.0, nearest_target=0.0
-)  # where a position integral is at work at once
-_ROUNDING = 2e-6  # relative, of what decides whether the position integral is at work
+WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "body_rates_std": 8.0}
+# Here the position integral is at work from the first step on.
+NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
+ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
+PER_ROTOR = ("0", "1", "2", "3")  # the parts of a feature that has one number for each rotor
 
 
 class Reference(NamedTuple):
-    """A trained policy in its own environment: what an exported file must agree with.
+    """A trained policy in its own environment: an exported file must agree with it.
 
-    :param mean: μ of Eq. 3.16, (18,), as in training; ``std`` σ, likewise.
+    :param mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise.
     :param vehicle: in the layout that the policy knows.
     :param output: ``thrusts`` (N) or ``speeds`` (rad/s).
     :param observation: the frames that the policy sees.
@@ -55,52 +59,70 @@ class Reference(NamedTuple):
 
     @property
     def turned_features(self) -> FloatArray:
-        """(18, 18), from features in the vehicle's own body frame to those that the policy knows."""
-        matrix, axes = np.eye(OBSERVATION_SIZE), self.turn.axes
-        for group, block in (
-            ("rotation", np.kron(axes, np.eye(3))),
-            ("velocity", axes),
-            ("body_rates", axes),
-        ):
-            matrix[GROUPS[group], GROUPS[group]] = block
+        """(OBSERVATION_SIZE, OBSERVATION_SIZE), from features in the vehicle's own body frame to
+        those that the policy knows.
+
+        :raises ConfigError: the layouts differ, and nobody knows how a feature turns with them.
+        """
+        matrix = np.eye(OBSERVATION_SIZE)
+        if self.turn == Turn():
+            return matrix
+        axes = self.turn.axes
+        blocks = {
+            "position": np.eye(3),  # in the world frame
+            "rotation": np.kron(axes, np.eye(3)),
+            "velocity": axes,
+            "body_rates": axes,
+        }
+        # Every feature needs a rule: a missing one must not turn into a wrong file.
+        for feature in FEATURES:
+            block = blocks.get(feature.name)
+            if block is None and feature.parts == PER_ROTOR:
+                block = np.eye(4)[[*self.turn.order]]
+            if block is None:
+                raise ConfigError(
+                    f"the feature {feature.name} has no rule for other rotor layouts; "
+                    "export for a vehicle in the layout of the training"
+                )
+            matrix[GROUPS[feature.name], GROUPS[feature.name]] = block
         return matrix
 
     @property
     def own_mean(self) -> FloatArray:
-        """μ in the vehicle's own body frame, (18,)."""
+        """μ in the vehicle's own body frame, (OBSERVATION_SIZE,)."""
         return self.mean @ self.turned_features
 
     def results(self, actions: npt.ArrayLike) -> FloatArray:
-        """Rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape; in
-        float64.
+        """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape,
+        in float64.
         """
         thrusts = self.vehicle.action_to_thrust(np.asarray(actions, dtype=np.float64))
-        return (
-            thrusts
-            if self.output == "thrusts"
-            else np.sqrt(thrusts / self.vehicle.thrust_coefficient)
-        )
+        if self.output == "thrusts":
+            return thrusts
+        return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
 
 
 class Comparison(Hook):
-    """Asks a file at each control step of the policy's flights; it keeps its own state from a
+    """Runs a file at each control step of the policy's flights. It keeps the file's state from a
     flight's start to its end.
 
     :ivar error: the largest difference of any rotor so far, N or rad/s.
-    :ivar count: how many observations the file has been asked about.
+    :ivar count: how many observations the file has seen.
     """
 
     def __init__(self, reference: Reference, call: Call) -> None:
-        self._reference, self._call, seen = reference, call, reference.observation
-        integral = seen.position_integral
-        self._limits = (
-            {"position": integral.distance, "velocity": integral.speed} if integral else {}
-        )
-        self._state, self._sure, self.count, self.error = None, np.True_, 0, 0.0
-        self._turned, self._order = (
-            reference.turned_features.astype(np.float32),
-            [*reference.turn.order],
-        )
+        self._reference = reference
+        self._call = call
+        self._turned = reference.turned_features.astype(np.float32)
+        self._order = [*reference.turn.order]
+        integral = reference.observation.position_integral
+        self._limits = {}
+        if integral is not None:
+            self._limits = {"position": integral.distance, "velocity": integral.speed}
+        self._state = None
+        self._sure = np.True_
+        self.count = 0
+        self.error = 0.0
 
     def before_step(
         self,
@@ -109,19 +131,17 @@ class Comparison(Hook):
         wrench: FloatArray,
         flying: BoolArray,
     ) -> None:
-        if self._reference.observation.is_extended:
-            features = physical_features(state)
-        else:
-            features = (observation * self._reference.std + self._reference.mean).astype(np.float32)
-        for (
-            group,
-            limit,
-        ) in (
-            self._limits.items()
-        ):  # so close to one, rounding may begin to integrate a step later, or earlier
-            self._sure = self._sure & (
-                np.abs(np.linalg.norm(features[:, GROUPS[group]], axis=1) / limit - 1.0) > _ROUNDING
-            )
+        # The present frame comes first in an observation. Unscaled, it is the file's input.
+        scaled = observation[:, :OBSERVATION_SIZE]
+        features = (scaled * self._reference.std + self._reference.mean).astype(np.float32)
+        if self._limits:
+            # The position integral is a part of the observed position, and the file has its own.
+            features[:, GROUPS["position"]] = state.position - state.target
+        # So close to a limit, rounding may begin to integrate one step earlier or later.
+        for group, limit in self._limits.items():
+            norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
+            self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
+        # The file flies the vehicle in its own axes and order of rotors.
         results, self._state = self._call(features @ self._turned, self._state)
         self._results = results[:, self._order]
         self._compared = flying & self._sure
@@ -135,48 +155,40 @@ class Comparison(Hook):
 
 
 def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) -> Comparison:
-    """Compare a file with the policy that it came from, in its flights.
+    """Compare a file with the policy that it came from, in the policy's flights.
 
-    They start at any attitude, up to 30 m from the target, with velocities of N(0, 4 m/s) and body
-    rates of N(0, 8 rad/s) per axis, twice what an episode starts with. A policy of the present
-    features flies two steps each time, so that half of the observations are such starts, and both
-    see noise. The flights of one with a state are longer, without noise, and half of them start
-    within 1 m.
+    The flights start at any attitude, up to 30 m from the target, with velocities of N(0, 4 m/s)
+    and body rates of N(0, 8 rad/s) per axis, twice what an episode starts with. A policy of the
+    present features flies two steps each time, so that half of the observations are such starts,
+    and both see noise. The flights of a policy with a state are longer, without noise, and half of
+    them start within 1 m.
 
-    :param by: what runs the file.
+    :param by: the program that runs the file, for the message.
     :param n: observations, at most: a flight may end early.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
     """
-    has_state = reference.observation.is_extended
-    steps = LONG if has_state else SHORT
-    task: dict[str, Any] = {"task": "recovery_and_tracking", "task_kwargs": _WIDE}
-    seen = {
-        "observation_mean": reference.mean,
-        "observation_std": reference.std,
-        **dict(reference.observation),
-    }
+    # Far and fast starts, or long flights for a policy with a state.
+    changes: dict[str, Any] = {"task": "recovery_and_tracking", "task_kwargs": WIDE, "noise": 0.05}
+    steps = SHORT
+    if reference.observation.is_extended:
+        changes = {"task": {"recovery_and_tracking": 1.0, NEAR: 1.0}, "noise": 0.0}
+        steps = LONG
     settings = FlightSettings().with_changes(
-        **({"task": {"recovery_and_tracking": 1.0, _NEAR: 1.0}} if has_state else task),
-        **seen,
+        **changes,
+        **dict(reference.observation),
+        observation_mean=reference.mean,
+        observation_std=reference.std,
         vehicle=reference.vehicle,
-        noise=0.0 if has_state else 0.05,
         max_episode_steps=steps,
     )
     comparison = Comparison(reference, call)
     fly_settings(reference.model, settings, row_seeds(0, max(n // steps, 1)), hooks=[comparison])
     allowed = TOLERANCE * float(np.ptp(reference.results([-1.0, 1.0])))
-    if not comparison.error <= allowed:  # also where it is NaN
-        difference = f"differs from the trained one by {comparison.error:.3g}, {allowed:.3g} is allowed ({by})"
-        raise ExportError(f"the exported policy {difference}; nothing was written")
+    # Negated, so that NaN fails as well.
+    if not comparison.error <= allowed:
+        raise ExportError(
+            f"the exported policy differs from the trained one by {comparison.error:.3g}, "
+            f"{allowed:.3g} is allowed ({by}); nothing was written"
+        )
     return comparison
-
-
-def physical_features(state: QuadcopterState) -> Float32Array:
-    """The features of the true state, (n, 18), as :data:`~sb3_quad.simulation.observation.FEATURES`
-    lists them.
-    """
-    to_body = state.rotation.transpose(0, 2, 1)
-    velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
-    parts = (state.position - state.target, to_body.reshape(-1, 9), velocity, state.body_rates)
-    return np.concatenate(parts, axis=1).astype(np.float32)

@@ -1,6 +1,4 @@
-"""An exported file as its users run it: loaded by torch, by onnxruntime, or compiled; and the time
-of a call.
-"""
+"""Exported files as their users run them: loaded by torch, by onnxruntime, or compiled."""
 
 import ctypes
 import io
@@ -22,15 +20,17 @@ from sb3_quad.base.imports import require
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 N_ROTORS = 4
+COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 Call = Callable[..., tuple[Float32Array, Any]]
-"""From observations in physical units, (n, 18), and states to results, (n, 4), and the next states;
-None: flights begin.
+"""From observations in physical units, (n, OBSERVATION_SIZE), and states to results, (n, 4), and
+the next states. The state None begins flights.
 """
 
 
 def load_torchscript(content: bytes) -> tuple[Call, str]:
-    """The file as torch loads it on the CPU; and torch's version."""
+    """Load the file by torch on the CPU. Return its call and torch's version."""
+    # torch fills in the files that it is asked for.
     extra = {"metadata.json": ""}
     module = th.jit.load(io.BytesIO(content), "cpu", extra)  # type: ignore[no-untyped-call]
     size = int(json.loads(extra["metadata.json"]).get("state_size", 0))
@@ -38,13 +38,15 @@ def load_torchscript(content: bytes) -> tuple[Call, str]:
     @th.no_grad()
     def run(*inputs: Float32Array) -> Sequence[Float32Array]:
         outputs = module(*map(th.from_numpy, inputs))
-        return [output.numpy() for output in (outputs if size else [outputs])]
+        if not size:
+            return [outputs.numpy()]
+        return [output.numpy() for output in outputs]
 
     return _call(run, size), f"torch {th.__version__}"
 
 
 def load_onnx(content: bytes) -> tuple[Call, str]:
-    """As :func:`load_torchscript`, by onnxruntime on one thread of the CPU.
+    """Load the file by onnxruntime on one thread of the CPU, see :func:`load_torchscript`.
 
     :raises ConfigError: it is not installed.
     """
@@ -52,12 +54,15 @@ def load_onnx(content: bytes) -> tuple[Call, str]:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
     session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    names, state = [port.name for port in session.get_inputs()], session.get_inputs()[1:]
+    # The second input is the state, if there is one.
+    ports = session.get_inputs()
+    size = ports[1].shape[1] if len(ports) > 1 else 0
 
     def run(*inputs: Float32Array) -> Any:
-        return session.run(None, dict(zip(names, inputs, strict=True)))
+        named = zip(ports, inputs, strict=True)
+        return session.run(None, {port.name: rows for port, rows in named})
 
-    return _call(run, state[0].shape[1] if state else 0), f"onnxruntime {runtime.__version__}"
+    return _call(run, size), f"onnxruntime {runtime.__version__}"
 
 
 def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
@@ -66,66 +71,71 @@ def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
     def call(rows: Float32Array, state: Float32Array | None = None) -> tuple[Float32Array, Any]:
         if not size:
             return run(rows)[0], None
-        results, following = run(
-            rows, np.zeros((len(rows), size), dtype=np.float32) if state is None else state
-        )
+        # Zeros begin a flight.
+        if state is None:
+            state = np.zeros((len(rows), size), dtype=np.float32)
+        results, following = run(rows, state)
         return results, following
 
     return call
 
 
 def load_header(content: bytes, name: str) -> tuple[Call, str]:
-    """As :func:`load_torchscript`, of a C header by the machine's compiler.
+    """Load a C header by the machine's compiler, see :func:`load_torchscript`.
 
     :param name: the beginning of the header's identifiers.
     :raises ConfigError: there is no compiler.
     :raises ExportError: the header does not compile without warnings.
     """
-    compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    compiler = next(filter(shutil.which, COMPILERS), None)
     if compiler is None:
         raise ConfigError(
-            "--format c needs a C compiler, to check what it writes: install gcc or clang (apt install gcc)"
+            "--format c needs a C compiler, to check what it writes: "
+            "install gcc or clang (apt install gcc)"
         )
-    has_state = f"}} {name}_state;".encode() in content
-    instead = (
-        ""
-        if has_state
-        else f"typedef char {name}_state;\n#define {name}_reset(state) (*(state) = 0)\n"
-    )
+    # The program below also flies a policy without a state, by a state that it does not use.
+    declarations = f"typedef char {name}_state;\n#define {name}_reset(state) (*(state) = 0)\n"
+    argument = ""
+    if f"}} {name}_state;".encode() in content:
+        declarations = ""
+        argument = "&states[k], "
     program = f"""\
 #include "policy.h"
-{instead}int size(void) {{ return (int)sizeof({name}_state); }}
+{declarations}int size(void) {{ return (int)sizeof({name}_state); }}
 void run(const float *in, float *out, {name}_state *states, int begin, long n)
 {{
     for (long k = 0; k < n; ++k) {{
         if (begin) {name}_reset(&states[k]);
-        {name}_policy({"&states[k], " * has_state}in + {OBSERVATION_SIZE} * k, out + {N_ROTORS} * k);
+        {name}_policy({argument}in + {OBSERVATION_SIZE} * k, out + {N_ROTORS} * k);
     }}
 }}
 """
+    library = _compile(compiler, content, program)
+
+    def call(rows: Float32Array, state: Any = None) -> tuple[Float32Array, Any]:
+        begins = state is None
+        if begins:
+            # A new struct holds anything before its reset.
+            state = np.full((len(rows), library.size()), 0xFF, dtype=np.uint8)
+        results = np.empty((len(rows), N_ROTORS), dtype=np.float32)
+        arrays = map(np.ctypeslib.as_ctypes, (rows, results, state))
+        library.run(*arrays, begins, ctypes.c_long(len(rows)))
+        return results, state
+
+    return call, f"{compiler} {' '.join(FLAGS)}"
+
+
+def _compile(compiler: str, header: bytes, program: str) -> ctypes.CDLL:
+    """Compile and load a program that includes the header as ``policy.h``."""
     with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
-        (Path(folder) / "policy.h").write_bytes(content)
-        (Path(folder) / "run.c").write_text(program, encoding="ascii")
+        Path(folder, "policy.h").write_bytes(header)
+        Path(folder, "run.c").write_text(program, encoding="ascii")
         command = (compiler, *FLAGS, "-shared", "-fPIC", "-o", "run.so", "run.c", "-lm")
         try:
             subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-            library = ctypes.CDLL(str(Path(folder) / "run.so"))
+            return ctypes.CDLL(str(Path(folder, "run.so")))
         except subprocess.CalledProcessError as error:
-            said = " ".join(error.stderr.split())[:200]
-            raise ExportError(
-                f"the C header cannot be checked: {compiler} failed ({said})"
-            ) from None
+            reason = f"{compiler} failed ({' '.join(error.stderr.split())[:200]})"
         except OSError as error:
-            raise ExportError(f"the C header cannot be checked: {one_line(error)}") from None
-
-    def call(rows: Float32Array, state: Any = None) -> tuple[Float32Array, Any]:
-        # A new struct holds anything before its reset.
-        states = (
-            np.full((len(rows), library.size()), 0xFF, dtype=np.uint8) if state is None else state
-        )
-        results = np.empty((len(rows), N_ROTORS), dtype=np.float32)
-        arrays = map(np.ctypeslib.as_ctypes, (rows, results, states))
-        library.run(*arrays, state is None, ctypes.c_long(len(rows)))
-        return results, states
-
-    return call, f"{Path(compiler).name} {' '.join(FLAGS)}"
+            reason = one_line(error)
+    raise ExportError(f"the C header cannot be checked: {reason}")

@@ -3,10 +3,11 @@
 import hashlib
 import re
 import warnings
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, unknown
@@ -17,9 +18,17 @@ from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import FEATURES, GROUPS, OBSERVATION_SIZE
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
+# The groups of an observation whose names do not say enough.
+GROUPS_IN_WORDS = {
+    "position": "position minus target position, world frame",
+    "rotation": "rotation matrix world to body (v_body = R v_world), row by row",
+    "velocity": "linear velocity, body frame",
+    "body_rates": "body rates, body frame",
+}
 
 
 class Export(NamedTuple):
@@ -40,13 +49,13 @@ def export_policy(
     name: str | None = None,
     n_observations: int = N_OBSERVATIONS,
 ) -> Export:
-    """The policy of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC; ``MlpPolicy``) as a file
-    that flies by itself.
+    """Make a file that flies by itself of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC;
+    ``MlpPolicy``).
 
-    It takes the 18 features of an observation in physical units, see ``metadata["observation"]``.
-    It gives the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
+    It takes the features of an observation in physical units, see ``metadata["observation"]``. It
+    gives the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
     Earlier frames that the policy sees are in a state, ``metadata["state"]``. A vehicle that is not
-    given, and the scaling, are those that :func:`agent_settings` finds in or beside the zip, or
+    given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it, or
     else ``itm`` and Table A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
@@ -55,17 +64,19 @@ def export_policy(
     :param name: the C function is called ``NAME_policy``; None: as the zip.
     :param n_observations: of the check, at most, see :func:`~sb3_quad.export.check.compare`.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are
-        not the quadcopter's or whose policy is no ``MlpPolicy``; one that flies any vehicle, and
-        none is given; a vehicle whose rotors cannot be brought to where the policy knows them; a
-        package or a C compiler that is not installed.
+        not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle,
+        and none is given; a vehicle whose rotors cannot be brought to where the policy knows them;
+        a package or a C compiler that is not installed.
     :raises ExportError: the file computes something else than the policy, or does not compile.
     """
     prefix = c_name(Path(path).stem) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix):
         raise ConfigError(
-            f"--name {name!r}: must be a C identifier: letters, digits and underscores, a letter first"
+            f"--name {name!r}: must be a C identifier: "
+            "letters, digits and underscores, a letter first"
         )
-    formats: dict[str, tuple[Callable[..., bytes], Callable[..., tuple[load.Call, str]]]] = {
+    # Each format has a writer, and a reader for the check.
+    formats: dict[str, tuple[Any, Any]] = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
         "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
@@ -73,24 +84,29 @@ def export_policy(
     if file_format not in formats:
         raise ConfigError(unknown("format", file_format, formats))
     write, read = formats[file_format]
-    algorithm, model, (settings, source) = (
-        saved_algorithm(path),
-        load_model(path),
-        agent_settings(path),
-    )
+    # The zip says how its agent flies, unless another vehicle is given.
+    algorithm = saved_algorithm(path)
+    model = load_model(path)
+    settings, source = agent_settings(path)
     layout = settings.layout
-    settings = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
+    if vehicle is not None:
+        settings = settings.with_changes(vehicle=vehicle)
     if settings.vehicles is not None:
         raise ConfigError(
-            f"model {path}: flies any vehicle; say with --vehicle which one's thrusts the file is to give"
+            f"model {path}: flies any vehicle; "
+            "say with --vehicle which one's thrusts the file is to give"
         )
     flown = first_vehicle(settings.vehicle)
-    row = QuadcopterBatch(
-        1, settings.with_changes(vehicle=flown, rotor_layout=layout), n_threads=1
-    )  # it checks them
-    known, turn = row.vehicle_list[0], flown.turn_to(layout)
+    # A batch of one row checks the settings and resolves vehicle and scaling.
+    row = QuadcopterBatch(1, settings.with_changes(vehicle=flown, rotor_layout=layout), n_threads=1)
     reference = Reference(
-        model, known, row.mean[:, 0], row.std[:, 0], output, row.observation, turn
+        model=model,
+        vehicle=row.vehicle_list[0],
+        mean=row.mean[:, 0],
+        std=row.std[:, 0],
+        output=output,
+        observation=row.observation,
+        turn=flown.turn_to(layout),
     )
     network = build_network(reference, f"model {path}")
     metadata = _describe(Path(path), algorithm, network, reference, flown)
@@ -98,10 +114,13 @@ def export_policy(
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
+        # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata))
         checked = compare(reference, call, by, n_observations)
-        found = f"largest error {checked.error:.2g} {network.unit} in {checked.count} observations of flights"
-        metadata["check"] = f"{found} ({by})"
+        metadata["check"] = (
+            f"largest error {checked.error:.2g} {network.unit} "
+            f"in {checked.count} observations of flights ({by})"
+        )
         content = write(network, metadata)
     return Export(content, metadata, checked.error, network.unit, source)
 
@@ -109,33 +128,56 @@ def export_policy(
 def _describe(
     path: Path, algorithm: str, network: Network, reference: Reference, vehicle: Vehicle
 ) -> dict[str, str]:
-    """What users of the file must know; ASCII but for names."""
+    """Return what users of the file must know; ASCII but for names."""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    # The limits of the results are those of the extreme actions.
     low, high = reference.results([-1.0, 1.0])
-    rotors = enumerate(zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True))
-    sizes = [network.steps[0][0].in_features, *(layer.out_features for layer, _ in network.steps)]
-    hidden = ", ".join(activation for _, activation in network.steps[:-1]) or "none"
-    mean, std = (
-        ", ".join(f"{value:.6g}" for value in values)
-        for values in (reference.own_mean, reference.std)
-    )
-    n_parameters = sum(parameter.numel() for parameter in network.parameters())
+    places = zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True)
+    shapes = network.shapes
+    sizes = [shapes[0]["inputs"], *(shape["outputs"] for shape in shapes)]
+    hidden = ", ".join(shape["activation"] for shape in shapes[:-1]) or "none"
+    n_parameters = parameters_to_vector(network.parameters()).numel()
     return {
-        "policy": f"{path.name} ({algorithm}), sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}",
+        "policy": f"{path.name} ({algorithm}), sha256 {digest}",
         "made_by": f"sb3_quad {__version__}",
-        "vehicle": f"{vehicle.name}: hover thrust {vehicle.hover_thrust:.6g} N, kF {vehicle.thrust_coefficient:.6g} N s^2",
+        "vehicle": (
+            f"{vehicle.name}: hover thrust {vehicle.hover_thrust:.6g} N, "
+            f"kF {vehicle.thrust_coefficient:.6g} N s^2"
+        ),
         "frames": "world: z up; body: x forward, y left, z up",
-        "observation": "18 numbers, not scaled: 0-2 position minus target position, world frame, m; "
-        "3-11 rotation matrix world to body (v_body = R v_world), row by row; "
-        "12-14 linear velocity, body frame, m/s; 15-17 body rates, body frame, rad/s",
+        "observation": f"{OBSERVATION_SIZE} numbers, not scaled: {'; '.join(_features())}",
         **network.facts,
-        "result": f"4 numbers: the {network.output.removesuffix('s')} to command of each rotor, {network.unit}, "
-        f"within {low:.6g} to {high:.6g}",
+        "result": (
+            f"4 numbers: the {network.output.removesuffix('s')} to command of each rotor, "
+            f"{network.unit}, within {low:.6g} to {high:.6g}"
+        ),
         "rotors": "; ".join(
-            f"{k} at x {x:.4g} m, y {y:.4g} m, yaw moment {sign:+d}"[:-1]
-            for k, ((x, y), sign) in rotors
+            f"{number} at x {x:.4g} m, y {y:.4g} m, yaw moment {'+' if sign > 0 else '-'}"
+            for number, ((x, y), sign) in enumerate(places)
         ),
         "period": f"{vehicle.control_step:g} s between calls, as in training",
-        "scaling": f"done inside, (x - mean) / std with mean {mean} and std {std}",
-        "network": f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, {n_parameters} float32 parameters",
+        "scaling": (
+            f"done inside, (x - mean) / std with mean {_numbers(reference.own_mean)} "
+            f"and std {_numbers(reference.std)}"
+        ),
+        "network": (
+            f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, "
+            f"{n_parameters} float32 parameters"
+        ),
         "check": "pending",
     }
+
+
+def _features() -> list[str]:
+    """Return each group of features with its places in an observation and its unit."""
+    lines = []
+    for feature in FEATURES:
+        rows = GROUPS[feature.name]
+        text = GROUPS_IN_WORDS.get(feature.name, feature.name)
+        unit = "" if feature.unit == "-" else f", {feature.unit}"
+        lines.append(f"{rows.start}-{rows.stop - 1} {text}{unit}")
+    return lines
+
+
+def _numbers(values: Any) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)

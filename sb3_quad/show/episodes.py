@@ -1,6 +1,4 @@
-"""What is flown to be shown, by whom, and how it is recorded: the same episodes for all
-controllers, on PyBullet.
-"""
+"""Recorded flights to be shown: the same episodes for all controllers, on PyBullet."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +20,8 @@ from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
+WRENCH_SECONDS = 0.4  # a wrench is shown for that long, so that a short blow can be seen
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -40,15 +40,14 @@ class Recording:
 
     @cached_property
     def rotor_angles(self) -> FloatArray:
-        """How far the drawn rotors have turned, (T + 1, 4), rad."""
-        return (
-            np.cumsum(rotor_turning(self.vehicle, self.state.rotor_speeds), axis=0)
-            * self.vehicle.control_step
-        )
+        """Angles by which the drawn rotors have turned, (T + 1, 4), rad."""
+        rates = rotor_turning(self.vehicle, self.state.rotor_speeds)
+        return np.cumsum(rates, axis=0) * self.vehicle.control_step
 
     @property
     def targets(self) -> FloatArray:
         """The targets flown to, one after the other, (k, 3), world frame, m."""
+        # The first target counts as a change, from NaN.
         changed = np.diff(self.state.target, axis=0, prepend=np.nan).any(axis=1)
         return self.state.target[changed]
 
@@ -58,8 +57,9 @@ class Recording:
         return np.concatenate([self.state.position[::5], self.targets])
 
     @property
-    def pushes(self) -> list[int]:
+    def disturbances(self) -> list[int]:
         """The steps after which a wrench has begun to act."""
+        # A wrench begins to act where it acts in a step and not in the one before.
         acts = np.asarray(self.wrench.any(axis=1))
         return (np.flatnonzero(acts[1:] & ~acts[:-1]) + 1).tolist()
 
@@ -68,32 +68,29 @@ class Recording:
         return max(0, int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1)
 
     def vehicle_and_target(self, step: int) -> FloatArray:
-        """Where both are, (2, 3), world frame, m."""
+        """The positions of both, (2, 3), world frame, m."""
         return np.stack([self.state.position[step], self.state.target[step]])
 
-    def wrench_around(self, step: int, seconds: float = 0.4) -> FloatArray:
-        """The largest force and torque, (12,), of the last while before ``step``: a short blow
-        stays to be seen.
-        """
-        recent = self.wrench[max(0, step - round(seconds / self.vehicle.control_step)) : step + 1]
+    def wrench_around(self, step: int, seconds: float = WRENCH_SECONDS) -> FloatArray:
+        """The largest force and torque, (12,), of the last ``seconds`` before ``step``."""
+        first = max(0, step - round(seconds / self.vehicle.control_step))
+        recent = self.wrench[first : step + 1]
         return np.asarray(recent[np.linalg.norm(recent, axis=1).argmax()])
 
-    def pose(self, step: int, seconds: float = 0.4) -> Pose:
+    def pose(self, step: int, seconds: float = WRENCH_SECONDS) -> Pose:
         """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
-        return Pose(
-            self.state.array[:, step], self.wrench_around(step, seconds), self.rotor_angles[step]
-        )
+        wrench = self.wrench_around(step, seconds)
+        return Pose(self.state.array[:, step], wrench, self.rotor_angles[step])
 
 
 class Setting(NamedTuple):
-    """What all controllers fly."""
+    """The episodes that all controllers fly."""
 
     vehicle: Any  # that experts are made for; in a scenario another one may fly
-    settings: FlightSettings  # how all episodes are flown
-    plan: Callable[[int], Plan]  # what happens in an episode, by its seed
-    own: Mapping[
-        str, Mapping[str, Any]
-    ] = {}  # changes to the settings that go with a controller, by its label
+    settings: FlightSettings  # of all episodes
+    plan: Callable[[int], Plan]  # the events of an episode, by its seed
+    # Changes to the settings that go with a controller, by its label.
+    own: Mapping[str, Mapping[str, Any]] = {}
 
 
 def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = None) -> Setting:
@@ -102,7 +99,8 @@ def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = Non
     :param target: of all of them, r_T, (3,), m; None: each episode's own.
     :raises ConfigError: an unknown vehicle, a target below ground.
     """
-    start, least = {}, first_vehicle(settings.vehicle).collision_radius
+    start = {}
+    least = first_vehicle(settings.vehicle).collision_radius
     if target is not None:
         start["target"] = per_row("--target", target, 1, 3).T
         if target[2] <= least:
@@ -135,7 +133,7 @@ def fly_all(
     deterministic: bool = True,
     n_envs: int = 1,
 ) -> Iterator[list[Recording]]:
-    """Episodes one after the other, each flown by all controllers.
+    """Fly episodes one after the other, each by all controllers.
 
     :param controllers: by label; each as of :func:`~sb3_quad.evaluation.flights.fly`.
     :param seed: of the first episode; the next has the next one.
@@ -146,27 +144,31 @@ def fly_all(
     :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
+    # Without n_timesteps one whole episode is flown.
     longest = setting.settings.longest_episode
     left = longest if n_timesteps is None else n_timesteps
     while left > 0:
         settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
-        together: list[Recording] = []
+        episode: list[Recording] = []
+        # All controllers fly the same seeds, each with the observations that it was trained on.
         for name, controller in controllers.items():
-            for each in range(seed, seed + n_envs):
-                label, colour = (
-                    name if n_envs == 1 else f"seed {each}, {name}",
-                    COLOURS[len(together) % len(COLOURS)],
-                )
+            own = settings.with_changes(**setting.own.get(name, {}))
+            for episode_seed in range(seed, seed + n_envs):
+                label = name if n_envs == 1 else f"seed {episode_seed}, {name}"
+                colour = COLOURS[len(episode) % len(COLOURS)]
+                plan = setting.plan(episode_seed)
                 try:
-                    its = settings.with_changes(**setting.own.get(name, {}))
-                    flown = controller, its, setting.plan(each), each, deterministic
-                    together.append(_record(label, colour, *flown))
+                    recording = _record(
+                        label, colour, controller, own, plan, episode_seed, deterministic
+                    )
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
-        yield together
+                episode.append(recording)
+        yield episode
         if n_timesteps is None:
             return
-        left -= max(len(recording.times) - 1 for recording in together)
+        # The longest flight counts, since the others wait for it.
+        left -= max(len(recording.times) - 1 for recording in episode)
         seed += n_envs
 
 
@@ -179,30 +181,32 @@ def _record(
     seed: int,
     deterministic: bool,
 ) -> Recording:
-    every = _EveryStep()
-    flights = fly_settings(
-        controller, settings, [seed], "pybullet", (), [every], plan, deterministic
-    )
+    log = _Log()
+    flights = fly_settings(controller, settings, [seed], "pybullet", (), [log], plan, deterministic)
+    lost = ""
+    if flights.collision[0]:
+        lost = "collision"
+    elif not flights.survival[0]:
+        lost = "out of range"
     return Recording(
         name=name,
         colour=colour,
-        vehicle=every.vehicle,
-        times=np.arange(len(every.states), dtype=np.float64) * every.vehicle.control_step,
-        state=QuadcopterState.concatenate(every.states),
-        wrench=np.stack([np.zeros(WRENCH_SIZE), *every.wrenches]),
+        vehicle=log.vehicle,
+        times=np.arange(len(log.states), dtype=np.float64) * log.vehicle.control_step,
+        state=QuadcopterState.concatenate(log.states),
+        wrench=np.stack(log.wrenches),
         reward=float(flights.reward[0]),
-        lost="" if flights.survival[0] else "collision" if flights.collision[0] else "out of range",
+        lost=lost,
     )
 
 
-class _EveryStep(Hook):
-    """Keeps the state after every control step of a flight, and before the first, and the wrench in
-    each.
-    """
+class _Log(Hook):
+    """The state before a flight and after every control step, and the wrench in each."""
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        self.vehicle, self.states = vehicle, [state.copy()]
-        self.wrenches: list[FloatArray] = []
+        self.vehicle = vehicle
+        self.states = [state.copy()]
+        self.wrenches = [np.zeros(WRENCH_SIZE)]
 
     def before_step(
         self,

@@ -27,20 +27,19 @@ from sb3_quad.show.labels import side_by_side, with_header
 
 FPS = 25
 HOLD = 1.0  # the last picture stays for that long, s
-MARGIN, AHEAD = (
-    0.9,
-    2.5,
-)  # around the vehicle, and how much of the way to its target is seen, m; for the default vehicle
+# Of the default vehicle, m: the margin around the vehicle, and how much of the way to its target a
+# camera shows.
+MARGIN = 0.9
+AHEAD = 2.5
 PANELS_ABREAST = 3
-# S of flight after which a camera has followed to 1/e of a jump, as of a target that is replaced
-LAG = 0.044
+LAG = 0.044  # s of flight after which a camera has followed to 1/e of a jump, as of a new target
 WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
 MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
 FORMATS = (".mp4", ".webp", ".gif")
 
 
 def check_film(path: Path) -> Any:
-    """See whether a film can be written, before anything is flown; the package that writes it.
+    """Return the package that writes a film, before anything is flown.
 
     :raises ConfigError: the suffix is not one of FORMATS, or the packages that write videos are
         missing.
@@ -54,15 +53,17 @@ def check_film(path: Path) -> Any:
 
 
 def write_film(path: Path, frames: Iterable[Image]) -> None:
-    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves what
-    was there before.
+    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves an
+    earlier film as it is.
 
     :raises ConfigError: a folder that cannot be written, a full disk, missing packages.
     """
     imageio = check_film(path)
     suffix = path.suffix.lower()
-    options = {"fps": FPS, **MP4} if suffix == ".mp4" else {"duration": 1000 / FPS, "loop": 0}
-    # Not beside the file: when it is interrupted, the encoder may still be writing for a moment.
+    options: dict[str, Any] = {"duration": 1000 / FPS, "loop": 0}
+    if suffix == ".mp4":
+        options = {"fps": FPS, **MP4}
+    # In another folder: after an interruption, the encoder may still write for a moment.
     with tempfile.TemporaryDirectory(prefix="sb3_quad_", ignore_cleanup_errors=True) as folder:
         draft = Path(folder, f"film{suffix}")
         try:
@@ -78,7 +79,8 @@ def write_film(path: Path, frames: Iterable[Image]) -> None:
 def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
     """The times of flight, s, that the frames of a film of several flights show."""
     last = max(float(recording.times[-1]) for recording in recordings)
-    return np.minimum(np.arange(round((last / speed + HOLD) * FPS) + 1) * speed / FPS, last)
+    n_frames = round((last / speed + HOLD) * FPS) + 1
+    return np.minimum(np.arange(n_frames) * speed / FPS, last)
 
 
 def film_frames(
@@ -91,8 +93,11 @@ def film_frames(
     :param speed: of time in the film; 0.5 is slow motion.
     """
     times = frame_times(recordings, speed)
+    # One direction for all panels, so that their flights can be compared.
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-    panels = [_panel(recording, times, forward, Lens(width, height)) for recording in recordings]
+    lens = Lens(width, height)
+    panels = [_panel(recording, times, forward, lens) for recording in recordings]
+    # Frame by frame, because a film does not fit into memory.
     for pictures in zip(*panels, strict=True):
         yield side_by_side(pictures, PANELS_ABREAST)
 
@@ -104,53 +109,60 @@ def following_cameras(
     forward: FloatArray,
     lens: Lens,
 ) -> Iterator[Camera]:
-    """For each time (s) a camera that has all vehicles in its picture, and their targets when these
-    are near.
+    """Yield a camera for each time (s) that has all vehicles in its picture, and their targets when
+    these are near.
 
     :param scale: the vehicles' size, in that of the default one.
-    :param forward: where the cameras look, a unit vector, (3,), not vertical.
+    :param forward: the direction in which the cameras look, a unit vector, (3,), not vertical.
     """
-    share, eye = 1.0 - math.exp(-(times[1] - times[0]) / LAG), None
+    # The share of a jump that the camera follows from one frame to the next.
+    share = 1.0 - math.exp(-(times[1] - times[0]) / LAG)
+    eye = None
     for seconds in times:
-        seen = []
+        points = []
+        # The vehicles, and their targets, or at most AHEAD of the way there.
         for recording in recordings:
             vehicle, target = recording.vehicle_and_target(recording.at(seconds))
             way = target - vehicle
-            seen += [
-                vehicle,
-                vehicle + way * min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9)),
-            ]
-        camera = framing_camera(np.stack(seen), MARGIN * scale, forward, lens)
-        eye = camera.eye if eye is None else eye + share * (camera.eye - eye)
-        yield camera._replace(eye=eye)
+            seen = min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9))
+            points += [vehicle, vehicle + seen * way]
+        camera = framing_camera(np.stack(points), MARGIN * scale, forward, lens)
+        if eye is not None:
+            # The camera follows with a lag, so that a jump of the target is no jump of the picture.
+            camera = camera._replace(eye=eye + share * (camera.eye - eye))
+        eye = camera.eye
+        yield camera
 
 
 def _panel(
     recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens
 ) -> Iterator[Image]:
     """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
-    path, font_size = recording.state.position, max(12, round(lens.height / 26))
+    font_size = max(12, round(lens.height / 26))
     with closing(Scene(recording.vehicle)) as scene:
-        for seconds, camera in zip(
-            times, following_cameras([recording], times, scene.scale, forward, lens), strict=True
-        ):
+        cameras = following_cameras([recording], times, scene.scale, forward, lens)
+        for seconds, camera in zip(times, cameras, strict=True):
             step = recording.at(seconds)
+            # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
-            trail = Trail(path[: step + 1 : 2], recording.colour, 0.03 * scene.scale)
-            pixels = scene.picture(camera, [trail])
-            yield with_header(
-                pixels, recording.name, [_caption(recording, step)], recording.colour, font_size
-            )
+            flown = recording.state.position[: step + 1 : 2]
+            pixels = scene.picture(camera, [Trail(flown, recording.colour, 0.03 * scene.scale)])
+            lines = [_caption(recording, step)]
+            yield with_header(pixels, recording.name, lines, recording.colour, font_size)
 
 
 def _caption(recording: Recording, step: int) -> str:
     seconds = f"{recording.times[step]:5.2f} s"
     if step == len(recording.times) - 1 and recording.lost:
         return f"{seconds}   {recording.lost}"
-    force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
-    push = f"   force {force:.1f} N" if force else ""
+    distance = recording.state.distance[step]
     height = recording.state.position[step, 2]
-    return f"{seconds}   {recording.state.distance[step]:.2f} m from target   {height:.1f} m high{push}"
+    caption = f"{seconds}   {distance:.2f} m from target   {height:.1f} m high"
+    # Only disturbed flights have a force to tell.
+    force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
+    if force:
+        caption += f"   force {force:.1f} N"
+    return caption
 
 
 def show_in_window(
@@ -162,6 +174,7 @@ def show_in_window(
     """
     client = open_window(width, height)
     try:
+        # All bodies are added before the window draws: it shows each one as it comes.
         n = len(episodes[0])
         scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
         start_drawing(client)
@@ -169,35 +182,38 @@ def show_in_window(
             p.removeAllUserDebugItems(physicsClientId=client)
             _play(scene, recordings, Lens(width, height, WINDOW_SLOPE), speed)
     except p.error:
-        if p.isConnected(client):  # else the window has been shut
+        # PyBullet also raises when somebody shuts the window; that is how this ends.
+        if p.isConnected(client):
             raise
     finally:
         disconnect(client)
 
 
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
-    times, client = frame_times(recordings, speed), scene.client
+    times = frame_times(recordings, speed)
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
     cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
-    drawn_to = [0] * len(recordings)
-    begun, number = time.perf_counter(), 0
+    trail_ends = [0] * len(recordings)  # the steps up to which trails are drawn
+    # The number of the frame follows the clock, so that flights are shown in real time.
+    begun = time.perf_counter()
+    number = 0
     while number < len(times):
-        now = [(recording, recording.at(times[number])) for recording in recordings]
-        targets = np.stack([recording.state.target[step] for recording, step in now])
-        scene.place([recording.pose(step) for recording, step in now], targets)
-        for k, (recording, step) in enumerate(now):
-            if step > drawn_to[k]:
-                ends, colour = (
-                    recording.state.position[[drawn_to[k], step]],
-                    to_rgb(recording.colour),
-                )
+        steps = [recording.at(times[number]) for recording in recordings]
+        flights = list(zip(recordings, steps, strict=True))
+        poses = [recording.pose(step) for recording, step in flights]
+        scene.place(poses, np.stack([flight.state.target[step] for flight, step in flights]))
+        # PyBullet keeps the lines, so each frame adds the latest piece only.
+        for row, (recording, step) in enumerate(flights):
+            if step > trail_ends[row]:
                 p.addUserDebugLine(
-                    *ends.tolist(), lineColorRGB=colour, lineWidth=3.0, physicsClientId=client
+                    *recording.state.position[[trail_ends[row], step]].tolist(),
+                    lineColorRGB=to_rgb(recording.colour),
+                    lineWidth=3.0,
+                    physicsClientId=scene.client,
                 )
-                drawn_to[k] = step
-        positions = np.stack([recording.state.position[step] for recording, step in now])
-        point_window(client, cameras[number], positions.mean(axis=0))
-        number = max(
-            number + 1, int((time.perf_counter() - begun) * FPS)
-        )  # frames that come too late are left out
+                trail_ends[row] = step
+        middle = np.mean([flight.state.position[step] for flight, step in flights], axis=0)
+        point_window(scene.client, cameras[number], middle)
+        # Skip the frames that would come too late.
+        number = max(number + 1, int((time.perf_counter() - begun) * FPS))
         time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))

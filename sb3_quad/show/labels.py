@@ -1,5 +1,6 @@
 """Words in pictures, in the font that comes with matplotlib."""
 
+import math
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -7,14 +8,14 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from PIL import Image as Pillow
-from PIL import ImageDraw, ImageFont
+from PIL import ImageDraw, ImageFont, ImageOps
 
 from sb3_quad.base.arrays import Image
 
 INK = (24, 32, 44)
 PLATE = (255, 255, 255, 205)
 STEP = 1.3  # between lines of text, in font sizes
-SMALLER = 0.88  # font size of what stands below a heading
+SMALLER = 0.88  # font size of the lines below a heading
 GAP = 4  # between pictures side by side, pixels
 
 
@@ -26,12 +27,12 @@ def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
 
 
 def tag_size(text: str, size: int) -> tuple[float, float]:
-    """Width and height of a tag, pixels; ``size`` of the font."""
+    """Return width and height of a tag, pixels; ``size`` of the font."""
     return font(size).getlength(text) + 0.7 * size, 1.5 * size
 
 
 def with_tags(pixels: Image, tags: Sequence[tuple[str, tuple[float, float]]], size: int) -> Image:
-    """A picture with small plates on it, each a text and its centre, column and row; ``size`` of
+    """Put small plates on a picture, each with a text around its centre (column, row); ``size`` of
     the font.
     """
     image = Pillow.fromarray(pixels)
@@ -45,19 +46,22 @@ def with_tags(pixels: Image, tags: Sequence[tuple[str, tuple[float, float]]], si
 
 
 def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, size: int) -> Image:
-    """A picture with a white band above it: a bar in ``colour``, a bold heading, and lines below.
+    """Put a white band above a picture: a bar in ``colour``, a bold heading, and lines below.
 
     :param colour: as ``#rrggbb``.
     :param size: of the font, pixels.
     """
-    band, bar = round((0.7 + STEP * (1 + len(lines))) * size), 0.45 * size
-    image = Pillow.new("RGB", (pixels.shape[1], band + pixels.shape[0]), "white")
-    image.paste(Pillow.fromarray(pixels), (0, band))
+    # The band is as high as its lines, with a margin above and below them.
+    band = round((0.7 + STEP * (1 + len(lines))) * size)
+    bar = 0.45 * size
+    image = ImageOps.expand(Pillow.fromarray(pixels), (0, band, 0, 0), "white")
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, 0, bar, band - 1), fill=colour)
-    for number, line in enumerate([heading, *lines]):
-        face = font(round(SMALLER * size)) if number else font(size, bold=True)
-        draw.text((bar + 0.7 * size, (0.35 + number * STEP) * size), line, font=face, fill=INK)
+    column = bar + 0.7 * size
+    draw.text((column, 0.35 * size), heading, font=font(size, bold=True), fill=INK)
+    for number, line in enumerate(lines, 1):
+        row = (0.35 + number * STEP) * size
+        draw.text((column, row), line, font=font(round(SMALLER * size)), fill=INK)
     return np.asarray(image)
 
 
@@ -65,12 +69,13 @@ def side_by_side(pictures: Sequence[Image], columns: int) -> Image:
     """Pictures of one size in rows of ``columns``, on white; even in width and height, as video
     codecs ask for.
     """
-    padded = [
-        np.pad(picture, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for picture in pictures
-    ]
-    columns = min(columns, len(padded))
-    padded += [np.full_like(padded[0], 255)] * (-len(padded) % columns)
-    sheet = np.vstack(
-        [np.hstack(padded[first : first + columns]) for first in range(0, len(padded), columns)]
-    )
+    # Each picture stands in the top left corner of its field; the gap is on its other sides.
+    columns = min(columns, len(pictures))
+    rows = math.ceil(len(pictures) / columns)
+    height, width, _ = np.add(pictures[0].shape, (GAP, GAP, 0))
+    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
+    for number, picture in enumerate(pictures):
+        top = number // columns * height
+        left = number % columns * width
+        sheet[top : top + height - GAP, left : left + width - GAP] = picture
     return sheet[: sheet.shape[0] // 2 * 2, : sheet.shape[1] // 2 * 2]

@@ -1,11 +1,11 @@
-"""A sweep on the disk: what it is to do, and what is done; every file appears whole or not at all.
+"""The files of a sweep; every file appears whole or not at all.
 
 A sweep's folder holds
 
-- ``sweep.yaml``, what was asked for; ``plan.json``, a :class:`Plan`: its runs with all their
+- ``sweep.yaml``, what was asked for; ``plan.json``, a :class:`Sweep`: its runs with all their
   settings;
 - ``runs/<configuration>/seed_<k>/``, folders as ``train`` leaves them;
-- ``records/<configuration>/seed_<k>.json``, a :class:`RunRecord` of each run that ended;
+- ``records/<configuration>/seed_<k>.json``, a :class:`RunResult` of each run that ended;
 - ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: what was
   measured.
 """
@@ -21,40 +21,43 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.scenarios.scenario import Suite
-from sb3_quad.sweep.expand import Run
+from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import SweepSpec
 
 PLAN = "plan.json"
 Numbers: TypeAlias = tuple[float | None, ...]
-SUCCESS, SURVIVAL, REWARD, ERROR, TIME = "success", "survival", "reward", "final_error", "time"
+SUCCESS = "success"
+SURVIVAL = "survival"
+REWARD = "reward"
+ERROR = "final_error"
+TIME = "time"
 MEASURES = (SUCCESS, SURVIVAL, REWARD, ERROR, TIME)
-"""Of an episode: 0 or 1, 0 or 1, sum, m (None: lost), s to the tightest tolerance, or, where it
-starts at its target, until stable (None: never)."""
+"""The numbers of an episode: 0 or 1, 0 or 1, sum, m (None: crashed or out of range), s to the
+tightest tolerance, or, where it starts at its target, until stable (None: never)."""
 
 
-class RunRecord(Frozen):
-    """How a run ended."""
+class RunResult(Frozen, use_attribute_docstrings=True):
+    """The end of a run."""
 
     name: str
     configuration: str
     seed: int
     state: Literal["finished", "failed", "interrupted"]
-    message: str = Field(default="", description="why it failed, in one line")
-    agent: str = Field(default="", description="the zip that flew, relative to the run's folder")
-    weights: str = Field(default="", description="SHA-256 of that agent's parameters")
+    message: str = ""
+    """why it failed, in one line"""
+    agent: str = ""
+    """the zip that flew, relative to the run's folder"""
+    weights: str = ""
+    """SHA-256 of that agent's parameters"""
     timesteps: int = 0
-    seconds: float = Field(
-        default=0.0,
-        description="wall-clock time of the training; of a run that was resumed, since then",
-    )
-    flights: dict[str, dict[str, Numbers]] = Field(
-        default={},
-        description="by scenario and measure, a number for each episode, the same episodes in every run",
-    )
+    seconds: float = 0.0
+    """wall-clock time of the training; of a run that was resumed, since then"""
+    flights: dict[str, dict[str, Numbers]] = {}
+    """by scenario and measure, a number for each episode, the same episodes in every run"""
 
 
-class Plan(Frozen):
-    """A resolved sweep; resuming does not reread the settings files."""
+class Sweep(Frozen):
+    """A sweep with all that its files say; resuming does not read the settings files again."""
 
     spec: SweepSpec
     runs: tuple[Run, ...] = Field(min_length=1)
@@ -69,42 +72,40 @@ class SweepFolder:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.plan = self.path / PLAN
 
-    def write(self, plan: Plan) -> None:
-        """Write what the sweep is to do."""
-        spec = plan.spec.model_dump(mode="json", exclude_defaults=True)
+    def write(self, sweep: Sweep) -> None:
+        """Write the sweep, before its first run."""
+        spec = sweep.spec.model_dump(mode="json", exclude_defaults=True)
         write_text(self.path / "sweep.yaml", yaml.safe_dump(spec, sort_keys=False))
-        write_text(self.plan, plan.model_dump_json(indent=1) + "\n")
+        write_text(self.path / PLAN, sweep.model_dump_json(indent=1) + "\n")
 
-    def read(self) -> Plan:
-        """What the sweep is to do.
+    def read(self) -> Sweep:
+        """Read the sweep.
 
         :raises ConfigError: a folder that holds no sweep, or a damaged file.
         """
         if not self.path.is_dir():
             raise ConfigError(f"sweep folder {self.path}: no such folder")
-        if not self.plan.is_file():
+        if not (self.path / PLAN).is_file():
             raise ConfigError(f"sweep folder {self.path}: holds no sweep ({PLAN} is missing)")
-        return read_record(self.plan, Plan)
+        return read_record(self.path / PLAN, Sweep)
 
     def run(self, run: Run) -> Path:
-        """The folder of a run, absolute: what is written in it names files that are looked for from
+        """The folder of a run, absolute: files in it name others, which must be found from
         anywhere.
         """
         return self.path.absolute() / "runs" / run.name
 
-    def add(self, record: RunRecord) -> None:
-        """Keep the record of a run that ended."""
-        write_text(self._record(record.name), record.model_dump_json() + "\n")
+    def add(self, result: RunResult) -> None:
+        """Write the result of a run that ended."""
+        write_text(self._result(result.name), result.model_dump_json() + "\n")
 
-    def records(self, runs: Sequence[Run]) -> dict[str, RunRecord]:
-        """The records of those runs that ended, by name."""
+    def results(self, runs: Sequence[Run]) -> dict[str, RunResult]:
+        """Read the results of those runs that ended, by name."""
+        paths = {run.name: self._result(run.name) for run in runs}
         return {
-            run.name: read_record(self._record(run.name), RunRecord)
-            for run in runs
-            if self._record(run.name).is_file()
+            name: read_record(path, RunResult) for name, path in paths.items() if path.is_file()
         }
 
-    def _record(self, name: str) -> Path:
+    def _result(self, name: str) -> Path:
         return self.path / "records" / f"{name}.json"

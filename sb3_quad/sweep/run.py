@@ -1,5 +1,5 @@
-"""Doing the runs of a sweep by an executor, and what a worker does of it: train as ``train`` does,
-and fly the agent.
+"""Executing the runs of a sweep, and the work of one run: train as ``train`` does, then fly the
+agent.
 """
 
 import hashlib
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -25,8 +26,8 @@ from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.sweep.expand import Run
-from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, Plan, RunRecord, SweepFolder
+from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, RunResult, Sweep, SweepFolder
+from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import Evaluation
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.environments import make_environments
@@ -41,131 +42,133 @@ from sb3_quad.training.pipeline import (
 EPISODES = 240  # of each task, where no suite is named
 TASKS = ("state_recovery", "target_tracking")
 TRIES = 2  # of a run whose worker process dies
-Show = Callable[[int, int, str], None]  # runs that ended, runs in all, what they are called
-LOG = "log.txt"  # what the training reports, in the run's folder
+Show = Callable[[int, int, str], None]  # runs that ended, all runs, and their name
+LOG = "log.txt"  # the reports of the training, in the run's folder
 
 
 def execute(
     place: SweepFolder,
-    plan: Plan,
+    sweep: Sweep,
     executor: Executor,
     signals: StopSignals,
     show: Show,
     report: Callable[[str], None],
-) -> dict[str, RunRecord]:
-    """Do all runs that are not finished.
+) -> dict[str, RunResult]:
+    """Execute all runs that are not finished.
 
     A run whose worker process ends is tried once more, from its snapshot; one that fails is left,
-    and the others go on. After a signal, the runs under way save and end.
+    and the others continue. After a signal, the runs under way save and end.
 
-    :param report: told of each event in one line.
-    :return: the records of all runs that ended, those of earlier calls included, by name.
+    :param report: receives each event in one line.
+    :return: the results of all runs that ended, those of earlier calls included, by name.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    known = place.records(plan.runs)
-    records = {name: record for name, record in known.items() if record.state == "finished"}
-    calls, tries = dict["Future[RunRecord]", Run](), Counter[str]()
+    # Finished runs stay as they are; failed ones are tried again.
+    known = place.results(sweep.runs)
+    results = {name: result for name, result in known.items() if result.state == "finished"}
+    calls: dict[Future[RunResult], Run] = {}
+    tries = Counter[str]()
 
     def submit(run: Run) -> None:
-        calls[executor.submit(work, run, str(place.run(run)), plan.suite, plan.spec.evaluation)] = (
-            run
-        )
+        folder = str(place.run(run))
+        calls[executor.submit(work, run, folder, sweep.suite, sweep.spec.evaluation)] = run
         tries[run.name] += 1
 
     def next_step(run: Run) -> str:
-        return (
-            "goes on where it was left"
-            if pipeline_folder(place.run(run)) is not None
-            else "begins again"
-        )
+        begun = pipeline_folder(place.run(run)) is not None
+        return "resumes where it stopped" if begun else "begins again"
 
-    for run in plan.runs:
-        if run.name in records:
+    # All runs are submitted at once; the executor starts as many as it has workers.
+    for run in sweep.runs:
+        if run.name in results:
             continue
         if run.name in known:
             report(f"{run.name}: failed before ({known[run.name].message}); {next_step(run)}")
         elif pipeline_folder(place.run(run)) is not None:
             report(f"{run.name}: {next_step(run)}")
         submit(run)
-    show(len(records), len(plan.runs), "runs")
+    show(len(results), len(sweep.runs), "runs")
     for run, future in as_they_end(executor, calls, signals, report):
         try:
-            record = future.result()
+            result = future.result()
         except WorkerDied as died:
+            # After a signal a worker may have been ended by it.
             if signals.received is not None:
                 continue
             if tries[run.name] < TRIES:
                 report(f"{run.name}: {died}; {next_step(run)}")
                 submit(run)
                 continue
-            record = RunRecord(**run.identity, state="failed", message=str(died))
-        if record.state == "interrupted":
+            result = _result(run, state="failed", message=str(died))
+        if result.state == "interrupted":
             report(f"{run.name}: interrupted; {next_step(run)} with --resume")
             continue
-        place.add(record)
-        records[run.name] = record
-        how = (
-            f"failed: {record.message}"
-            if record.state == "failed"
-            else f"finished in {record.seconds:.1f} s"
-        )
-        report(f"{run.name}: {how} ({len(records)} of {len(plan.runs)})")
-        show(len(records), len(plan.runs), "runs")
-    return records
+        place.add(result)
+        results[run.name] = result
+        end = f"finished in {result.seconds:.1f} s"
+        if result.state == "failed":
+            end = f"failed: {result.message}"
+        report(f"{run.name}: {end} ({len(results)} of {len(sweep.runs)})")
+        show(len(results), len(sweep.runs), "runs")
+    return results
 
 
-def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> RunRecord:
-    """Train a run in its folder, or what is left of it, and fly its agent; of a run that fails,
-    why.
+def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> RunResult:
+    """Train a run in its folder, or the rest of it, and fly its agent. The result of a run that
+    fails says why.
 
-    :param suite: what the agent flies; None: fresh episodes of both tasks, as many as
+    :param suite: the scenarios of the agent; None: fresh episodes of both tasks, as many as
         ``evaluation`` says.
     """
+    # One core for each run: so the same weights come out on any machine.
     use_cpus(1)
     place = Path(folder)
+    interrupted = _result(run, state="interrupted")
     try:
         place.mkdir(parents=True, exist_ok=True)
         import_packages(run.gym_packages, "gym_packages:")
-        result = _train(run, place)
-        if result.exit_code != 0:
-            return RunRecord(**run.identity, state="interrupted")
-        agent = Path([*result.stages.values()][-1].agent)
-        flights = _fly(agent, result.job, suite, evaluation)
+        trained = _train(run, place)
+        if trained.exit_code != 0:
+            return interrupted
+        stages = [*trained.stages.values()]
+        agent = Path(stages[-1].agent)
+        flights = _fly(agent, trained.job, suite, evaluation)
     except KeyboardInterrupt:
-        return RunRecord(**run.identity, state="interrupted")
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # of a callback or environment of the user's, too; the other runs go on
+        return interrupted
+    # Also the errors of a user's callback or environment: the other runs continue.
+    except (Exception, SystemExit) as error:
         kind = "" if isinstance(error, SB3QuadError) else f"{type(error).__name__}: "
-        return RunRecord(**run.identity, state="failed", message=kind + one_line(error))
-    return RunRecord(
-        **run.identity,
+        return _result(run, state="failed", message=kind + one_line(error))
+    return _result(
+        run,
         state="finished",
         agent=agent.relative_to(place).as_posix(),
         weights=digest(agent),
-        timesteps=sum(stage.timesteps for stage in result.stages.values()),
-        seconds=round(sum(stage.seconds for stage in result.stages.values()), 1),
+        timesteps=sum(stage.timesteps for stage in stages),
+        seconds=round(sum(stage.seconds for stage in stages), 1),
         flights=flights,
     )
+
+
+def _result(run: Run, **fields: Any) -> RunResult:
+    return RunResult(name=run.name, configuration=run.configuration, seed=run.seed, **fields)
 
 
 def digest(agent: Path) -> str:
     """The SHA-256 of the parameters in an agent's zip."""
     parameters = load_model(agent).policy.state_dict()
-    content = b"".join(
-        name.encode() + tensor.numpy().tobytes() for name, tensor in sorted(parameters.items())
-    )
-    return hashlib.sha256(content).hexdigest()
+    sha256 = hashlib.sha256()
+    for name, tensor in sorted(parameters.items()):
+        sha256.update(name.encode() + tensor.numpy().tobytes())
+    return sha256.hexdigest()
 
 
 def pipeline_folder(place: Path) -> Path | None:
-    """Where a run's training is, if it has begun."""
+    """The folder of a run's training, if it has begun."""
     return next((path.parent for path in sorted(place.glob(f"*/*/{STATUS_FILE}"))), None)
 
 
 def _train(run: Run, place: Path) -> PipelineResult:
-
     def report(line: str) -> None:
         with (place / LOG).open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
@@ -174,9 +177,8 @@ def _train(run: Run, place: Path) -> PipelineResult:
     if begun is not None:
         return resume_pipeline(begun, report)
     stages = []
-    for number, stage in enumerate(
-        run.stages
-    ):  # with its settings in a file here: one of the user's may have changed
+    for number, stage in enumerate(run.stages):
+        # The settings get a file here, because one of the user's may have changed since.
         settings = place / f"stage_{number}.yml"
         write_text(settings, yaml.safe_dump({stage.env: stage.settings}, sort_keys=False))
         stages.append(stage.model_copy(update={"conf_file": str(settings), "settings": {}}))
@@ -187,41 +189,52 @@ def _train(run: Run, place: Path) -> PipelineResult:
 def _fly(
     agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluation
 ) -> dict[str, dict[str, Numbers]]:
-    """The numbers of an agent's flights, by scenario and measure."""
+    """Return the numbers of an agent's flights, by scenario and measure."""
     model = load_model(agent)
-    episodes, seed = evaluation.episodes or EPISODES, seed_for("table", evaluation.seed or 0)
-    if job.config.task is None:  # an environment of others has rewards, and no scenarios
+    episodes = evaluation.episodes or EPISODES
+    seed = seed_for("table", evaluation.seed or 0)
+    if job.config.task is None:
+        # An environment of others has rewards, and no scenarios.
         if suite is not None:
             raise ConfigError(
-                f"evaluation: suites are for this package's environments, not for {job.config.env_id}"
+                "evaluation: suites are for this package's environments, "
+                f"not for {job.config.env_id}"
             )
         config = job.for_evaluation()
         with closing(make_environments(config, 1, seed)) as env:
             rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
-        return {config.env_id: {REWARD: tuple(np.asarray(rewards, dtype=np.float64).tolist())}}
+        return {config.env_id: {REWARD: tuple(np.ravel(rewards).tolist())}}
+    # Without a suite, the episodes are those of the closing table of train.
     if suite is None:
-        seeds, how = row_seeds(seed, episodes), job.flight_settings.in_any_task()
+        seeds = row_seeds(seed, episodes)
+        settings = job.flight_settings.in_any_task()
         return {
-            task: _numbers(fly_settings(model, FlightSettings(task=task, **how), seeds))
+            task: _numbers(fly_settings(model, FlightSettings(task=task, **settings), seeds))
             for task in TASKS
         }
-    spec, found = ControllerSpec("agent", str(agent)), {}
-    for each in suite.scenarios:
-        scenario = each.flown_by(spec.own and spec.own.vehicle)
-        found[each.name] = _numbers(fly_scenario(model, scenario, own=spec.observed)[0])
-    return found
+    spec = ControllerSpec("agent", str(agent))
+    flights = {}
+    for scenario in suite.scenarios:
+        flown = scenario.flown_by(spec.own and spec.own.vehicle)
+        flights[scenario.name] = _numbers(fly_scenario(model, flown, own=spec.observed)[0])
+    return flights
 
 
 def _numbers(flights: Flights) -> dict[str, Numbers]:
-    error = np.where(flights.survival, flights.final_error, np.nan)
-    arrival = (
-        flights.time_to[min(flights.time_to)] if flights.time_to else np.full(flights.n, np.nan)
+    """Return the measures of all episodes, None where there is no number."""
+    # The time to the tightest tolerance.
+    arrival = np.full(flights.n, np.nan)
+    if flights.time_to:
+        arrival = flights.time_to[min(flights.time_to)]
+    # An episode that starts at its target has no way to it, and so no cross-track error.
+    has_way = np.isfinite(flights.cross_track_error)
+    columns = (
+        flights.success,
+        flights.survival,
+        flights.reward,
+        np.where(flights.survival, flights.final_error, np.nan),
+        np.where(has_way, arrival, flights.recovery_time),
     )
-    time = np.where(
-        np.isfinite(flights.cross_track_error), arrival, flights.recovery_time
-    )  # who starts at the target has no way to it
-    columns = (flights.success, flights.survival, flights.reward, error, time)
-    return {
-        name: tuple(float(value) if np.isfinite(value) else None for value in column)
-        for name, column in zip(MEASURES, columns, strict=True)
-    }
+    numbers = np.array(columns, dtype=np.float64)
+    rows = np.where(np.isfinite(numbers), numbers, np.array(None)).tolist()
+    return dict(zip(MEASURES, map(tuple, rows), strict=True))

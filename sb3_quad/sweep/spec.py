@@ -1,8 +1,8 @@
-"""What a sweep trains: settings that all runs share, a grid or a list of those that differ, and the
-seeds.
+"""The settings of a sweep: those that all runs share, a grid or a list of those that differ, and
+the seeds.
 
 The words are rl-zoo's. Keys at the top hold for every configuration; ``grid`` maps keys, dotted
-where they lie deeper, to lists of values, of which every combination is a configuration, such as
+where they lie deeper, to lists of values. Every combination of them is a configuration, such as
 ``grid: {hyperparams.learning_rate: [1e-3, 5e-3]}``; ``configurations`` lists some one by one.
 """
 
@@ -25,25 +25,21 @@ SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 MAX_RUNS = 10_000
 
 
-class Configuration(SettingsOptions, RunOptions):
-    """What one training is given, less its seed; what is left out is as for ``train``."""
+class Configuration(SettingsOptions, RunOptions, use_attribute_docstrings=True):
+    """The settings of one training, less its seed; a missing key has the default of ``train``."""
 
-    name: str | None = Field(
-        default=None,
-        pattern=NAME,
-        description="in tables and folders; made of what differs without it",
-    )
-    algo: str | None = Field(default=None, description="algorithm of a single run")
-    env: str | None = Field(default=None, description="environment id of a single run")
-    conf_file: str | None = Field(
-        default=None, description="settings file, of a single run or of a pipeline"
-    )
-    hyperparams: dict[str, Any] = Field(
-        default={}, description="settings to change, such as n_steps: 500"
-    )
-    vehicle: str | None = Field(
-        default=None, description="env_kwargs' vehicle, by name or YAML file"
-    )
+    name: str | None = Field(default=None, pattern=NAME)
+    """in tables and folders; made of the settings that differ without it"""
+    algo: str | None = None
+    """algorithm of a single run"""
+    env: str | None = None
+    """environment id of a single run"""
+    conf_file: str | None = None
+    """settings file, of a single run or of a pipeline"""
+    hyperparams: dict[str, Any] = {}
+    """settings to change, such as n_steps: 500"""
+    vehicle: str | None = None
+    """env_kwargs' vehicle, by name or YAML file"""
 
     @model_validator(mode="before")
     @classmethod
@@ -62,49 +58,47 @@ class Configuration(SettingsOptions, RunOptions):
         return self.model_dump(include={*Configuration.model_fields}, exclude_defaults=True)
 
 
-class Resources(Frozen):
-    """What a run takes, for Ray to place it."""
+class Resources(Frozen, use_attribute_docstrings=True):
+    """The resources of a run, for Ray to place it."""
 
-    num_cpus: NonNegativeFloat = Field(default=1, description="cores")
-    num_gpus: NonNegativeFloat = Field(default=0, description="GPUs")
+    num_cpus: NonNegativeFloat = 1
+    """cores"""
+    num_gpus: NonNegativeFloat = 0
+    """GPUs"""
 
 
-class Evaluation(Frozen):
+class Evaluation(Frozen, use_attribute_docstrings=True):
     """The fresh episodes on which all agents are compared."""
 
-    suite: str | None = Field(
-        default=None, description="name or YAML file; without it, fresh episodes of both tasks"
-    )
-    scenario: Annotated[tuple[str, ...], BeforeValidator(as_list)] = Field(
-        default=(), description="only these of the suite"
-    )
-    episodes: PositiveInt | None = Field(
-        default=None, description="of each scenario; without a suite 240"
-    )
-    seed: Seed | None = Field(default=None, description="of the episodes")
+    suite: str | None = None
+    """name or YAML file; without it, fresh episodes of both tasks"""
+    scenario: Annotated[tuple[str, ...], BeforeValidator(as_list)] = ()
+    """only these of the suite"""
+    episodes: PositiveInt | None = None
+    """of each scenario; without a suite 240"""
+    seed: Seed | None = None
+    """of the episodes"""
 
 
-class SweepSpec(Configuration):
-    """A sweep."""
+class SweepSpec(Configuration, use_attribute_docstrings=True):
+    """The keys of a sweep's file."""
 
-    seed: Annotated[tuple[Seed, ...], BeforeValidator(as_list)] = Field(
-        default=(0,), min_length=1, description="one or a list"
-    )
-    grid: dict[str, Any] = Field(default={}, description="keys, each with a list of values")
-    configurations: tuple[dict[str, Any], ...] = Field(
-        default=(), description="a list of keys and values each"
-    )
-    evaluation: Evaluation = Field(
-        default=Evaluation(), description="what the agents fly in the end"
-    )
-    resources: Resources = Field(default=Resources(), description="what a run takes")
-    gym_packages: tuple[str, ...] = Field(
-        default=(), description="modules that register further environments"
-    )
+    seed: Annotated[tuple[Seed, ...], BeforeValidator(as_list)] = Field(default=(0,), min_length=1)
+    """one or a list"""
+    grid: dict[str, Any] = {}
+    """keys, each with a list of values"""
+    configurations: tuple[dict[str, Any], ...] = ()
+    """a list of keys and values each"""
+    evaluation: Evaluation = Evaluation()
+    """the episodes that the agents fly in the end"""
+    resources: Resources = Resources()
+    """the resources of a run"""
+    gym_packages: tuple[str, ...] = ()
+    """modules that register further environments"""
 
 
 def load_sweep(source: str | Path) -> SweepSpec:
-    """The sweep in a YAML file, by path or by the name of one in the package.
+    """Load the sweep in a YAML file, by path or by the name of one in the package.
 
     :raises ConfigError: an unreadable file, or a key that is unknown or does not fit.
     """

@@ -1,5 +1,9 @@
 """The search for hyperparameters: trials, each a training of its own, in a study of Optuna that may
 be shared and resumed.
+
+Optuna's heartbeats and its retries of stale trials need a database and ``study.optimize``, and its
+samplers are seeded once for a process. A study here may be a journal file, on any system, and
+repeats by its seed however often it was interrupted; so retries and seeds of trials are our own.
 """
 
 import hashlib
@@ -18,7 +22,7 @@ from optuna.distributions import BaseDistribution, distribution_to_json
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
@@ -29,7 +33,8 @@ from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 
-SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {  # from a seed and n_startup_trials
+# From a seed and n_startup_trials.
+SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {
     "tpe": lambda seed, n: TPESampler(
         seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True
     ),
@@ -38,24 +43,23 @@ SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {  # from a seed and
         seed=seed, n_startup_trials=n, warn_independent_sampling=False
     ),
 }
-PRUNERS: Mapping[
-    str, Callable[[int, int], BasePruner]
-] = {  # from n_startup_trials and n_evaluations
+# From n_startup_trials and n_evaluations.
+PRUNERS: Mapping[str, Callable[[int, int], BasePruner]] = {
     "median": lambda n, evaluations: MedianPruner(
         n_startup_trials=n, n_warmup_steps=evaluations // 3
     ),
     "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
     "none": lambda n, evaluations: NopPruner(),
 }
+ENDED = ("COMPLETE", "PRUNED", "FAIL")  # states of trials
 BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials share
-OWNER = "owner"  # user attribute of a trial: the machine and the process that train it
-SETTINGS, SUCCESS, REWARD, RUN, ERROR = (
-    "settings",
-    "success_rate",
-    "mean_reward",
-    "run",
-    "error",
-)  # others
+# User attributes of a trial. The owner is the machine and the process that trains it.
+OWNER = "owner"
+SETTINGS = "settings"
+SUCCESS = "success_rate"
+REWARD = "mean_reward"
+RUN = "run"
+ERROR = "error"
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
 AGAIN = {"again": True}  # user attributes of the trials that do so
 
@@ -92,33 +96,39 @@ class Search:
         n_startup_trials: int = 10,
         n_evaluations: int = 10,
     ) -> None:
-        for kind, given, valid in (("sampler", sampler, SAMPLERS), ("pruner", pruner, PRUNERS)):
-            if given not in valid:
-                raise ConfigError(unknown(kind, given, valid))
+        if sampler not in SAMPLERS:
+            raise ConfigError(unknown("sampler", sampler, SAMPLERS))
+        if pruner not in PRUNERS:
+            raise ConfigError(unknown("pruner", pruner, PRUNERS))
         if min(n_evaluations, job.eval_episodes) < 1 or n_startup_trials < 0:
             raise ConfigError(
                 "n_evaluations and eval_episodes must be at least 1, n_startup_trials at least 0"
             )
-        self.job, self.space, self.name, self.storage = job, space, name, storage
+        self.job = job
+        self.space = space
+        self.name = name
+        self.storage = storage
         self.n_evaluations = n_evaluations
-        wanted = {
-            key: json.dumps(value, sort_keys=True, default=str)
-            for key, value in self._shared().items()
-        }
+        # Only trials of one kind compare. This is the kind, as a storage gives it back.
+        wanted = json.loads(json.dumps(self._shared(), default=str))
         self.study = open_study(name, storage)
         if BEGUN_WITH not in self.study.user_attrs and not self.study.trials:
             self.study.set_user_attr(BEGUN_WITH, wanted)
-            if (first := space.start()) is not None:
+            # The first trial has the settings as they are, if the space holds them.
+            first = space.start()
+            if first is not None:
                 self.study.enqueue_trial(first)
-        known, where = self.study.user_attrs.get(BEGUN_WITH), f"study {name} in {storage}"
+        known = self.study.user_attrs.get(BEGUN_WITH)
+        where = f"study {name} in {storage}"
         if not isinstance(known, dict):
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
-        differing = ", ".join(
-            sorted(key for key in {**known, **wanted} if known.get(key) != wanted.get(key))
-        )
+        differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
         if differing:
-            other = f"was begun with other settings ({differing})"
-            raise ConfigError(f"{where}: {other}; give the same again, or another --study-name")
+            raise ConfigError(
+                f"{where}: was begun with other settings ({', '.join(sorted(differing))}); "
+                "give the same again, or another --study-name"
+            )
+        # Sampler and pruner may differ from one session to the next.
         self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
         self.study.sampler = NumberedSampler(sampler, job.seed, n_startup_trials)
 
@@ -131,6 +141,7 @@ class Search:
         :raises ConfigError: a storage that fails meanwhile.
         """
         try:
+            # A trial that another process left behind counts no longer, but is tried again.
             retry_dead_trials(self.study)
             if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
                 return None
@@ -145,71 +156,78 @@ class Search:
 
     def trials(self, *states: str) -> list[FrozenTrial]:
         """The trials in these states, such as ``COMPLETE``; all that ended by default."""
-        wanted = states or ("COMPLETE", "PRUNED", "FAIL")
-        return [
-            trial for trial in self.study.get_trials(deepcopy=False) if trial.state.name in wanted
-        ]
+        trials = self.study.get_trials(deepcopy=False)
+        return [trial for trial in trials if trial.state.name in (states or ENDED)]
 
     @property
     def best(self) -> FrozenTrial | None:
-        """The best trial that was finished, of any process; None if there is none."""
+        """The best trial that was finished, of any process; None before the first one."""
         return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
 
     def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
-        """Train as a trial says; its value and state. Whatever a choice of settings leads to, the
-        next may fare better.
+        """Train as a trial says; return its value and state. Whatever happens to a choice of
+        settings, the next one may fare better.
         """
         try:
             value = self._value(trial)
-            return value, TrialState.PRUNED if value is None else TrialState.COMPLETE
         except Exception as error:
             trial.set_user_attr(ERROR, f"{type(error).__name__}: {one_line(error)}")
+            return None, TrialState.FAIL
         except KeyboardInterrupt:
             trial.set_user_attr(ERROR, INTERRUPTED)
             self.study.enqueue_trial(trial.params, AGAIN)
-        return None, TrialState.FAIL
+            return None, TrialState.FAIL
+        return value, TrialState.PRUNED if value is None else TrialState.COMPLETE
 
     def _value(self, trial: optuna.Trial) -> float | None:
-        """What a trial's last evaluation was worth; None: it was pruned."""
-        known, count = self.job.config, self.n_evaluations
+        """Train as a trial says; return the value of its last evaluation, None if it was pruned."""
+        known = self.job.config
         settings = self.space.settings(trial.params)
         trial.set_user_attr(SETTINGS, json.dumps(settings))
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
+        # A training ends with a whole rollout.
         rollout = config.rollout_steps * config.n_envs
-        total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
-        every = math.ceil(total / count)
-        evaluations: list[float] = []
+        total = math.ceil(config.n_timesteps / rollout) * rollout
+        changes = {
+            "config": config,
+            "eval_freq": math.ceil(total / self.n_evaluations),
+            "snapshot_every": 0,
+        }
+        values: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
-            evaluations.append(
-                reward if known.task is None else score(success, reward, self.job.eval_episodes)
-            )
-            trial.report(evaluations[-1], len(evaluations))
+            value = reward
+            if known.task is not None:
+                value = score(success, reward, self.job.eval_episodes)
+            values.append(value)
+            trial.report(value, len(values))
             trial.set_user_attr(SUCCESS, success)
             trial.set_user_attr(REWARD, reward)
-            return len(evaluations) >= count or not trial.should_prune()
+            return len(values) >= self.n_evaluations or not trial.should_prune()
 
+        # SB3 warns of each batch size that does not divide the rollout, which a search often tries.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
-                self.job.model_copy(
-                    update={"config": config, "eval_freq": every, "snapshot_every": 0}
-                ),
+                self.job.model_copy(update=changes),
                 report=lambda line: None,
                 on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
                 should_continue=should_continue,
             )
+        # The training ends early by a signal, or because the pruner stopped it.
         if result.exit_code != 0:
             raise KeyboardInterrupt
         if result.model.num_timesteps < total:
             return None
-        if not math.isfinite(evaluations[-1]):
+        if not math.isfinite(values[-1]):
             raise TrainingError(f"the mean reward is {trial.user_attrs[REWARD]}")
-        return evaluations[-1]
+        return values[-1]
 
     def _shared(self) -> dict[str, Any]:
-        """What all trials of a study must share to be compared."""
-        job, config, agent = self.job, self.job.config, None
+        """Return all that the trials of a study must share to be compared."""
+        job = self.job
+        # The agent counts by its content, since its file may move.
+        agent = None
         if job.trained_agent is not None:
             try:
                 agent = hashlib.sha256(Path(job.trained_agent).read_bytes()).hexdigest()
@@ -217,13 +235,12 @@ class Search:
                 raise ConfigError(
                     f"{job.trained_agent}: cannot be read ({error.strerror or error})"
                 ) from None
+        dimensions = self.space.dimensions.items()
         return {
-            "algo": config.algo,
-            "env": config.env_id,
-            **config.settings,
-            "search_space": {
-                name: distribution_to_json(each) for name, each in self.space.dimensions.items()
-            },
+            "algo": job.config.algo,
+            "env": job.config.env_id,
+            **job.config.settings,
+            "search_space": {name: distribution_to_json(values) for name, values in dimensions},
             "seed": job.seed,
             "trained_agent": agent,
             "n_evaluations": self.n_evaluations,
@@ -232,26 +249,26 @@ class Search:
 
 
 class NumberedSampler(BaseSampler):
-    """One of :data:`SAMPLERS`, made anew for each trial, from a seed, the trials known and its
+    """One of :data:`SAMPLERS`, made again for each trial, from a seed, the known trials and its
     number, retries not counted.
 
-    So processes that share a study propose different trials, and a study that is resumed goes on as
-    if never left.
+    So processes that share a study propose different trials, and a study that is resumed continues
+    as if it had never been interrupted.
     """
 
     def __init__(self, kind: str, seed: int, n_startup_trials: int) -> None:
-        self._kind, self._seed, self._startup = kind, seed, n_startup_trials
+        self._kind = kind
+        self._seed = seed
+        self._startup = n_startup_trials
 
     def infer_relative_search_space(
         self, study: optuna.Study, trial: FrozenTrial
     ) -> dict[str, BaseDistribution]:
-        again = sum(
-            "again" in each.user_attrs
-            for each in study.get_trials(deepcopy=False)
-            if each.number < trial.number
-        )
-        own = int(np.random.SeedSequence([self._seed, trial.number - again]).generate_state(1)[0])
-        self._sampler = SAMPLERS[self._kind](own, self._startup)
+        # A retry has the parameters of an earlier trial, and no number of its own.
+        before = study.get_trials(deepcopy=False)[: trial.number]
+        number = sum("again" not in earlier.user_attrs for earlier in before)
+        seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
+        self._sampler = SAMPLERS[self._kind](seed, self._startup)
         return self._sampler.infer_relative_search_space(study, trial)
 
     def sample_relative(self, *arguments: Any) -> dict[str, Any]:
@@ -262,35 +279,37 @@ class NumberedSampler(BaseSampler):
 
 
 def open_study(name: str, storage: str | Path) -> optuna.Study:
-    """The study of this name, also one that the storage holds already.
+    """Return the study of this name, which the storage may hold already.
 
-    :raises ConfigError: cmaes is missing; a storage that cannot be used, such as a file that is no
-        journal.
+    :raises ConfigError: cmaes is missing; a storage that cannot be used, such as a file that is not
+        a journal.
     """
     require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
     try:
-        opened: Any = str(storage)
-        if "://" not in opened:
-            path = Path(storage)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_file() and path.read_bytes()[-1:] not in (
-                b"",
-                b"\n",
-            ):  # Optuna would append to that line
-                raise ConfigError(
-                    "the last line is cut, as by a full disk, or it is no journal; remove that line"
-                )
-            opened = JournalStorage(JournalFileBackend(str(storage)))
+        backend: Any = str(storage)
+        if "://" not in backend:
+            backend = _open_journal(Path(storage))
         return optuna.create_study(
-            study_name=name, storage=opened, direction="maximize", load_if_exists=True
+            study_name=name, storage=backend, direction="maximize", load_if_exists=True
         )
-    except Exception as error:  # databases and damaged journals raise what they like
+    except Exception as error:  # databases and damaged journals raise anything
         reason = f"{type(error).__name__}: {one_line(error)}"
         raise ConfigError(f"storage {storage}: cannot be used ({reason})") from None
 
 
+def _open_journal(path: Path) -> JournalStorage:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Optuna would ignore a cut line, and append the next one to it.
+    if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):
+        raise ConfigError(
+            "the last line is cut, as by a full disk, or it is no journal; remove that line"
+        )
+    # Optuna's other lock needs symbolic links, which Windows reserves for administrators.
+    return JournalStorage(JournalFileBackend(str(path), JournalFileOpenLock(str(path))))
+
+
 def retry_dead_trials(study: optuna.Study) -> None:
-    """Have the trials tried again whose process on this machine is gone."""
+    """Enqueue the trials again whose process on this machine is gone."""
     for trial in study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
         machine, process = trial.user_attrs.get(OWNER, ["", 0])
         if machine == platform.node() and has_ended(process):
@@ -299,8 +318,8 @@ def retry_dead_trials(study: optuna.Study) -> None:
 
 
 def score(success: float, reward: float, n_episodes: int) -> float:
-    """Success and reward as one number: any more successful episodes outweigh any reward, which
-    decides between equals.
+    """Return success and reward as one number: any more successful episodes outweigh any reward,
+    which decides between equals.
 
     ``success + s(reward) / n_episodes`` with s(x) = (1 + x / (1 + |x|)) / 2, which rises from 0 to
     1.

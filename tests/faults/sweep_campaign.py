@@ -2,9 +2,11 @@
 table of the undisturbed one.
 
 python tests/faults/sweep_campaign.py driver --sweeps 10 --folder campaign
-python tests/faults/sweep_campaign.py node --sweeps 10 --folder campaign      # with Ray: two nodes
-on this machine python tests/faults/sweep_campaign.py speed --folder campaign                 # 12
-runs one by one, and two at a time
+python tests/faults/sweep_campaign.py node --sweeps 10 --folder campaign
+python tests/faults/sweep_campaign.py speed --folder campaign
+
+``node`` needs Ray, and starts two nodes on this machine. ``speed`` times 12 runs one by one, and
+two at a time.
 """
 
 import argparse
@@ -88,11 +90,15 @@ def main() -> None:
         (folder / "one.yaml").write_text(json.dumps({**spec, "seed": [0], "n_timesteps": 100}))
         begin = timed(folder, "one.yaml", "--workers", "1", "--executor", options.executor)
         print(
-            f"one by one {alone:.1f} s, two at a time {both:.1f} s, start-up {begin:.1f} s; load {os.getloadavg()[0]:.1f}"
+            f"one by one {alone:.1f} s, two at a time {both:.1f} s, start-up {begin:.1f} s; "
+            f"load {os.getloadavg()[0]:.1f}"
         )
         return
     seconds = timed(folder, "sweep.yaml", "--workers", "2")
-    whole, moments, kept, first = table(folder, 1), random.Random(options.seed), 0, 2
+    whole = table(folder, 1)
+    moments = random.Random(options.seed)
+    kept = 0
+    first = 2
     if options.kind == "node":
         seconds, on_nodes = node(folder, 2, None)
         if on_nodes != whole:
@@ -102,28 +108,23 @@ def main() -> None:
         first = 3
     for number in range(options.sweeps):
         moment = moments.uniform(0.1, 0.9) * seconds
-        found = (
-            driver(folder, number + first, moment)
-            if options.kind == "driver"
-            else node(folder, number + first, moment)[1]
-        )
-        same = found == whole
-        kept += same
-        print(
-            f"sweep {number + 1}: killed after {moment:.1f} s: {'the same table' if same else 'ANOTHER TABLE'}",
-            flush=True,
-        )
+        if options.kind == "driver":
+            result = driver(folder, number + first, moment)
+        else:
+            _, result = node(folder, number + first, moment)
+        kept += result == whole
+        verdict = "the same table" if result == whole else "ANOTHER TABLE"
+        print(f"sweep {number + 1}: killed after {moment:.1f} s: {verdict}", flush=True)
     print(
-        f"{kept} of {options.sweeps} end with all runs and the same table; load {os.getloadavg()[0]:.1f}"
+        f"{kept} of {options.sweeps} end with all runs and the same table; "
+        f"load {os.getloadavg()[0]:.1f}"
     )
 
 
 def driver(folder: Path, number: int, moment: float) -> str:
     """The table of a sweep whose driver is killed, then resumed."""
-    process, place = (
-        start(folder, "sweep.yaml", "--workers", "2"),
-        folder / f"logs/sweep/sweep_{number}",
-    )
+    process = start(folder, "sweep.yaml", "--workers", "2")
+    place = folder / f"logs/sweep/sweep_{number}"
     end = time.monotonic() + moment
     while time.monotonic() < end or not (place / "plan.json").is_file():
         time.sleep(0.05)
@@ -134,7 +135,7 @@ def driver(folder: Path, number: int, moment: float) -> str:
 
 
 def node(folder: Path, number: int, moment: float | None) -> tuple[float, str]:
-    """Seconds and table of a sweep on two nodes, of which one is killed, unless ``moment`` is None."""
+    """Seconds and table of a sweep on two nodes; one is killed, unless ``moment`` is None."""
     import ray
     from ray.cluster_utils import Cluster
 
@@ -148,10 +149,8 @@ def node(folder: Path, number: int, moment: float | None) -> tuple[float, str]:
     )
     lost = cluster.add_node(num_cpus=1)
     try:
-        begin, process = (
-            time.monotonic(),
-            start(folder, "sweep.yaml", "--executor", "ray", "--address", cluster.address),
-        )
+        begin = time.monotonic()
+        process = start(folder, "sweep.yaml", "--executor", "ray", "--address", cluster.address)
         if moment is not None:
             time.sleep(moment)
             cluster.remove_node(lost, allow_graceful=False)

@@ -73,8 +73,8 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
     from sb3_quad.base.imports import import_packages
-    from sb3_quad.sweep.expand import expand, suite_of
-    from sb3_quad.sweep.folder import Plan, SweepFolder
+    from sb3_quad.sweep.folder import Sweep, SweepFolder
+    from sb3_quad.sweep.runs import make_runs, suite_of
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
@@ -85,22 +85,22 @@ def run(options: argparse.Namespace) -> int:
         return _execute(options, folder.read(), folder)
     spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
-    plan = Plan(spec=spec, runs=tuple(expand(spec)), suite=suite_of(spec))
+    sweep = Sweep(spec=spec, runs=tuple(make_runs(spec)), suite=suite_of(spec))
     if options.dry_run:
-        _print_runs(plan)
+        _print_runs(sweep)
         return 0
-    return _execute(options, plan, None)
+    return _execute(options, sweep, None)
 
 
-def _print_runs(plan: Any) -> None:
-    for run in plan.runs:
+def _print_runs(sweep: Any) -> None:
+    for run in sweep.runs:
         stages = [
             f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
             for stage in run.stages
         ]
         print(f"{run.name}: {', then '.join(stages)}")
-    configurations = {run.configuration for run in plan.runs}
-    print(f"{_count(len(plan.runs), 'run')} of {_count(len(configurations), 'configuration')}")
+    configurations = {run.configuration for run in sweep.runs}
+    print(f"{_count(len(sweep.runs), 'run')} of {_count(len(configurations), 'configuration')}")
 
 
 def _spec(options: argparse.Namespace) -> Any:
@@ -153,10 +153,10 @@ def _add_defaults(data: dict[str, Any]) -> None:
     data.setdefault("env", DEFAULT_ENV)
 
 
-def _execute(options: argparse.Namespace, plan: Any, folder: Any) -> int:
+def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
     """Do what is left of a sweep. Returns the exit code.
 
-    :param plan: The sweep's Plan.
+    :param sweep: The sweep.
     :param folder: Its SweepFolder, None for a new one.
     """
     from sb3_quad.base.files import locked
@@ -166,15 +166,15 @@ def _execute(options: argparse.Namespace, plan: Any, folder: Any) -> int:
     from sb3_quad.sweep.run import execute
 
     start = time.perf_counter()
-    workers = min(options.workers or available_cpus(), len(plan.runs))
-    needs = plan.spec.resources
-    runs = _count(len(plan.runs), "run")
+    workers = min(options.workers or available_cpus(), len(sweep.runs))
+    needs = sweep.spec.resources
+    runs = _count(len(sweep.runs), "run")
     with start_executor(
         options.executor, workers, options.address, needs.num_cpus, needs.num_gpus
     ) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
-            folder = _new_folder(options, plan)
+            folder = _new_folder(options, sweep)
         parallel = f"{executor.workers} in parallel, executor {options.executor}"
         print(f"sweep {folder.path}: {runs}, {parallel}")
         with (
@@ -182,10 +182,10 @@ def _execute(options: argparse.Namespace, plan: Any, folder: Any) -> int:
             StopSignals() as signals,
             progress_bar(options.progress) as show,
         ):
-            records = execute(folder, plan, executor, signals, show, print)
+            records = execute(folder, sweep, executor, signals, show, print)
             # Nothing interrupts the results.
             signals.hold()
-            results = _write_results(folder, plan, records)
+            results = _write_results(folder, sweep, records)
     failures = [record for record in records.values() if record.state == "failed"]
     seconds = time.perf_counter() - start
     print(f"{results.finished} of {runs} finished, {len(failures)} failed; {seconds:.1f} s")
@@ -199,22 +199,22 @@ def _execute(options: argparse.Namespace, plan: Any, folder: Any) -> int:
     return 1 if failures else 0
 
 
-def _new_folder(options: argparse.Namespace, plan: Any) -> Any:
+def _new_folder(options: argparse.Namespace, sweep: Any) -> Any:
     from sb3_quad.sweep.folder import SweepFolder
     from sb3_quad.training.runs import claim_folder
 
     parent = Path(options.log_folder or "logs") / "sweep"
-    folder = SweepFolder(claim_folder(parent, plan.spec.name or "sweep"))
-    folder.write(plan)
+    folder = SweepFolder(claim_folder(parent, sweep.spec.name or "sweep"))
+    folder.write(sweep)
     return folder
 
 
-def _write_results(folder: Any, plan: Any, records: Any) -> Any:
+def _write_results(folder: Any, sweep: Any, records: Any) -> Any:
     """Write and print the comparison of the finished runs, and return it."""
     from sb3_quad.cli.output import console
-    from sb3_quad.sweep.results import evaluate, tables, write_report, write_results
+    from sb3_quad.sweep.results import summarize, tables, write_report, write_results
 
-    results = evaluate(plan, records)
+    results = summarize(sweep, records)
     write_results(folder, results)
     if results.groups:
         sections = tables(results)

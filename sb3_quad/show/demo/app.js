@@ -67,18 +67,18 @@ function frame(now) {
 }
 
 player.onEnd = () => {
-  const told = fleet.flying.map(({ agent, flight }) => {
+  const outcomes = fleet.flying.map(({ agent, flight }) => {
     const end = flight.arrival >= 0 ? `arrives after ${flight.arrival.toFixed(2)} s` : "survives";
     return `${agent.label} ${flight.lost ? "is lost" : end}`;
   });
-  if (!player.auto) say(told.join("; "));
+  if (!player.auto) say(outcomes.join("; "));
 };
 readPalette();
 board.build();
 new ResizeObserver(resize).observe(canvas);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", readPalette);
 resize();
-player.start("s1");
+player.start("upside down");
 player.set({ auto: !matchMedia("(prefers-reduced-motion: reduce)").matches });
 draw(Infinity);
 requestAnimationFrame((now) => {

@@ -32,7 +32,7 @@ export class Board {
     this.thrust = new Plot($("plot-thrust"), { low: 0, high: 2, ticks: [0, 1, 2] });
   }
 
-  /** Make the rows anew. */
+  /** Make the rows again. */
   build() {
     $("score").replaceChildren(...this.fleet.entries.map((entry, k) => this.#row(entry, k)));
     this.show();
@@ -47,8 +47,8 @@ export class Board {
     box.style.setProperty("--colour", colour);
     box.addEventListener("change", () => this.toggle(k));
     label.append(box, agent.label);
-    const told = agent.kind === "network" ? `trained on ${agent.vehicle || "random quadcopters"}` : "on the true state";
-    label.title = `${told}; key ${k + 1}`;
+    const origin = agent.kind === "network" ? `trained on ${agent.vehicle || "random quadcopters"}` : "on the true state";
+    label.title = `${origin}; key ${k + 1}`;
     head.append(label);
     row.append(head, ...[0, 1, 2].map(() => document.createElement("td")));
     row.addEventListener("pointerenter", () => (this.chosen = k));

@@ -14,9 +14,9 @@ const TOOLS = /** @type {const} */ (["throw", "push"]);
 const SWITCHES = /** @type {const} */ (["auto", "apart", "trails", "paused"]);
 /** @type {Object<string, string>} */
 const TITLES = {
-  "upside down": "At rest, upside down (u)",
-  s1: "The thesis's state s1: upside down, 2.8 m/s, 6.9 rad/s (a)",
-  s2: "The thesis's state s2: tumbling, 3.5 m/s, 6.9 rad/s (b)",
+  "upside down, at rest": "At rest, upside down (u)",
+  "upside down": "Upside down, 2.8 m/s, 6.9 rad/s: the thesis's state s1 (a)",
+  tumbling: "Tumbling, 3.5 m/s, 6.9 rad/s: the thesis's state s2 (b)",
   random: "Any attitude, velocity and spin (r)",
   "10 m away": "Level, the target 10 m away (f)",
 };
@@ -71,7 +71,7 @@ export class Controls {
   #buildStarts() {
     $("starts").append(...Object.keys(STARTS).map((name) => {
       const button = document.createElement("button");
-      const textContent = name.length > 2 ? name[0].toUpperCase() + name.slice(1) : name;
+      const textContent = name[0].toUpperCase() + name.slice(1);
       Object.assign(button, { type: "button", id: `start-${name}`, title: TITLES[name], textContent });
       button.addEventListener("click", () => this.start(name));
       return button;
@@ -185,10 +185,10 @@ export class Controls {
     const keys = {
       " ": () => player.set({ paused: !player.paused }),
       m: () => player.set({ speed: SPEEDS[(SPEEDS.indexOf(player.speed) + 1) % SPEEDS.length] }),
-      u: () => this.start("upside down"),
+      u: () => this.start("upside down, at rest"),
       r: () => this.start("random"),
-      a: () => this.start("s1"),
-      b: () => this.start("s2"),
+      a: () => this.start("upside down"),
+      b: () => this.start("tumbling"),
       f: () => this.start("10 m away"),
       Enter: () => {
         player.takeOver();
@@ -206,14 +206,14 @@ export class Controls {
       ArrowUp: () => player.nudge(0, 1),
       ArrowDown: () => player.nudge(0, -1),
     };
-    const deed = /^[1-9]$/.test(event.key) ? () => this.toggle(Number(event.key) - 1) : keys[event.key];
-    if (!deed || event.ctrlKey || event.metaKey || event.altKey || $("help").hasAttribute("open")) return;
+    const action = /^[1-9]$/.test(event.key) ? () => this.toggle(Number(event.key) - 1) : keys[event.key];
+    if (!action || event.ctrlKey || event.metaKey || event.altKey || $("help").hasAttribute("open")) return;
     const { target } = event;
     const presses = event.key === " " || event.key === "Enter"; // what the element itself answers
     const isButton = target instanceof HTMLButtonElement || (target instanceof HTMLInputElement && target.type !== "range");
     if (target instanceof HTMLSelectElement || (isButton && presses)) return;
     if (target instanceof HTMLInputElement && target.type === "range" && event.key.startsWith("Arrow")) return;
     event.preventDefault();
-    deed();
+    action();
   }
 }

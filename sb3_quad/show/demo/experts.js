@@ -4,7 +4,8 @@
  * @typedef {import("./vehicle.js").Vehicle} Vehicle
  * @typedef {(state: Float64Array, actions: Float32Array) => void} Law writes the four actions for a state
  */
-import { rotation } from "./dynamics.js";
+import { errorOf, rotation } from "./dynamics.js";
+import { part } from "./tables.js";
 import { armsOf, commandLag, hoverThrust, thrustRange } from "./vehicle.js";
 
 const { sqrt, min, max, abs, atan2, sin, cos } = Math;
@@ -33,10 +34,11 @@ export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) 
   const { mass, gravity: g } = v;
   const kiDt = ki * v.control_step;
   return (s, actions) => {
-    const ex = s[17] - s[0], ey = s[18] - s[1], ez = s[19] - s[2];
+    const [ex, ey, ez] = errorOf(s);
     const r = rotation(s);
     const roll = atan2(r[7], r[8]), pitch = Math.asin(clipped(-r[6])), yaw = atan2(r[3], r[0]);
-    const [vx, vy, vz] = [s[7], s[8], s[9]];
+    const [vx, vy, vz] = part(s, "velocity");
+    const rates = part(s, "body_rates");
     const ax = kp * ex - kd * (r[0] * vx + r[3] * vy + r[6] * vz);
     const ay = kp * ey - kd * (r[1] * vx + r[4] * vy + r[7] * vz);
     const az = kp * ez - kd * (r[2] * vx + r[5] * vy + r[8] * vz);
@@ -44,9 +46,9 @@ export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) 
     const pitchDes = (0.25 * (ax * cos(yaw) + ay * sin(yaw))) / g;
     const u = [
       mass * (g + az + kiDt * ez),
-      stiff[0] * (rollDes - roll) - damp[0] * s[10],
-      stiff[1] * (pitchDes - pitch) - damp[1] * s[11],
-      -stiff[2] * yaw - damp[2] * s[12],
+      stiff[0] * (rollDes - roll) - damp[0] * rates[0],
+      stiff[1] * (pitchDes - pitch) - damp[1] * rates[1],
+      -stiff[2] * yaw - damp[2] * rates[2],
     ];
     const thrusts = mixer.map((m) => m[0] * u[0] + m[1] * u[1] + m[2] * u[2] + m[3] * u[3]);
     const largest = max(...thrusts);
@@ -99,8 +101,8 @@ export function geometric(v) {
   const lag = commandLag(v);
   return (s, actions) => {
     const r = rotation(s);
-    const [p, q, w] = [s[10], s[11], s[12]];
-    const [fx, fy, fz] = desiredForce([s[17] - s[0], s[18] - s[1], s[19] - s[2]], [s[7], s[8], s[9]], gains, v.gravity);
+    const [p, q, w] = part(s, "body_rates");
+    const [fx, fy, fz] = desiredForce([...errorOf(s)], [...part(s, "velocity")], gains, v.gravity);
     const size = sqrt(fx * fx + fy * fy + fz * fz);
     const body = [0, 1, 2].map((k) => (r[k] * fx + r[3 + k] * fy + r[6 + k] * fz) / size);
     const [b1, b2, b3] = rotated(body, p, q, w, lag);

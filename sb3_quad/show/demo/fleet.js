@@ -28,6 +28,7 @@
  * @property {number} battery factor of the thrust
  */
 import { Flight, normals, NO_WRENCH, uniforms } from "./flight.js";
+import { part, STATE_SIZE } from "./tables.js";
 import { thrustRange } from "./vehicle.js";
 
 export const LOG_SECONDS = 8;
@@ -50,30 +51,30 @@ function inWorld([w, x, y, z], [a, b, c]) {
 }
 
 /**
- * Starts by name; s1 and s2 as the suite `thesis` has them, random as the task state_recovery.
+ * Starts by name; "upside down" and "tumbling" are s1 and s2 of the suite `thesis`, random is as in the task state_recovery.
  * @type {Object<string, (uniform: () => number) => Start>}
  */
 export const STARTS = {
-  "upside down": () => ({ position: HOME, quaternion: [0, 1, 0, 0], velocity: [0, 0, 0], rates: [0, 0, 0], target: HOME }),
-  s1: () => thesis([0, -1, 0, 0], [2, 2, 0]),
-  s2: () => thesis([0.42, -0.41, -0.81, 0], [2, 2, -2]),
+  "upside down, at rest": () => ({ position: HOME, quaternion: [0, 1, 0, 0], velocity: [0, 0, 0], body_rates: [0, 0, 0], target: HOME }),
+  "upside down": () => thesis([0, -1, 0, 0], [2, 2, 0]),
+  tumbling: () => thesis([0.42, -0.41, -0.81, 0], [2, 2, -2]),
   random: (uniform) => {
     const normal = () => Math.sqrt(-2 * Math.log(1 - uniform())) * Math.cos(2 * Math.PI * uniform());
     const three = (/** @type {number} */ std) => [normal(), normal(), normal()].map((each) => std * each);
-    return { position: HOME, quaternion: unit([...three(1), normal()]), velocity: three(2), rates: three(4), target: HOME };
+    return { position: HOME, quaternion: unit([...three(1), normal()]), velocity: three(2), body_rates: three(4), target: HOME };
   },
   "10 m away": (uniform) => {
     const [up, azimuth] = [2 * uniform() - 1, 2 * Math.PI * uniform()];
     const across = 10 * Math.sqrt(1 - up * up);
     const target = [across * Math.cos(azimuth), across * Math.sin(azimuth), HOME[2] + 10 * up];
-    return { position: HOME, quaternion: [1, 0, 0, 0], velocity: [0, 0, 0], rates: [0, 0, 0], target };
+    return { position: HOME, quaternion: [1, 0, 0, 0], velocity: [0, 0, 0], body_rates: [0, 0, 0], target };
   },
 };
 
 /** @param {number[]} quaternion @param {number[]} velocity body frame @returns {Start} */
 function thesis(quaternion, velocity) {
   const q = unit(quaternion);
-  return { position: HOME, quaternion: q, velocity: inWorld(q, velocity), rates: [4, 4, 4], target: HOME };
+  return { position: HOME, quaternion: q, velocity: inWorld(q, velocity), body_rates: [4, 4, 4], target: HOME };
 }
 
 export class Fleet {
@@ -104,7 +105,7 @@ export class Fleet {
     /** @type {Entry} */
     const entry = {
       ...{ agent, colour, active: true, flight: null, why: "", judged: true, survived: 0, attempts: 0 },
-      ...{ log: [], trail: [], before: new Float64Array(20) },
+      ...{ log: [], trail: [], before: new Float64Array(STATE_SIZE) },
     };
     this.entries.push(entry);
     this.#equip(entry);
@@ -131,7 +132,7 @@ export class Fleet {
     flight.setWorld({ mass, motors, thrust: battery, delay }, noise);
   }
 
-  /** All fly another vehicle from now on; scores begin anew. @param {Vehicle} vehicle */
+  /** All fly another vehicle from now on; scores begin again. @param {Vehicle} vehicle */
   setVehicle(vehicle) {
     if (this.settings.delay === this.vehicle.delay) this.settings.delay = vehicle.delay;
     this.vehicle = vehicle;
@@ -235,7 +236,7 @@ export class Fleet {
     const dt = this.vehicle.control_step;
     entry.log.push([flight.time, flight.distance, flight.tilt, ...flight.thrusts]);
     if (entry.log.length > LOG_SECONDS / dt) entry.log.shift();
-    entry.trail.push([...flight.state.subarray(0, 3)]);
+    entry.trail.push([...part(flight.state, "position")]);
     if (entry.trail.length > TRAIL_SECONDS / dt) entry.trail.shift();
     const calm = flight.time - flight.settled >= CALM_SECONDS;
     if (!entry.judged && (flight.lost || calm || flight.time >= EPISODE_SECONDS)) {
@@ -254,7 +255,7 @@ export class Fleet {
  */
 export function physicalLimit(vehicle, start) {
   const times = vehicle.time_optimal;
-  const level = start.quaternion[0] === 1 && ![...start.velocity, ...start.rates].some(Boolean);
+  const level = start.quaternion[0] === 1 && ![...start.velocity, ...start.body_rates].some(Boolean);
   const distance = Math.hypot(...start.target.map((each, k) => each - start.position[k]));
   const known = level ? Object.entries(times ?? {}).find(([metres]) => Math.abs(Number(metres) - distance) < 1e-3) : undefined;
   return known ? known[1] : null;

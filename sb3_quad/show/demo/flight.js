@@ -22,18 +22,20 @@
  * @property {number[]} position m
  * @property {number[]} quaternion body to world
  * @property {number[]} velocity world frame, m/s
- * @property {number[]} rates body frame, rad/s
+ * @property {number[]} body_rates body frame, rad/s
  * @property {number[]} target m
  */
-import { commandedSpeeds, distanceOf, physicsStep, rotation, STATE_SIZE, tiltOf } from "./dynamics.js";
+import { commandedSpeeds, distanceOf, physicsStep, rotation, tiltOf } from "./dynamics.js";
 import { geometric, pid } from "./experts.js";
 import { forward } from "./network.js";
 import { Observer } from "./observation.js";
+import { part, STATE_SIZE, X } from "./tables.js";
 import { findTurn, parametersOf } from "./vehicle.js";
 
 export const NEAR = 0.1; // m: arrival
 export const MAX_DISTANCE = 30; // m, farther from the target ends a flight
 const EXPERTS = { pid, geometric };
+const STARTED = /** @type {const} */ (["position", "quaternion", "velocity", "body_rates", "target"]);
 /** @type {Wrench} */
 export const NO_WRENCH = { force: [0, 0, 0], torque: [0, 0, 0], wind: [0, 0, 0] };
 
@@ -66,7 +68,7 @@ export class Flight {
     } else {
       this.law = EXPERTS[agent.kind](vehicle);
     }
-    this.begin({ position: [0, 0, 5], quaternion: [1, 0, 0, 0], velocity: [0, 0, 0], rates: [0, 0, 0], target: [0, 0, 5] });
+    this.begin({ position: [0, 0, 5], quaternion: [1, 0, 0, 0], velocity: [0, 0, 0], body_rates: [0, 0, 0], target: [0, 0, 5] });
   }
 
   /** Fly in another world from now on. @param {World} world @param {number} noise relative */
@@ -82,7 +84,8 @@ export class Flight {
   begin(start) {
     const { hoverSpeed, delay } = this.parameters;
     const hover = Array(4).fill(hoverSpeed);
-    this.state.set([...start.position, ...start.quaternion, ...start.velocity, ...start.rates, ...hover, ...start.target]);
+    for (const name of STARTED) this.state.set(start[name], X[name]);
+    this.state.set(hover, X.rotor_speeds);
     this.queue = Array.from({ length: delay }, () => [...hover]);
     this.time = 0;
     this.lost = "";
@@ -94,9 +97,9 @@ export class Flight {
     }
   }
 
-  /** @param {number[]} target m; arrival is counted anew from now on */
+  /** @param {number[]} target m; arrival counts again from now on */
   setTarget(target) {
-    this.state.set(target, 17);
+    this.state.set(target, X.target);
     this.arrival = this.settled = NaN;
   }
 
@@ -126,7 +129,7 @@ export class Flight {
 
   #judge() {
     const distance = distanceOf(this.state);
-    if (this.state[2] <= this.parameters.radius) this.lost ||= "collision";
+    if (this.state[X.position + 2] <= this.parameters.radius) this.lost ||= "collision";
     else if (distance > MAX_DISTANCE) this.lost ||= "out of range";
     if (distance > NEAR) {
       this.away = true;
@@ -149,7 +152,7 @@ export class Flight {
   get thrusts() {
     const { lift } = this.parameters;
     const hover = (this.vehicle.mass * this.vehicle.gravity) / 4;
-    return [0, 1, 2, 3].map((k) => (lift * this.state[13 + k] ** 2) / hover);
+    return [...part(this.state, "rotor_speeds")].map((speed) => (lift * speed ** 2) / hover);
   }
 
   get rotation() {

@@ -1,5 +1,5 @@
 /**
- * What a pointer does to the picture: it throws or pushes vehicles, drags the target, turns the camera, zooms.
+ * Gestures of a pointer: throw or push vehicles, drag the target, turn the camera, zoom.
  *
  * @typedef {import("./camera.js").Camera} Camera
  *
@@ -8,7 +8,7 @@
  * @property {number} index of the vehicle
  * @property {number[]} position m, its lane included
  *
- * @typedef {object} Deeds
+ * @typedef {object} Gestures
  * @property {() => Holdable[]} things
  * @property {"throw" | "push"} tool what dragging a vehicle does
  * @property {(index: number) => void} grab
@@ -21,8 +21,8 @@
 const REACH = { mouse: 34, touch: 46 }; // pixels
 const FLICK = 0.09; // s before the release that make the velocity
 
-/** @param {HTMLCanvasElement} canvas @param {Camera} camera @param {Deeds} deeds */
-export function listen(canvas, camera, deeds) {
+/** @param {HTMLCanvasElement} canvas @param {Camera} camera @param {Gestures} gestures */
+export function listen(canvas, camera, gestures) {
   /** @type {Map<number, {x: number, y: number}>} */
   const pointers = new Map();
   /** @type {{kind: string, index: number, depth: number, x: number, y: number, samples: number[][]} | null} */
@@ -37,7 +37,7 @@ export function listen(canvas, camera, deeds) {
   /** What is nearest to a pointer, within reach. @param {{x: number, y: number}} at @param {number} reach */
   const find = (at, reach) => {
     let best = null, least = reach;
-    for (const thing of deeds.things()) {
+    for (const thing of gestures.things()) {
       const [x, y, depth] = camera.project(thing.position);
       const behind = thing.kind === "target" ? 6 : 0; // a vehicle at its target is taken first
       const away = Math.hypot(x - at.x, y - at.y) + behind;
@@ -46,7 +46,7 @@ export function listen(canvas, camera, deeds) {
     return best;
   };
 
-  /** The velocity of what is held, m/s. @param {PointerEvent} event of the moment */
+  /** The velocity of what is held, m/s. @param {PointerEvent} event the latest one */
   const velocity = (event) => {
     const samples = held?.samples ?? [];
     const now = event.timeStamp / 1000, last = samples[samples.length - 1];
@@ -65,12 +65,12 @@ export function listen(canvas, camera, deeds) {
       return;
     }
     const thing = find(at, event.pointerType === "mouse" ? REACH.mouse : REACH.touch);
-    const pushes = deeds.tool === "push" || event.button === 2 || event.shiftKey;
-    const kind = !thing ? "camera" : thing.kind === "target" ? "target" : pushes ? "push" : "throw";
+    const isPush = gestures.tool === "push" || event.button === 2 || event.shiftKey;
+    const kind = !thing ? "camera" : thing.kind === "target" ? "target" : isPush ? "push" : "throw";
     const { index, depth } = thing ?? { index: 0, depth: 1 };
     held = { kind, index, depth, ...at, samples: [[event.timeStamp / 1000, at.x, at.y]] };
-    if (kind === "throw") deeds.grab(held.index);
-    if (kind === "target") deeds.target(null);
+    if (kind === "throw") gestures.grab(held.index);
+    if (kind === "target") gestures.target(null);
     canvas.dataset.hand = kind;
   });
 
@@ -96,9 +96,9 @@ export function listen(canvas, camera, deeds) {
     held.samples.push([event.timeStamp / 1000, at.x, at.y]);
     if (held.samples.length > 60) held.samples.shift();
     const way = camera.way(at.x - held.x, at.y - held.y, held.depth);
-    if (held.kind === "throw") deeds.carry(way, velocity(event));
-    else if (held.kind === "push") deeds.push(way);
-    else if (held.kind === "target") deeds.target(way);
+    if (held.kind === "throw") gestures.carry(way, velocity(event));
+    else if (held.kind === "push") gestures.push(way);
+    else if (held.kind === "target") gestures.target(way);
     else {
       camera.yaw -= (at.x - before.x) * 0.006;
       camera.pitch = Math.min(1.45, Math.max(-0.2, camera.pitch + (at.y - before.y) * 0.005));
@@ -106,8 +106,8 @@ export function listen(canvas, camera, deeds) {
   });
 
   const finish = (/** @type {PointerEvent} */ event) => {
-    if (held?.kind === "throw") deeds.release(velocity(event));
-    if (held?.kind === "push") deeds.push(null);
+    if (held?.kind === "throw") gestures.release(velocity(event));
+    if (held?.kind === "push") gestures.push(null);
     held = null;
     canvas.dataset.hand = "";
   };

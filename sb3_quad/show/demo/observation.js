@@ -1,5 +1,5 @@
 /**
- * What a policy sees, as sb3_quad/simulation/{observation,frames}.py have it, in float32 where they are: 18 features
+ * The observation of a policy, as sb3_quad/simulation/{observation,frames}.py have it, in float32 where they are: 18 features
  * (thesis 3.3.1) with their noise and scaling (Eq. 3.16), last action, earlier frames and the integral of the position error.
  *
  * @typedef {import("./vehicle.js").Turn} Turn
@@ -9,17 +9,14 @@
  * @property {number[] | null} history ages of the observed frames, control steps
  * @property {{gain: number, distance: number, speed: number, limit: number} | null} position_integral
  */
-import { rotation } from "./dynamics.js";
+import { errorOf, rotation } from "./dynamics.js";
+import { DEFAULT_STD, F, OBSERVATION_SIZE, part } from "./tables.js";
 
-export const OBSERVATION_SIZE = 18;
 const NO_TURN = { angle: 0, order: [0, 1, 2, 3] };
 const f32 = Math.fround;
-const third = Math.sqrt(3);
-/** σ of Eq. 3.16 (Table A.2). */
-export const DEFAULT_STD = [...Array(3).fill(10 / third), ...Array(9).fill(third), ...Array(6).fill(5)];
 
 /**
- * The features of a state, without noise, in the axes of a layout, float32 (18,).
+ * The features of a state, without noise, in the axes of a layout, float32 (OBSERVATION_SIZE,).
  * @param {Float64Array} s
  * @param {Turn} turn
  * @param {Float32Array} out
@@ -27,19 +24,18 @@ export const DEFAULT_STD = [...Array(3).fill(10 / third), ...Array(9).fill(third
 export function features(s, turn, out) {
   const r = rotation(s);
   const cosine = Math.cos(turn.angle), sine = Math.sin(turn.angle);
-  const v = [0, 1, 2].map((k) => r[k] * s[7] + r[3 + k] * s[8] + r[6 + k] * s[9]);
-  const rows = [[r[0], r[3], r[6]], [r[1], r[4], r[7]], [r[2], r[5], r[8]], v, [s[10], s[11], s[12]]];
-  for (let k = 0; k < 3; k++) out[k] = s[k] - s[17 + k];
-  for (let k = 0; k < 3; k++) {
-    out[3 + k] = cosine * rows[0][k] - sine * rows[1][k];
-    out[6 + k] = sine * rows[0][k] + cosine * rows[1][k];
-    out[9 + k] = rows[2][k];
-  }
-  rows.slice(3).forEach(([x, y, z], j) => {
-    out[12 + 3 * j] = cosine * x - sine * y;
-    out[13 + 3 * j] = sine * x + cosine * y;
-    out[14 + 3 * j] = z;
-  });
+  /** A vector of the body, as the layout's axes have it. @param {ArrayLike<number>} v @param {number} first @param {number} stride */
+  const turned = (v, first, stride = 1) => {
+    out[first] = cosine * v[0] - sine * v[1];
+    out[first + stride] = sine * v[0] + cosine * v[1];
+    out[first + 2 * stride] = v[2];
+  };
+  const velocity = part(s, "velocity");
+  out.set(errorOf(s).map((each) => -each), F.position);
+  // World to body, row by row: its columns are the world's axes, seen from the body.
+  for (let k = 0; k < 3; k++) turned(r.slice(3 * k, 3 * k + 3), F.rotation + k, 3);
+  turned([0, 1, 2].map((k) => r[k] * velocity[0] + r[3 + k] * velocity[1] + r[6 + k] * velocity[2]), F.velocity);
+  turned(part(s, "body_rates"), F.body_rates);
 }
 
 /** Observations of one flight, with what they remember. */
@@ -53,7 +49,7 @@ export class Observer {
    * @param {Turn} [how.turn]
    * @param {() => number} [how.normal]
    */
-  constructor(settings, controlStep, { mean = Array(18).fill(0), std = DEFAULT_STD, turn = NO_TURN, normal = () => 0 } = {}) {
+  constructor(settings, controlStep, { mean = Array(OBSERVATION_SIZE).fill(0), std = DEFAULT_STD, turn = NO_TURN, normal = () => 0 } = {}) {
     this.ages = settings.history ?? [0];
     this.size = OBSERVATION_SIZE + (settings.last_action ? 4 : 0);
     this.depth = this.ages[this.ages.length - 1] + 1;
@@ -110,15 +106,18 @@ export class Observer {
   #integrate({ gain, distance, speed, limit }) {
     const value = (/** @type {number} */ k) => f32(f32(this.feature[k] / this.inverse[k]) + this.mean[k]);
     const square = (/** @type {number} */ k) => value(k) ** 2 + value(k + 1) ** 2 + value(k + 2) ** 2;
-    if (square(0) >= distance ** 2 || square(12) >= speed ** 2) return;
-    this.sum = this.sum.map((s, k) => Math.min(Math.max(s + gain * this.controlStep * value(k), -limit), limit));
+    if (square(F.position) >= distance ** 2 || square(F.velocity) >= speed ** 2) return;
+    this.sum = this.sum.map((s, k) => Math.min(Math.max(s + gain * this.controlStep * value(F.position + k), -limit), limit));
   }
 
   #observe() {
     const { step, depth, size, frames, out } = this;
     const now = (step % depth) * size;
     frames.set(this.feature, now);
-    if (this.integral) for (let k = 0; k < 3; k++) frames[now + k] += f32(f32(this.sum[k]) * this.inverse[k]);
+    if (this.integral) {
+      const first = F.position;
+      this.sum.forEach((s, k) => (frames[now + first + k] += f32(f32(s) * this.inverse[first + k])));
+    }
     this.ages.forEach((age, k) => {
       const then = ((step - age + depth * 2) % depth) * size;
       if (age <= step) out.set(frames.subarray(then, then + size), k * size);

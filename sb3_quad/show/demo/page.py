@@ -2,7 +2,7 @@
 that needs no network.
 
 The scripts are ES modules without dependencies. They become one script here, so that no build step
-is needed.
+is needed; the tables of states and features in it are those of :mod:`sb3_quad.simulation`.
 """
 
 import base64
@@ -15,6 +15,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
 from sb3_quad.base.arrays import Float32Array
@@ -26,17 +27,21 @@ from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.export.check import Reference
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
+from sb3_quad.simulation.state import STATE, STATE_SIZE, X
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
 DEFAULT_AGENTS = (
     "pid",
     "geometric",
-    "stage two=itm-recovery",
+    "RL agent=itm-recovery",
     "any-quadcopter",
-    "stage one=itm-imitation",
+    "imitation agent=itm-imitation",
 )
 LIMIT = 500_000  # bytes of a page, above which the largest networks are rounded to half precision
+# The modules of the page in the order of their imports: those that need no browser, and the others.
 MODEL = (
+    "tables",
     "vehicle",
     "dynamics",
     "observation",
@@ -44,7 +49,7 @@ MODEL = (
     "experts",
     "flight",
     "weights",
-)  # without a browser, in this order
+)
 VIEW = (
     "fleet",
     "camera",
@@ -58,59 +63,78 @@ VIEW = (
     "app",
 )
 EXPERTS = ("pid", "geometric")
+FEATURES = {"position", "rotation", "velocity", "body_rates"}  # that observation.js computes
+TABLES = {
+    "X": X._asdict(),
+    "SIZES": STATE,
+    "STATE_SIZE": STATE_SIZE,
+    "F": F._asdict(),
+    "OBSERVATION_SIZE": OBSERVATION_SIZE,
+    "DEFAULT_STD": DEFAULT_STD.tolist(),
+}
+# Parts of a script: strings, templates (also with a template in them) and comments at the end of a
+# line are kept as they are; documentation, imports, the word export, indentation and comment lines
+# are removed.
+PARTS = re.compile(
+    r"""
+    (?P<kept>
+        "(?:\\.|[^"\\\n])*" | '(?:\\.|[^'\\\n])*'
+        | `(?:\\.|\$\{(?:[^`{}]|\{[^`{}]*\}|`(?:\\.|[^`\\])*`)*\}|[^`\\])*`
+        | (?<=\S)[ ]*//[^\n]*
+    )
+    | /\*\*.*?\*/ | ^import\ [^;]*; | ^export\ (?=\w) | ^\s*//[^\n]* | ^\s+
+    """,
+    re.MULTILINE | re.DOTALL | re.VERBOSE,
+)
 
 
 def make_page(
     specs: Sequence[ControllerSpec], vehicle: Vehicle | None = None
 ) -> tuple[str, Vehicle, list[str]]:
-    """The page as text, the vehicle that all fly at first, and which agents' weights are rounded to
-    make the page small.
+    """Return the page as text, the vehicle that all fly at first, and the agents whose weights are
+    rounded to make the page small.
 
-    :param specs: who flies, from the first on as many as are shown.
+    :param specs: the controllers, from the first on as many as are shown.
     :param vehicle: that all fly at first; None: the first agent's own, else ``itm``.
     :raises ConfigError: a controller that the page cannot fly, or settings that cannot be read.
     """
-    agents, networks = [], {}
-    for spec, colour in zip(
-        specs, colours_of([spec.label for spec in specs]).values(), strict=True
-    ):
-        described, networks[spec.label] = describe(spec)
-        agents.append({"label": spec.label, "colour": colour, **described})
+    # A vehicle that is given comes first, then those of the agents, each under a name of its own.
+    colours = colours_of([spec.label for spec in specs])
     vehicles = {name: load_vehicle(name) for name in VEHICLES.names()}
-    own = [
-        _add(vehicles, first_vehicle(spec.own.vehicle))
-        for spec in specs
-        if spec.own and not spec.own.vehicles
-    ]
-    first = _add(vehicles, vehicle or [*own, vehicles["itm"]][0])
+    first = vehicle and _add(vehicles, vehicle)
+    agents = []
+    networks: dict[str, Network] = {}
+    for spec in specs:
+        described, network = describe(spec)
+        agents.append({"label": spec.label, "colour": colours[spec.label], **described})
+        if network is not None:
+            networks[spec.label] = network
+        if spec.own and not spec.own.vehicles:
+            own = _add(vehicles, first_vehicle(spec.own.vehicle))
+            first = first or own
+    first = first or vehicles["itm"]
     data = {
-        "vehicles": [each.model_dump(mode="json") for each in vehicles.values()],
+        "vehicles": [known.model_dump(mode="json") for known in vehicles.values()],
         "vehicle": first.name,
         "colours": COLOURS,
+        "agents": agents,
     }
-    sizes = {
-        label: numbers(network).size for label, network in networks.items() if network is not None
-    }
-    by_size = sorted(sizes, key=lambda label: -sizes[label])
-    for count in range(len(by_size) + 1):  # of the largest networks that are rounded
+    # Round one network after the other, the largest first, until the page is small enough.
+    by_size = sorted(networks, key=lambda label: -numbers(networks[label]).size)
+    for count in range(len(by_size) + 1):
         rounded = by_size[:count]
-        packed = {
-            label: pack(network, label in rounded)
-            for label, network in networks.items()
-            if network is not None
-        }
-        page = _render(
-            {**data, "agents": [agent | packed.get(agent["label"], {}) for agent in agents]},
-            rounded,
-        )
+        for agent in agents:
+            if agent["label"] in networks:
+                agent.update(pack(networks[agent["label"]], agent["label"] in rounded))
+        page = _render(data, rounded)
         if len(page.encode()) <= LIMIT:
             break
     return page, first, rounded
 
 
 def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
-    """Add a vehicle to others unless one of them flies the same; it is given another name if its
-    own is taken.
+    """Add a vehicle to others unless one of them flies the same. It gets another name if its own
+    is taken.
     """
     for known in vehicles.values():
         if known.name == vehicle.name and known.flies_as(vehicle):
@@ -121,9 +145,10 @@ def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
 
 
 def describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
-    """A controller as the page knows it, but for its weights; and its network.
+    """Return a controller as the page knows it, but for its weights; and its network.
 
-    :raises ConfigError: neither an expert of the page nor an agent in a zip that exports.
+    :raises ConfigError: neither an expert of the page nor an agent in a zip that exports, or an
+        observation with a feature that the page does not compute.
     """
     if spec.spec in EXPERTS:
         return {"kind": spec.spec}, None
@@ -131,45 +156,45 @@ def describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
         raise ConfigError(
             f"controller {spec.spec}: the page flies {', '.join(EXPERTS)}, and agents in zips"
         )
+    further = ", ".join(sorted(GROUPS.keys() - FEATURES))
+    if further:
+        raise ConfigError(f"controller {spec.spec}: the page does not compute {further}")
     settings = agent_settings(spec.spec)[0]
     layout = settings.layout
-    row = QuadcopterBatch(
-        1, settings.with_changes(vehicle=layout, randomize=None), n_threads=1
-    )  # it checks the scaling
-    mean, std = row.mean[:, 0], row.std[:, 0]
-    reference = Reference(load_model(spec.spec), layout, mean, std, "thrusts", row.observation)
+    # A batch of one row checks the scaling.
+    row = QuadcopterBatch(1, settings.with_changes(vehicle=layout, randomize=None), n_threads=1)
+    reference = Reference(
+        model=load_model(spec.spec),
+        vehicle=layout,
+        mean=row.mean[:, 0],
+        std=row.std[:, 0],
+        observation=row.observation,
+    )
     network = build_network(reference, f"model {spec.spec}")
-    steps = [
-        {"inputs": each.in_features, "outputs": each.out_features, "activation": after}
-        for each, after in network.steps
-    ]
     described = {
         "kind": "network",
         "vehicle": "" if settings.vehicles is not None else first_vehicle(settings.vehicle).name,
         "layout": layout.model_dump(mode="json", include={"rotor_positions", "rotor_directions"}),
         "observation": row.observation.model_dump(mode="json"),
-        "mean": mean.tolist(),
-        "std": std.tolist(),
-        "shapes": steps,
+        "mean": reference.mean.tolist(),
+        "std": reference.std.tolist(),
+        "shapes": network.shapes,
     }
     return described, network
 
 
 def numbers(network: Network) -> Float32Array:
     """Weights and biases, layer by layer."""
-    layers = [
-        part.detach().numpy().ravel()
-        for each, _ in network.steps
-        for part in (each.weight, each.bias)
-    ]
-    return np.concatenate(layers)
+    return parameters_to_vector(network.parameters()).numpy()
 
 
 def pack(network: Network, rounded: bool) -> dict[str, Any]:
-    """A network's numbers as text: planes, each of one byte of every number, deflated, in base64.
+    """Return a network's numbers as text: planes, each of one byte of every number, deflated, in
+    base64.
 
     :param rounded: whether to half precision.
     """
+    # Sorted by byte, the signs and exponents stand together and deflate better.
     values = numbers(network).astype("<f2" if rounded else "<f4")
     planes = np.frombuffer(values.tobytes(), np.uint8).reshape(values.size, -1).T.tobytes()
     return {
@@ -179,20 +204,27 @@ def pack(network: Network, rounded: bool) -> dict[str, Any]:
 
 
 def script(modules: Iterable[str] = (*MODEL, *VIEW)) -> str:
-    """The named modules as one script, in this order, without comments of their own lines and
-    without indentation.
-    """
+    """Return the named modules as one script, in this order."""
     sources = files(__package__)
     text = "\n".join(sources.joinpath(f"{name}.js").read_text("utf-8") for name in modules)
-    return re.sub(
-        r"/\*\*.*?\*/|^import [^;]*;|^export (?=\w)|^\s+|^\s*//[^\n]*", "", text, flags=re.M | re.S
-    )
+    return join_modules(text).replace('JSON.parse("TABLES")', json.dumps(TABLES))
+
+
+def join_modules(text: str) -> str:
+    """Return modules, one after the other, as one script without imports, exports, documentation
+    and indentation; strings and template literals stay as they are.
+    """
+    return PARTS.sub(lambda match: match["kept"] or "", text)
 
 
 def _render(data: dict[str, Any], rounded: Sequence[str]) -> str:
-    notes = f"sb3_quad {__version__}. The page flies what sb3_quad flies in Python, in double precision."
+    notes = (
+        f"sb3_quad {__version__}. "
+        "The page flies what sb3_quad flies in Python, in double precision."
+    )
     if rounded:
         notes += f" Weights of {' and '.join(rounded)} are rounded to half precision."
+    # Without "<", no text in the data can end the script element.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(__package__, ""), undefined=jinja2.StrictUndefined

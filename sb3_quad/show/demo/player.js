@@ -1,5 +1,5 @@
 /**
- * Time and deeds: how the fleet's flights go on while somebody watches, throws, pushes, and moves the target.
+ * The clock of the flights, and what the visitor does: throw, push, move the target.
  *
  * @typedef {import("./fleet.js").Entry} Entry
  * @typedef {import("./camera.js").Camera} Camera
@@ -8,15 +8,16 @@
  */
 import { rotation, turnBody } from "./dynamics.js";
 import { Fleet, STARTS } from "./fleet.js";
+import { part, STATE_SIZE, X } from "./tables.js";
 
 const LANE = 2.4; // m between vehicles
 const FASTEST = 14; // m/s of a throw
 const TUMBLE = 1.1; // rad/s of a throw, per m/s
-const SPIN = 12; // rad/s at which something in the hand turns at most
+const SPIN = 12; // rad/s at which a dragged vehicle turns at most
 const STRONGEST = 1.2; // of a push, weights
 const KICK_SECONDS = 0.15;
 const PAUSE = 1.4; // s between attempts of the automatic flight
-const CYCLE = ["random", "10 m away", "upside down", "random", "s2", "s1"];
+const CYCLE = ["random", "10 m away", "upside down, at rest", "random", "tumbling", "upside down"];
 
 export class Player {
   /** @param {Fleet} fleet @param {Camera} camera */
@@ -25,11 +26,11 @@ export class Player {
     this.camera = camera;
     this.paused = false;
     this.speed = 1;
-    this.auto = true; // starts anew by itself
+    this.auto = true; // starts again by itself
     this.apart = true; // each vehicle in a lane of its own
     this.trails = true;
     this.touched = false;
-    this.startName = "s1"; // of the present attempt; empty after a throw
+    this.startName = "upside down"; // of the present attempt; empty after a throw
     /** @type {"throw" | "push"} */
     this.tool = "throw";
     this.carried = 0; // s of flight that are due
@@ -111,17 +112,18 @@ export class Player {
       const lane = [0, this.apart ? -(place - (flying.length - 1) / 2) * LANE : 0, 0];
       const share = flight.lost || fleet.held ? 1 : this.carried / fleet.vehicle.control_step;
       const between = flight.state.map((each, k) => before[k] + share * (each - before[k]));
-      const size = Math.hypot(between[3], between[4], between[5], between[6]) || 1;
-      for (let k = 3; k < 7; k++) between[k] /= size;
+      const attitude = part(between, "quaternion");
+      const size = Math.hypot(...attitude) || 1;
+      attitude.forEach((each, k) => (attitude[k] = each / size));
       const inLane = (/** @type {ArrayLike<number>} */ v) => lane.map((each, k) => v[k] + each);
       return {
         label: entry.agent.label,
         colour: entry.colour,
-        position: inLane(between),
+        position: inLane(part(between, "position")),
         rotation: rotation(between),
         thrusts: flight.thrusts,
         angles: this.angles.get(entry) ?? [0, 0, 0, 0],
-        target: inLane(flight.state.subarray(17)),
+        target: inLane(part(flight.state, "target")),
         trail: entry.trail,
         lane,
         lost: flight.lost,
@@ -131,9 +133,9 @@ export class Player {
     });
   }
 
-  // ------------------------------------------------------------ deeds of the hand
+  // ------------------------------------------------------------ what the visitor drags
 
-  /** What can be taken in the hand. @returns {import("./hand.js").Holdable[]} */
+  /** What the visitor can drag. @returns {import("./hand.js").Holdable[]} */
   things() {
     return this.bodies().flatMap(({ position, target }, index) => [
       { kind: /** @type {const} */ ("vehicle"), index, position },
@@ -141,10 +143,10 @@ export class Player {
     ]);
   }
 
-  /** Take a vehicle in the hand, and with it all others. @param {number} index */
+  /** Grab a vehicle, and with it all others. @param {number} index */
   grab(index) {
     const { state } = this.fleet.flying[index].flight;
-    this.grabbed = { position: [...state.subarray(0, 3)], quaternion: [...state.subarray(3, 7)] };
+    this.grabbed = { position: [...part(state, "position")], quaternion: [...part(state, "quaternion")] };
     this.startName = "";
     this.fleet.hold(this.#inHand([0, 0, 0], [0, 0, 0]));
     for (const entry of this.fleet.entries) entry.trail = [];
@@ -212,8 +214,8 @@ export class Player {
   }
 
   #grabbedState() {
-    const state = new Float64Array(20);
-    state.set(this.grabbed.quaternion, 3);
+    const state = new Float64Array(STATE_SIZE);
+    state.set(this.grabbed.quaternion, X.quaternion);
     return state;
   }
 
@@ -225,7 +227,7 @@ export class Player {
     const [x, y, z] = rates.map((each) => (each / size) * Math.sin(half));
     const state = this.#grabbedState();
     turnBody(state, Math.cos(half), x, y, z);
-    this.grabbed.quaternion = [...state.subarray(3, 7)];
+    this.grabbed.quaternion = [...part(state, "quaternion")];
   }
 
   /** @param {number[]} way @param {number[]} velocity @returns {Start} */
@@ -235,6 +237,6 @@ export class Player {
     const share = Math.min(1, FASTEST / Math.max(Math.hypot(...velocity), 1e-9));
     const held = velocity.map((each) => each * share);
     const { quaternion } = this.grabbed, { target } = this.fleet.start;
-    return { position, quaternion, velocity: held, rates: this.#spin(held), target };
+    return { position, quaternion, velocity: held, body_rates: this.#spin(held), target };
   }
 }

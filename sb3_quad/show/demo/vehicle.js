@@ -136,14 +136,14 @@ function permutations(items) {
 const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
 /**
- * The smallest turn that brings the rotors to where a layout has them; null: there is none.
+ * The smallest turn that brings the rotors to where a layout has them; null: no turn does.
  * @param {Layout} ours
  * @param {Layout} theirs
  * @returns {Turn | null}
  */
 export function findTurn(ours, theirs) {
   const [places, goals] = [ours, theirs].map((each) => each.rotor_positions.map(([x, y]) => Math.atan2(y, x)));
-  const found = [];
+  const turns = [];
   for (const order of permutations([0, 1, 2, 3])) {
     if (order.some((from, k) => ours.rotor_directions[from] !== theirs.rotor_directions[k])) continue;
     const apart = order.map((from, k) => wrapped(goals[k] - places[from]));
@@ -152,12 +152,12 @@ export function findTurn(ours, theirs) {
     const misfit = Math.max(...apart.map((each) => Math.abs(wrapped(each - angle))));
     const eighth = Math.round(angle / (Math.PI / 4)) * (Math.PI / 4);
     if (Math.abs(angle - eighth) < SLACK) angle = eighth;
-    found.push({ misfit, angle, order });
+    turns.push({ misfit, angle, order });
   }
-  const least = Math.min(...found.map((each) => each.misfit));
+  const least = Math.min(...turns.map((each) => each.misfit));
   if (!(least < TOLERANCE)) return null;
   const key = (/** @type {Turn} */ turn) => [Math.round(Math.abs(turn.angle) * 1e6), -turn.angle];
-  const fitting = found.filter((each) => each.misfit < least + SLACK);
+  const fitting = turns.filter((each) => each.misfit < least + SLACK);
   fitting.sort((a, b) => key(a)[0] - key(b)[0] || key(a)[1] - key(b)[1]);
   return { angle: fitting[0].angle, order: fitting[0].order };
 }

@@ -6,7 +6,7 @@
  * @typedef {{inputs: number, outputs: number, activation: string}} Shape
  */
 import { fromHalf, layersOf } from "./network.js";
-import { OBSERVATION_SIZE } from "./observation.js";
+import { OBSERVATION_SIZE } from "./tables.js";
 
 /** @param {Uint8Array} bytes @param {"deflate" | "deflate-raw"} format */
 async function inflate(bytes, format) {
@@ -191,8 +191,8 @@ export async function readAgent(label, content) {
   const { last_action = false, history = null, position_integral = null } = settings;
   const size = (history ?? [0]).length * (OBSERVATION_SIZE + (last_action ? 4 : 0));
   if (!layers.length || layers[0].inputs !== size || layers[layers.length - 1].outputs !== 4) {
-    const found = layers.length ? `${layers[0].inputs} numbers and gives ${layers[layers.length - 1].outputs}` : "nothing";
-    throw new Error(`its network takes ${found}; by its settings it takes ${size}, and a quadcopter takes 4`);
+    const actual = layers.length ? `${layers[0].inputs} numbers and gives ${layers[layers.length - 1].outputs}` : "nothing";
+    throw new Error(`its network takes ${actual}; by its settings it takes ${size}, and a quadcopter takes 4`);
   }
   const row = (/** @type {any} */ scaling) => (Array.isArray(scaling?.[0]) ? scaling[0] : scaling) ?? undefined;
   return {
