@@ -22,6 +22,7 @@ from sb3_quad.base import __version__
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_csv, write_text
+from sb3_quad.evaluation import metric_tables
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
 from sb3_quad.evaluation.metric_tables import estimate_cell
 from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
