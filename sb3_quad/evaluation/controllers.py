@@ -44,7 +44,9 @@ class ControllerSpec:
         if not self.is_zip:
             return None
         settings, source = agent_settings(self.spec)
-        return settings if source else None
+        if source is None:
+            return None
+        return settings
 
     @property
     def observed(self) -> dict[str, Any]:

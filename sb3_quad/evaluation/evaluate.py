@@ -129,7 +129,7 @@ def evaluate(
         suite=suite.name,
         description=suite.description,
         source=suite.source,
-        reward=getattr(reward, "__name__", reward or ""),
+        reward=str(getattr(reward, "__name__", reward or "")),
         package_version=__version__,
         controllers=[*records.values()],
         scenarios=[*suite.scenarios],

@@ -388,6 +388,8 @@ class Waypoints:
     def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
         count = len(self._plan.waypoints)
+        if count == 0:
+            return np.zeros(0, dtype=np.int64)
         near = distance <= self._plan.radius
         reached = np.flatnonzero(flying & (self._next < count) & near)
         self.times[reached, self._next[reached]] = time
@@ -397,6 +399,8 @@ class Waypoints:
 
     def to_last(self, distance: FloatArray) -> FloatArray:
         """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
+        if not len(self._plan.waypoints):
+            return distance
         return np.where(self.on_last, distance, np.inf)
 
     def targets(self, rows: IntArray) -> FloatArray:

@@ -57,7 +57,8 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
             raise ConfigError(f"{path}: cannot be read ({name}: no such array)")
         # A file of another program may hold anything.
         array = arrays[name]
-        dimensions = 2 if name in EPISODES.values() else 1
+        # Evaluations by episodes, or one number for each evaluation.
+        dimensions = 1 + (name in EPISODES.values())
         fits = array.ndim == dimensions and len(array) == arrays["timesteps"].size > 0
         if not fits or array.dtype.kind not in "fiub":
             raise ConfigError(f"{path}: cannot be read ({name} does not fit to the other arrays)")

@@ -36,7 +36,9 @@ class Cell:
     @property
     def number(self) -> str:
         """The value, with a proper minus sign; empty without a value."""
-        return "" if self.value is None else self._rounded(self.value)
+        if self.value is None:
+            return ""
+        return self._rounded(self.value)
 
     @property
     def interval(self) -> str:

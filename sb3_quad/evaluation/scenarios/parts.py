@@ -25,14 +25,18 @@ class OneOf(Frozen, use_attribute_docstrings=True):
     @model_validator(mode="before")
     @classmethod
     def _from_list(cls, data: Any) -> Any:
-        return {cls.ways[0]: data} if isinstance(data, (list, tuple)) else data
+        if isinstance(data, (list, tuple)):
+            return {cls.ways[0]: data}
+        return data
 
     @model_validator(mode="after")
     def _exactly_one(self) -> "OneOf":
         given = [name for name in self.ways if getattr(self, name) is not None]
         if len(given) != 1:
-            but = f", not {' and '.join(given)}" if given else ""
-            raise ValueError(f"give exactly one of {', '.join(self.ways)}{but}")
+            message = f"give exactly one of {', '.join(self.ways)}"
+            if given:
+                message += f", not {' and '.join(given)}"
+            raise ValueError(message)
         return self
 
 

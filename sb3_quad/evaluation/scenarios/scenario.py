@@ -104,7 +104,9 @@ class Scenario(Frozen, use_attribute_docstrings=True):
     @classmethod
     def _read(cls, value: str | Vehicle | None) -> str | Vehicle | None:
         # Load the file now; nothing below reads it again.
-        return load_vehicle(value) if isinstance(value, str) and VEHICLES.is_path(value) else value
+        if isinstance(value, str) and VEHICLES.is_path(value):
+            return load_vehicle(value)
+        return value
 
     @field_validator("tolerances")
     @classmethod
