@@ -141,8 +141,7 @@ def shorter(content):
     kept = {
         key: shorter(value)
         for key, value in content.items()
-        if key
-        not in ("require", "correct_offset")
+        if key not in ("require", "correct_offset")
     }
     if isinstance(kept.get("vary"), dict):
         kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}
