@@ -1,20 +1,32 @@
-"""Train an agent. Without arguments: DAgger, then PPO with cloning, with domain randomization.
+r"""Train an agent: DAgger, then PPO with cloning, unless you name others.
 
-The expert of both is privileged.
+Without arguments, both stages train with domain randomization and a privileged
+expert.
 
 examples:
-  sb3-quad train                                     both stages with domain randomization
-  sb3-quad train --thesis                            the thesis's method and PID expert, in minutes
-  sb3-quad train --conf-file nominal/two_stage.yml   both stages for one undisturbed vehicle
-  sb3-quad train --conf-file thesis/two_stage.yml    the recipe that the thesis prints; hours
-  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   PyBullet, a process per environment
-  sb3-quad train --seed 1 -P -tb logs/tb             another seed, progress bar, TensorBoard
-  sb3-quad train --conf-file thesis/dagger.yml       Table A.4 as the thesis prints it
-  sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4
-  sb3-quad train --hyperparams "policy_kwargs:dict(net_arch=[32, 32])"
+  # both stages with domain randomization
+  sb3-quad train
+  # the thesis's method: both stages from its PID expert, in minutes
+  sb3-quad train --thesis
+  # both stages for one undisturbed vehicle
+  sb3-quad train --conf-file nominal/two_stage.yml
+  # the recipe as the thesis prints it; takes hours
+  sb3-quad train --conf-file thesis/two_stage.yml
+  # Table A.4 as the thesis prints it
+  sb3-quad train --conf-file thesis/dagger.yml
+  # imitation on PyBullet, with a process for each environment
+  sb3-quad train --algo dagger --vec-env subproc --n-envs 8
+  # another seed, a progress bar, TensorBoard
+  sb3-quad train --seed 1 -P -tb logs/tb
+  # other hyperparameters and environment keywords
+  sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 \
+    "policy_kwargs:dict(net_arch=[32, 32])"
   sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
-  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i thesis-imitation   from an agent
+  # the RL stage alone, from an imitation agent
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i thesis-imitation
+  # continue an interrupted run
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
+  # another environment, with an agent as its expert
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
 
