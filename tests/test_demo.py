@@ -495,7 +495,7 @@ def page(tmp_path_factory):
 
 @chromium
 @pytest.mark.slow
-def test_a_throw_comes_back_and_a_push_is_felt(browser, page):
+def test_a_throw_comes_back_and_a_push_disturbs(browser, page):
     browser.open(page, 1280, 800)
     assert browser.value("demo.fleet.flying.length") == 4
     browser.wait_for(

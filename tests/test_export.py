@@ -258,7 +258,7 @@ def test_speeds_give_the_thrusts_and_a_rotor_may_stand_still(zips, flight, file_
     np.testing.assert_allclose(vehicle.thrust_coefficient * speeds**2, thrusts, atol=1e-5)
 
 
-def test_the_run_folder_tells_vehicle_and_scaling(zips, tmp_path):
+def test_the_run_folder_gives_vehicle_and_scaling(zips, tmp_path):
     run_folder = tmp_path / "run"
     (run_folder / "Env-v0").mkdir(parents=True)
     path = run_folder / "agent.zip"

@@ -104,7 +104,7 @@ def test_pictures_do_not_touch_the_flight(env: QuadcopterEnv) -> None:
     plain.close()
 
 
-def test_human_mode_without_a_display_flies_on(
+def test_human_mode_without_a_display_still_flies(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)

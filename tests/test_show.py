@@ -279,7 +279,7 @@ def test_missing_video_packages_are_named(monkeypatch, capsys, tmp_path):
     assert "pip install '.[video]'" in capsys.readouterr().err
 
 
-def test_the_command_draws_and_tells(tmp_path, capsys):
+def test_the_command_draws_and_reports(tmp_path, capsys):
     picture, film = tmp_path / "s.png", tmp_path / "f.gif"
     size = ["--size", "64x64", "-n", "12", "--seed", "3"]
     asked = [

@@ -229,7 +229,7 @@ class Inline:
     __exit__ = lambda self, *error: None  # noqa: E731
 
 
-def test_a_sweep_trains_compares_and_goes_on_with_what_failed(tmp_path, monkeypatch, capsys):
+def test_a_sweep_trains_compares_and_resumes_what_failed(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sb3_quad.executors.start_executor", Inline)
     own = [{"name": "one"}, {"name": "noisy", "env_kwargs": {"noise": 0.5}}]
@@ -366,7 +366,7 @@ def start(folder, *arguments):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatch):
+def test_a_driver_that_is_ended_resumes_with_the_same_table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "sb3_quad.executors.start_executor", Inline

@@ -91,7 +91,7 @@ def varied(row):
 
 
 @pytest.mark.slow
-def test_a_search_leaves_settings_that_train_takes_and_goes_on_where_it_was_left(command, capsys):
+def test_a_search_leaves_settings_that_train_takes_and_resumes(command, capsys):
     assert main([*command, "--n-trials", "2", "--seed", "3"]) == 0
     output = capsys.readouterr().out
     assert (
@@ -214,7 +214,7 @@ def test_pruned_trials_end_early_and_are_never_the_best(command, monkeypatch, ca
     assert not (folder() / "best.yml").exists()
 
 
-def test_a_trial_that_fails_is_told_and_the_others_go_on(command, capsys):
+def test_a_trial_that_fails_is_reported_and_the_others_continue(command, capsys):
     Path("space.yml").write_text(yaml.safe_dump({**SPACE, "batch_size": [100, 0]}))
     assert main([*command, "--n-trials", "5", "--seed", "1"]) == 0
     output, rows = capsys.readouterr().out, trials()
@@ -346,7 +346,7 @@ def test_bad_input_is_one_line(command, arguments, message, capsys):
         ({}, "must hold"),
     ],
 )
-def test_spaces_that_are_none_are_refused(tmp_path, space, message):
+def test_invalid_spaces_are_refused(tmp_path, space, message):
     path = tmp_path / "space.yml"
     path.write_text(yaml.safe_dump(space))
     with pytest.raises(ConfigError, match=message) as caught:
@@ -354,7 +354,7 @@ def test_spaces_that_are_none_are_refused(tmp_path, space, message):
     assert "space.yml" in str(caught.value)
 
 
-def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
+def test_without_optuna_it_names_the_extra_to_install(command, monkeypatch, capsys):
     for name in [
         name
         for name in sys.modules

@@ -13,6 +13,7 @@ from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
+from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.observation import (
     DEFAULT_MEAN,
@@ -100,6 +101,29 @@ class Reference(NamedTuple):
         if self.output == "thrusts":
             return thrusts
         return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
+
+
+def make_reference(
+    model: BaseAlgorithm, settings: FlightSettings, vehicle: Vehicle, output: str = "thrusts"
+) -> Reference:
+    """Return a policy in its own environment, on a vehicle whose layout may be another.
+
+    :raises ConfigError: settings that the environment refuses, a layout that does not fit.
+    """
+    # A batch of one row checks the settings and resolves vehicle and scaling.
+    layout = settings.layout
+    row = QuadcopterBatch(
+        1, settings.with_changes(vehicle=vehicle, rotor_layout=layout), n_threads=1
+    )
+    return Reference(
+        model=model,
+        vehicle=row.vehicle_list[0],
+        mean=row.mean[:, 0],
+        std=row.std[:, 0],
+        output=output,
+        observation=row.observation,
+        turn=vehicle.turn_to(layout),
+    )
 
 
 class Comparison(Hook):

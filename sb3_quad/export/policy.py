@@ -15,9 +15,8 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
-from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
+from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare, make_reference
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
-from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import FEATURES, GROUPS, OBSERVATION_SIZE
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
@@ -88,26 +87,16 @@ def export_policy(
     algorithm = saved_algorithm(path)
     model = load_model(path)
     settings, source = agent_settings(path)
-    layout = settings.layout
+    given = settings
     if vehicle is not None:
-        settings = settings.with_changes(vehicle=vehicle)
-    if settings.vehicles is not None:
+        given = settings.with_changes(vehicle=vehicle)
+    if given.vehicles is not None:
         raise ConfigError(
             f"model {path}: flies any vehicle; "
             "say with --vehicle which one's thrusts the file is to give"
         )
-    flown = first_vehicle(settings.vehicle)
-    # A batch of one row checks the settings and resolves vehicle and scaling.
-    row = QuadcopterBatch(1, settings.with_changes(vehicle=flown, rotor_layout=layout), n_threads=1)
-    reference = Reference(
-        model=model,
-        vehicle=row.vehicle_list[0],
-        mean=row.mean[:, 0],
-        std=row.std[:, 0],
-        output=output,
-        observation=row.observation,
-        turn=flown.turn_to(layout),
-    )
+    flown = first_vehicle(given.vehicle)
+    reference = make_reference(model, settings, flown, output)
     network = build_network(reference, f"model {path}")
     metadata = _describe(Path(path), algorithm, network, reference, flown)
     with warnings.catch_warnings():

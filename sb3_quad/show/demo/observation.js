@@ -1,5 +1,5 @@
 /**
- * The observation of a policy, as sb3_quad/simulation/{observation,frames}.py have it, in float32 where they are: 18 features
+ * The observation of a policy, as sb3_quad/simulation/{observation,frames}.py have it, in float32 where they are: features
  * (thesis 3.3.1) with their noise and scaling (Eq. 3.16), last action, earlier frames and the integral of the position error.
  *
  * @typedef {import("./vehicle.js").Turn} Turn

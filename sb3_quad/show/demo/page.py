@@ -24,9 +24,8 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
-from sb3_quad.export.check import Reference
+from sb3_quad.export.check import make_reference
 from sb3_quad.export.network import Network, build_network
-from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
 from sb3_quad.simulation.state import STATE, STATE_SIZE, X
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
@@ -161,21 +160,13 @@ def describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
         raise ConfigError(f"controller {spec.spec}: the page does not compute {further}")
     settings = agent_settings(spec.spec)[0]
     layout = settings.layout
-    # A batch of one row checks the scaling.
-    row = QuadcopterBatch(1, settings.with_changes(vehicle=layout, randomize=None), n_threads=1)
-    reference = Reference(
-        model=load_model(spec.spec),
-        vehicle=layout,
-        mean=row.mean[:, 0],
-        std=row.std[:, 0],
-        observation=row.observation,
-    )
+    reference = make_reference(load_model(spec.spec), settings, layout)
     network = build_network(reference, f"model {spec.spec}")
     described = {
         "kind": "network",
         "vehicle": "" if settings.vehicles is not None else first_vehicle(settings.vehicle).name,
         "layout": layout.model_dump(mode="json", include={"rotor_positions", "rotor_directions"}),
-        "observation": row.observation.model_dump(mode="json"),
+        "observation": reference.observation.model_dump(mode="json"),
         "mean": reference.mean.tolist(),
         "std": reference.std.tolist(),
         "shapes": network.shapes,
