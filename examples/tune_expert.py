@@ -157,8 +157,8 @@ def fresh_cost(metrics: dict[str, Any]) -> float:
     return lost + metrics["settling_time"]
 
 
-def main() -> None:
-    """Search, measure on fresh episodes, write the file."""
+def parse_options() -> argparse.Namespace:
+    """Read the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -177,8 +177,12 @@ def main() -> None:
     parser.add_argument(
         "--seed", type=int, default=0, help="seed of the search and its episodes (0)"
     )
-    options = parser.parse_args()
+    return parser.parse_args()
 
+
+def main() -> None:
+    """Search, measure on fresh episodes, write the file."""
+    options = parse_options()
     vehicle = load_vehicle(options.vehicle)
     output = options.output or Path(f"{vehicle.name}_tuned.yaml")
     first = GeometricExpert(vehicle).gains

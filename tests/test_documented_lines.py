@@ -1,4 +1,4 @@
-"""Every `sb3-quad` line of README, docs/ and --help runs, with one small rollout or short flights."""
+"""Every `sb3-quad` line of README, docs/ and --help runs, with a small rollout or short flights."""
 
 import re
 import shlex

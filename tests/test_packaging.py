@@ -308,7 +308,8 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
     The closing tables are of few episodes, and PyTorch has one thread: its others only wait for
     each other here.
     """
-    algo = "--algo dagger --num-threads 1 -n 1600 --n-envs 16 --eval-episodes".split()
+    algo = ["--algo", "dagger", "--num-threads", "1", "-n", "1600", "--n-envs", "16"]
+    algo.append("--eval-episodes")
     small = ["--seed", "0", "--hyperparams", "n_steps:50", "gradient_steps:5", "batch_size:256"]
     search = ["--n-trials", "2", "--n-evaluations", "1", "--search-space", "space.yml"]
     zip_file, best = (

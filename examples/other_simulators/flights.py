@@ -307,13 +307,10 @@ class Cell:
     make: Callable[[int], Simulator]  # from the number of vehicles
 
 
-def main(
-    description: str, cells: Mapping[str, Cell], others: Mapping[str, Callable[[Any], Policy]]
-) -> None:
-    """Run a script's command: check the rotors, fly, print the table.
-
-    :param others: controllers to compare with, by name; each is made for a simulator.
-    """
+def parse_options(
+    description: str, cells: Iterable[str], others: Iterable[str]
+) -> argparse.Namespace:
+    """Read the command line of a script with these cells and other controllers."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -354,7 +351,17 @@ def main(
         default=0.05,
         help="relative standard deviation of each observed number (0.05)",
     )
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main(
+    description: str, cells: Mapping[str, Cell], others: Mapping[str, Callable[[Any], Policy]]
+) -> None:
+    """Run a script's command: check the rotors, fly, print the table.
+
+    :param others: controllers to compare with, by name; each is made for a simulator.
+    """
+    options = parse_options(description, [*cells], [*others])
     print(HEADER)
     for cell in (cells[name] for name in options.cells):
         check_rotors(cell.make)
