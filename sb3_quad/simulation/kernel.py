@@ -27,6 +27,7 @@ from sb3_quad.simulation.physics import (
     moment,
     motor_factor,
     rotation_rows,
+    total_thrust,
     turn_rotors,
 )
 from sb3_quad.simulation.random import STEP, gust_words
@@ -90,7 +91,8 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "scored": ("f8", len(SCORED)),  # max_distance and the costs of the row's task
     "reward": ("f8", ()),
     "distance": ("f8", ()),
-    "work": ("f8", 4),
+    "thrust": ("f8", 4),  # of each rotor, N
+    "speed2": ("f8", ()),  # the larger of |v|² and |ω|²
     "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
     "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
     "noise_level": ("f4", ()),  # relative
@@ -338,11 +340,11 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, o
             _load_rows(wrench, 0, 1, b.wrench)
             _load_vehicles(b, vehicles, 0, 1, physics_step, True)
             _load_commands(actions, queue, own_delays, b, 0, 1)
-        f0, f1, f2, f3 = turn_rotors(b, 0)
+        turn_rotors(b, 0)
         for axis in range(3):
             out[each, 0, axis] = b.force_body[axis, 0]
-            out[each, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0, f0, f1, f2, f3)
-        out[each, 0, 2] += (f0 + f1) + (f2 + f3)
+            out[each, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0)
+        out[each, 0, 2] += total_thrust(b, 0)
         for rotor in range(4):
             state[X.rotor_speeds + rotor, 0] = b.rotor_speeds[rotor, 0]
 
