@@ -128,7 +128,7 @@ def accelerate(b):
 
     :return: whether some velocity may exceed PyBullet's limit.
     """
-    v, w, gyro, twist, largest = b.velocity, b.body_rates, b.gyro, b.twist, b.speed2
+    v, w, gyro, rates_gain = b.velocity, b.body_rates, b.gyro, b.rates_gain
     for lane in range(LANES):
         turn_rotors(b, lane)
         r = rotation(b.quaternion, lane)
@@ -141,9 +141,9 @@ def accelerate(b):
         fy = b.force_body[1, lane] - b.drag[1, lane] * uy
         fz = b.force_body[2, lane] - b.drag[2, lane] * uz + total_thrust(b, lane)
         fx, fy, fz = to_world(r, fx, fy, fz)
-        vx += b.push[lane] * (b.force_world[0, lane] + fx)
-        vy += b.push[lane] * (b.force_world[1, lane] + fy)
-        vz += b.push[lane] * (b.force_world[2, lane] + fz) - b.fall[lane]
+        vx += b.velocity_gain[lane] * (b.force_world[0, lane] + fx)
+        vy += b.velocity_gain[lane] * (b.force_world[1, lane] + fy)
+        vz += b.velocity_gain[lane] * (b.force_world[2, lane] + fz) - b.fall[lane]
 
         # Euler's equations in the body frame.
         gx, gy, gz = vector(b.torque_world, lane)
@@ -152,16 +152,16 @@ def accelerate(b):
         tx += b.torque_body[0, lane] - gyro[0, lane] * wy * wz + moment(b, 0, lane)
         ty += b.torque_body[1, lane] - gyro[1, lane] * wz * wx + moment(b, 1, lane)
         tz += b.torque_body[2, lane] - gyro[2, lane] * wx * wy + moment(b, 2, lane)
-        wx += twist[0, lane] * tx
-        wy += twist[1, lane] * ty
-        wz += twist[2, lane] * tz
+        wx += rates_gain[0, lane] * tx
+        wy += rates_gain[1, lane] * ty
+        wz += rates_gain[2, lane] * tz
 
         v[0, lane], v[1, lane], v[2, lane] = vx, vy, vz
         w[0, lane], w[1, lane], w[2, lane] = wx, wy, wz
-        largest[lane] = max(wx * wx + wy * wy + wz * wz, vx * vx + vy * vy + vz * vz)
+        b.speed2[lane] = max(wx * wx + wy * wy + wz * wz, vx * vx + vy * vy + vz * vz)
     over = 0
     for lane in range(LANES):
-        over += largest[lane] > MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY
+        over += b.speed2[lane] > MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY
     return over > 0
 
 
