@@ -1,4 +1,4 @@
-"""n quadcopters as arrays: what all environments are made of."""
+"""n quadcopters as arrays: the part that all environments share."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
@@ -45,11 +45,23 @@ from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
-MAX_ROWS, MAX_THREADS = 2**20, 2**16
-_NO_ACTIONS, _NO_REWARDS = np.zeros((0, 4), np.float32), np.zeros(0, np.float32)  # of a look
-_KEPT = (  # all that future flight depends on
-    *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
-    *("vehicles", "gust", "wind", "wind_gust", "frames", "integral"),
+MAX_ROWS = 2**20
+MAX_THREADS = 2**16
+# A snapshot keeps these: future flight depends on nothing else.
+_KEPT = (
+    "state",
+    "queue",
+    "wrench",
+    "streams",
+    "task_index",
+    "returns",
+    "limits",
+    "vehicles",
+    "gust",
+    "wind",
+    "wind_gust",
+    "frames",
+    "integral",
 )
 
 
@@ -79,47 +91,37 @@ class QuadcopterBatch:
     ) -> None:
         settings = settings or FlightSettings()
         n = self.n = whole_number("n_envs", n_envs, 1, MAX_ROWS)
-        self.threads = (
-            available_cpus()
-            if n_threads is None
-            else whole_number("n_threads", n_threads, 1, MAX_THREADS)
-        )
-        self.autoreset, self.observation = autoreset, settings.observation
-        self.distribution, self.randomize = settings.vehicles, settings.randomize or Randomization()
+        if n_threads is None:
+            self.threads = available_cpus()
+        else:
+            self.threads = whole_number("n_threads", n_threads, 1, MAX_THREADS)
+        self.autoreset = autoreset
 
-        several = isinstance(settings.vehicle, (list, tuple))
-        vehicles = load_vehicles(
-            settings.vehicle if several else [settings.vehicle], settings.rotor_layout
-        )
-        self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, n)
-        for each in vehicles:
-            self.randomize.check(
-                each if self.distribution is None else self.distribution.weakest(each)
-            )
-        columns = self.vehicle_list if several else vehicles
-        self.base_vehicles = np.stack([each.parameters() for each in columns], axis=1)
-        own = n if self.distribution is not None or self.randomize.sets_vehicle else len(columns)
-        self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.base_vehicles), own)).copy()
-        self.distribution_numbers = (
-            NO_DISTRIBUTION if self.distribution is None else self.distribution.numbers()
-        )
-        self.randomize_numbers = self.randomize.numbers(vehicles[0].control_step)
-        kinds = self.randomize.gusts, self.randomize.wind_gusts
-        self.gust, self.wind_gust = (
-            np.zeros((GUST_SIZE, 0 if each is None else n)) for each in kinds
-        )
+        vehicles = self._set_vehicles(settings)
+        control_step = vehicles[0].control_step
+        self.physics_step = vehicles[0].physics_step
+        self.substeps = vehicles[0].substeps
+        self.randomize_numbers = self.randomize.numbers(control_step)
+        self.gust = np.zeros((GUST_SIZE, 0 if self.randomize.gusts is None else n))
         self.wind = np.zeros((3, n))
-        drags = (self.randomize.drag, self.distribution and self.distribution.drag)
-        self.has_drag = bool(self.base_vehicles[P.drag_x : P.drag_z + 1].any()) or any(drags)
+        self.wind_gust = np.zeros((GUST_SIZE, 0 if self.randomize.wind_gusts is None else n))
 
+        # Commands wait in a queue that is as long as the longest delay of any episode.
+        longest = max(vehicle.delay for vehicle in vehicles)
+        if self.randomize.delay is not None:
+            longest = max(longest, int(self.randomize.delay.high))
+        self.queue = np.zeros((longest, 4, n))
+        same_delay = bool((self.base_vehicles[P.delay] == longest).all())
+        self.own_delays = self.randomize.delay is not None or not same_delay
+
+        # The frames that a policy sees besides the present features.
+        self.observation = settings.observation
         integral = self.observation.position_integral
         depth = self.observation.ages[-1] + 1 if self.observation.is_extended else 0
         self.frames = np.zeros((n, depth, self.observation.frame_size), dtype=np.float32)
         self.ages = np.array(self.observation.ages, dtype=np.int64)
         self.integral = np.zeros((0 if integral is None else 3, n))
-        self.integral_numbers = np.array(
-            (integral or PositionIntegral()).numbers(vehicles[0].control_step)
-        )
+        self.integral_numbers = np.array((integral or PositionIntegral()).numbers(control_step))
         self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
 
         self.task: TaskSpec = settings.task
@@ -131,79 +133,101 @@ class QuadcopterBatch:
             "max_episode_steps", steps if isinstance(steps, list) else [steps], n
         )
         self.max_steps = np.array(steps_of_rows, dtype=np.int64)
-        self.limits = self.max_steps.copy()  # control steps of the present episodes, at most
+        # The episodes under way may be shorter, see stagger.
+        self.limits = self.max_steps.copy()
+
         self.state = np.zeros((STATE_SIZE, n))
-        longest = (
-            int(self.randomize.delay.high) if self.randomize.delay else 0
-        )  # delay, control steps
-        self.queue = np.zeros((max(longest, *(each.delay for each in vehicles)), 4, n))
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
-        self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[
-            :, None
-        ]  # until rows are set apart
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
-        self.physics_step, self.substeps = vehicles[0].physics_step, vehicles[0].substeps
-        self.own_delays = self.randomize.delay is not None or bool(
-            (self.base_vehicles[P.delay] != len(self.queue)).any()
-        )
-        self.own_arms = (
-            len(columns) > 1 or self.distribution is not None or self.randomize.sets_arms
-        )
-        self.constants = np.array(
-            [self.physics_step, self.substeps, self.own_delays, self.own_arms, autoreset],
-            np.float64,
-        )
+        # One column serves all rows until some differ.
+        self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[:, None]
         self._bind()
         self.set_noise(settings.noise)
-        self._set_scaling(settings)
+        self._set_scaling("observation_mean", settings.observation_mean)
+        self._set_scaling("observation_std", settings.observation_std)
         with compile_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
 
+    def _set_vehicles(self, settings: FlightSettings) -> list[Vehicle]:
+        """Load the vehicles, check that all can be flown, and return the different ones.
+
+        ``base_vehicles`` and ``vehicles`` have a column for each row where rows differ, else one
+        for all.
+        """
+        self.distribution = settings.vehicles
+        self.randomize = settings.randomize or Randomization()
+        several = isinstance(settings.vehicle, (list, tuple))
+        sources = settings.vehicle if several else [settings.vehicle]
+        vehicles = load_vehicles(sources, settings.rotor_layout)
+        for vehicle in vehicles:
+            weakest = vehicle if self.distribution is None else self.distribution.weakest(vehicle)
+            self.randomize.check(weakest)
+        self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, self.n)
+
+        columns = self.vehicle_list if several else vehicles
+        self.base_vehicles = np.stack([vehicle.parameters() for vehicle in columns], axis=1)
+        if self.distribution is not None or self.randomize.sets_vehicle:
+            self.vehicles = np.repeat(self.base_vehicles, self.n // len(columns), axis=1)
+        else:
+            self.vehicles = self.base_vehicles.copy()
+
+        self.distribution_numbers = NO_DISTRIBUTION
+        random_drag: Any = self.randomize.drag
+        if self.distribution is not None:
+            self.distribution_numbers = self.distribution.numbers()
+            random_drag = random_drag or self.distribution.drag
+        own_drag = self.base_vehicles[P.drag_x : P.drag_z + 1].any()
+        self.has_drag = bool(own_drag) or random_drag is not None
+        return vehicles
+
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
-        """New streams of the given rows, from one seed each; their next reset begins the first
+        """Give rows new random streams, from one seed each. Their next reset begins the first
         episode.
         """
         self.streams[:, self.rows(rows)] = new_streams(seeds)
 
     def reset(self, rows: Rows = None) -> Float32Array:
-        """Begin the next episode of the given rows (None: all); the observations of all rows,
-        float32 (n, size).
+        """Begin the next episode of the given rows, None for all.
+
+        :return: the observations of all rows, float32 (n, size).
         """
         return self._look(self.rows(rows))
 
     def stagger(self) -> None:
-        """Truncate the present episodes at times spread evenly over ``max_episode_steps``; those
-        that follow, after it.
+        """Stagger the present episodes: row i of n is truncated after (n - i) / n of
+        ``max_episode_steps``. Later episodes have their full length.
         """
         self.limits[:] = self.max_steps - np.arange(self.n) * self.max_steps // self.n
 
     def observe(self) -> Float32Array:
-        """The present observations, float32 (n, size), of ``observation.size``; the same numbers
-        until the next step.
+        """Return the present observations, float32 (n, ``observation.size``). They are the same
+        numbers, noise included, until the next step.
         """
         return self._look([])
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
-        """One control step of every row.
+        """Fly a control step of every row.
+
+        Where a row is done, ``outcome`` (fields total, reward, length, distance, collision,
+        out_of_range, truncated, success) and ``last_observations`` hold how its episode ended until
+        its next one ends. Without autoreset they are those of every row's last step.
 
         :param actions: (n, 4), clipped to [-1, 1].
         :return: observations float32 (n, size), rewards float32 (n,), done bool (n,): fresh arrays.
-            Of rows that are done, ``outcome`` (fields total, reward, length, distance, collision,
-            out_of_range, truncated, success) and ``last_observations`` tell how the episode ended,
-            until the row's next one ends; without autoreset they are of every row's last step.
+        :raises ValueError: actions of another shape, or not finite.
         """
         return self._move(FLY, actions)
 
     def score(
         self, actions: npt.NDArray[Any] | None = None
     ) -> tuple[Float32Array, Float32Array, BoolArray]:
-        """As :meth:`step`, of a control step that another simulator has flown and written into
-        ``state``.
+        """Score a control step that another simulator has flown and written into ``state``; else
+        like :meth:`step`.
 
-        :param actions: for those that a policy is to see; None: zeros.
+        :param actions: those that the policy sees in its next observation; None: zeros.
         """
         return self._move(SCORE, np.zeros((self.n, 4), np.float32) if actions is None else actions)
 
@@ -215,56 +239,54 @@ class QuadcopterBatch:
             raise ValueError(
                 f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment"
             )
-        out = (
-            np.empty(self.last_observations.shape, np.float32),
-            np.empty(self.n, np.float32),
-            np.empty(self.n, np.bool_),
-        )
-        if not self._step(mode, array, *out):
+        observations, dones = self._new_observations()
+        rewards = np.empty(self.n, np.float32)
+        if not self._step(mode, array, observations, rewards, dones):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(
                 f"actions: row {row} is {array[row].tolist()}; every number must be finite"
             )
-        return out
+        return observations, rewards, dones
 
     def _look(self, resetting: Any) -> Float32Array:
-        observations, dones = (
-            np.empty(self.last_observations.shape, np.float32),
-            np.zeros(self.n, np.bool_),
-        )
+        observations, dones = self._new_observations()
         dones[resetting] = True
-        self._step(LOOK, _NO_ACTIONS, observations, _NO_REWARDS, dones)
+        self._step(LOOK, np.empty((0, 4), np.float32), observations, np.empty(0, np.float32), dones)
         return observations
 
+    def _new_observations(self) -> tuple[Float32Array, BoolArray]:
+        return np.empty(self.last_observations.shape, np.float32), np.zeros(self.n, np.bool_)
+
     def _step(self, mode: int, *arrays: npt.NDArray[Any]) -> bool:
-        chunks = min(self.threads, self.n // (2 * CHUNK))
-        return bool(share_out(step, chunks - 1, mode, *arrays, *self._arrays))
+        # A thread pays off from two chunks on.
+        threads = min(self.threads, self.n // (2 * CHUNK))
+        return bool(share_out(step, threads - 1, mode, *arrays, *self._arrays))
 
     def turn_rotors(self, actions: npt.NDArray[Any]) -> FloatArray:
-        """The rotors' part of a control step of row 0, for another simulator, whose part
-        :meth:`score` judges.
+        """Advance the rotors of row 0 by a control step, for another simulator that moves the body.
+
+        It then writes the state, and :meth:`score` scores the step.
 
         :param actions: (n, 4), clipped to [-1, 1].
         :return: force (N) and torque (N m) of rotors and wrench in each physics step, body frame,
-            (substeps, 2, 3); what the wrench has in the world frame acts besides.
+            (substeps, 2, 3). The parts of the wrench in the world frame are not included.
         """
         wrenches = np.empty((self.substeps, 2, 3))
-        a = self._arrays
         rotor_wrenches(
             actions,
             wrenches,
-            a.state,
-            a.queue,
-            a.wrench,
-            a.vehicles,
+            self.state,
+            self.queue,
+            self.wrench,
+            self.vehicles,
             self.physics_step,
             self.own_delays,
         )
         return wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:
-        """Of rows that have just begun an episode: nothing has ended, and the distance is that of
-        the start.
+        """Clear ``outcome`` of rows that have just begun an episode; its distance is that of the
+        start.
         """
         chosen = self.rows(rows)
         self.outcome[chosen] = 0
@@ -272,22 +294,26 @@ class QuadcopterBatch:
         self.outcome["distance"][chosen] = QuadcopterState(self.state[:, chosen]).distance
 
     def rows(self, rows: Rows) -> IntArray:
-        """Row numbers from None (all), a number, a slice or a sequence."""
+        """Return row numbers from None (all), a number, a slice or a sequence.
+
+        :raises ConfigError: no such rows.
+        """
         everything = np.arange(self.n, dtype=np.int64)
         if rows is None:
             return everything
+        selected = rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)
         try:
-            return np.atleast_1d(
-                everything[rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)]
-            )
+            return np.atleast_1d(everything[selected])
         except (IndexError, TypeError):
             raise ConfigError(
                 f"indices {rows!r}: must be row numbers of 0 to {self.n - 1}"
             ) from None
 
     def true_state(self) -> QuadcopterState:
-        """The true state of all rows, a live view but for gusts and drag, which is a part of its
-        wrench.
+        """Return the true state of all rows.
+
+        It is a live view, except that gusts and drag, which are a part of its wrench, are those of
+        this control step.
         """
         vehicles = np.broadcast_to(self.vehicles, (len(self.vehicles), self.n))
         wrench = self.total_wrench()
@@ -297,8 +323,8 @@ class QuadcopterBatch:
         return QuadcopterState(self.state, vehicles, wrench)
 
     def total_wrench(self) -> FloatArray:
-        """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and
-        gusts; without drag.
+        """Return the external wrench of this control step, (WRENCH_SIZE, n): the one that was set
+        or sampled, and gusts; without drag.
         """
         if self.randomize.gusts is None:
             return self.wrench
@@ -307,44 +333,44 @@ class QuadcopterBatch:
         return total
 
     def total_wind(self) -> FloatArray:
-        """The velocity of the air in this control step, (3, n), world frame, m/s: what was set or
-        sampled, and gusts.
+        """Return the velocity of the air in this control step, (3, n), world frame, m/s: the one
+        that was set or sampled, and gusts.
         """
-        return (
-            self.wind
-            if self.randomize.wind_gusts is None
-            else self.wind + self.wind_gust[GUST_VALUE]
-        )
+        if self.randomize.wind_gusts is None:
+            return self.wind
+        return self.wind + self.wind_gust[GUST_VALUE]
 
     def snapshot(self) -> Arrays:
-        """Copies of all that future flight depends on, by name."""
+        """Return copies of everything that future flight depends on, by name."""
         return {name: getattr(self, name).copy() for name in _KEPT}
 
     def restore(self, snapshot: Arrays) -> None:
-        """Undo what has happened since :meth:`snapshot`.
+        """Undo everything that has happened since :meth:`snapshot`.
 
         :raises ConfigError: the snapshot is of other environments.
         """
-        for name in dict.fromkeys((*_KEPT, *snapshot)):
+        for name in {*_KEPT, *snapshot}:
             array: Any = snapshot.get(name)
             own = getattr(self, name) if name in _KEPT else None
-            fits = (
-                array is not None
-                and own is not None
-                and (array.dtype, array.shape) == (own.dtype, own.shape)
-            )
-            if not fits or (
-                name == "task_index" and not ((array >= 0) & (array < self.task_weights.size)).all()
-            ):
-                found = "missing" if array is None else f"{array.dtype} of shape {array.shape}"
+            if array is None or own is None:
+                fits = False
+            else:
+                fits = (array.dtype, array.shape) == (own.dtype, own.shape)
+            if fits and name == "task_index":
+                fits = bool(((array >= 0) & (array < self.task_weights.size)).all())
+            if not fits:
+                held = "missing" if array is None else f"{array.dtype} of shape {array.shape}"
                 raise ConfigError(
-                    f"the saved state of the environments does not fit these ({name}: {found}); use the run's own settings"
+                    f"the saved state of the environments does not fit these ({name}: {held});"
+                    " use the run's own settings"
                 )
         for name in _KEPT:
             getattr(self, name)[...] = snapshot[name]
 
     def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
-        """Move targets r_T, (3,) or (rows, 3), world frame, m; until the row's next reset."""
+        """Move targets r_T to a position, (3,) or (rows, 3), world frame, m, until the row's next
+        reset.
+        """
         chosen = self.rows(indices)
         self.state[TARGET, chosen] = per_row("target", position, chosen.size, 3)
 
@@ -357,58 +383,54 @@ class QuadcopterBatch:
         indices: Rows = None,
     ) -> None:
         """Apply an external force (N) and torque (N m), (3,) or (rows, 3) each, at the centre of
-        mass; until set anew.
+        mass, until they are set again.
 
-        Without arguments, nothing pushes any more.
+        Without arguments it removes both.
 
         :param force_frame: ``"world"`` or ``"body"``; ``torque_frame`` likewise.
         """
         chosen = self.rows(indices)
-        vectors = [
-            per_row(name, each, chosen.size, 3).T
-            for name, each in (("force", force), ("torque", torque))
-        ]
-        self.wrench[:, chosen] = make_wrench(vectors[0], vectors[1], force_frame, torque_frame)
+        forces = per_row("force", force, chosen.size, 3).T
+        torques = per_row("torque", torque, chosen.size, 3).T
+        self.wrench[:, chosen] = make_wrench(forces, torques, force_frame, torque_frame)
 
     def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
-        """Set the velocity of the air, (3,) or (rows, 3), world frame, m/s; until set anew. It acts
-        on vehicles with drag.
+        """Set the velocity of the air, (3,) or (rows, 3), world frame, m/s, until it is set again.
+        It acts on vehicles with drag.
         """
         chosen = self.rows(indices)
         self.wind[:, chosen] = per_row("wind", velocity, chosen.size, 3)
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a
-        ``Noise``; 0: none.
+        ``Noise``; 0 switches it off.
         """
         chosen = self.rows(indices)
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
-        relative, additive = (
-            per_row("noise", each, chosen.size, None)[0] for each in levels(noise)
-        )
         columns = self._columns(indices, one_for_all=not isinstance(noise, list))
-        self.noise_level[columns], self.additive_level[columns] = (
-            relative[: columns.size],
-            additive[: columns.size],
-        )
+        relative, additive = levels(noise)
+        rows = per_row("noise", relative, chosen.size, None)[0]
+        self.noise_level[columns] = rows[: columns.size]
+        self.additive_level[columns] = additive
 
-    def _set_scaling(self, settings: FlightSettings) -> None:
-        """Set μ and σ of Eq. 3.16, (18,) or (n, 18) each; None leaves one as it is."""
-        given = {"mean": settings.observation_mean, "std": settings.observation_std}
-        for name, value in given.items():
-            if value is None:
-                continue
-            values = per_row(f"observation_{name}", value, self.n, OBSERVATION_SIZE)
-            if name == "std" and (values <= 0).any():
-                raise ConfigError("observation_std: every value must be positive")
-            columns = self._columns(None, one_for_all=np.ndim(value) < 2)
-            getattr(self, name)[:, columns] = values[:, : columns.size]
+    def _set_scaling(self, name: str, value: Any) -> None:
+        """Set μ or σ of Eq. 3.16, (18,) or (n, 18); None leaves it as it is."""
+        if value is None:
+            return
+        values = per_row(name, value, self.n, OBSERVATION_SIZE)
+        target = self.mean if name == "observation_mean" else self.std
+        if target is self.std and (values <= 0).any():
+            raise ConfigError(f"{name}: every value must be positive")
+        columns = self._columns(None, one_for_all=np.ndim(value) < 2)
+        # _columns may have set rows apart, and so have moved the arrays.
+        target = self.mean if name == "observation_mean" else self.std
+        target[:, columns] = values[:, : columns.size]
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
-        """The columns of noise level and scaling to write for some rows, which are set apart unless
-        one serves all.
+        """Return the columns of noise level and scaling to write for some rows. One column serves
+        all rows until they are set apart.
         """
-        if self.mean.shape[1] < self.n:
+        if self.scaling.shape[1] < self.n:
             if rows is None and one_for_all:
                 return np.zeros(1, dtype=np.int64)
             self.scaling = np.repeat(self.scaling, self.n, axis=1)
@@ -416,9 +438,7 @@ class QuadcopterBatch:
         return self.rows(rows)
 
     def _bind(self) -> None:
-        self.mean, self.std = (
-            self.scaling[:OBSERVATION_SIZE],
-            self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE],
-        )
+        self.mean = self.scaling[:OBSERVATION_SIZE]
+        self.std = self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
         self.noise_level, self.additive_level = self.scaling[-2:]
         self._arrays = BatchArrays(*(getattr(self, name) for name in BatchArrays._fields))

@@ -1,7 +1,7 @@
 """One control step of a batch, block by block: a block goes through all of it while it is in the
 first cache.
 
-A block is ``LANES`` neighbouring rows with all that a control step needs of them in one piece of
+A block is ``LANES`` neighbouring rows with everything a control step needs of them in one piece of
 memory. Its arrays have constant shapes and places: LLVM then knows each distance between two rows,
 needs no test for overlap, and vectorises the loops over lanes. Lanes behind the last row repeat it,
 so that every loop runs over all lanes: a row's numbers then never depend on how many others fly, or
@@ -20,14 +20,24 @@ from sb3_quad.simulation.frames import (
     observe_frames,
     store_action,
 )
-from sb3_quad.simulation.observation import GUST_WORDS, NORMALS, OBSERVATION_SIZE, WORDS, observe
+from sb3_quad.simulation.observation import (
+    GUST_WORDS,
+    NORMALS,
+    OBSERVATION_SIZE,
+    WORDS,
+    features,
+    observe,
+)
 from sb3_quad.simulation.physics import (
     command_rotors,
     fly,
     moment,
     motor_factor,
     rotation_rows,
+    to_body,
+    total_thrust,
     turn_rotors,
+    vector,
 )
 from sb3_quad.simulation.random import STEP, gust_words
 from sb3_quad.simulation.reward import score, succeeds
@@ -38,15 +48,25 @@ from sb3_quad.simulation.sampling import (
     sample_episode,
     start_episode,
 )
-from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE, P, W, X
+from sb3_quad.simulation.state import (
+    STATE,
+    STATE_SIZE,
+    WRENCH,
+    WRENCH_SIZE,
+    P,
+    QuadcopterState,
+    W,
+    X,
+)
 from sb3_quad.simulation.tasks import SCORED, S, T
 from sb3_quad.simulation.threads import DONE, LEFT, finish
+from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 CHUNK = 2 * LANES  # rows that a thread takes at once
 LOOK, SCORE, FLY = range(3)
-"""What :func:`step` does: it observes, after it has begun the next episodes of the rows whose
-``dones`` are set; it scores a control step that another simulator has flown; it flies and scores
-one.
+"""The modes of :func:`step`. LOOK begins the next episodes of the rows whose ``dones`` are set, and
+observes all rows. SCORE scores a control step that another simulator has flown. FLY flies and
+scores one.
 """
 
 OUTCOME = np.dtype(
@@ -64,33 +84,27 @@ OUTCOME = np.dtype(
 )
 """How the last episode of a row ended."""
 
-_SCORED = tuple(getattr(T, name) for name in SCORED)
-# Of every lane: the kind of numbers, and how many or of what shape.
+# The kind of number and the shape of each quantity of a lane; an int is a number of rows.
 _CONTENTS: dict[str, tuple[str, Any]] = {
     "row": ("i8", ()),  # of the batch
-    "state": ("f8", STATE_SIZE),  # all its rows
+    "state": ("f8", STATE_SIZE),
     "command": ("f8", 4),  # action, then the rotor speed it commands
     "wanted_speeds": ("f8", 4),  # rotor speeds to be reached in this control step
+    "thrust": ("f8", 4),  # of each rotor, N
     "wrench": ("f8", WRENCH_SIZE),
     "wind": ("f8", 3),  # velocity of the air
-    "drag": ("f8", 3),
+    "vehicle": ("f8", len(PARAMETER_NAMES)),
     "motor": ("f8", 2),  # motor_factor of a rotor that speeds up, and of one that slows down
-    "exact": ("f8", ()),  # 1 where motors are integrated exactly, else 0
-    "lift": ("f8", ()),  # kF
+    "velocity_gain": ("f8", ()),  # dt / m
+    "rates_gain": ("f8", 3),  # dt / I
     "fall": ("f8", ()),  # g dt
-    "push": ("f8", ()),  # dt / m
-    "twist": ("f8", 3),  # dt / I
     "gyro": ("f8", 3),  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
     "thrust_middle": ("f8", ()),  # divided by kF, as is the next
     "thrust_half_range": ("f8", ()),
-    "radius": ("f8", ()),  # of the collision sphere
-    "arm": ("f8", (3, 4)),  # moment per thrust, by axis and rotor
-    "delay": ("f8", ()),  # control steps
-    "vehicle": ("f8", P.roll_arm_0),  # its parameters but for the arms, the last of them
-    "scored": ("f8", len(SCORED)),  # max_distance and the costs of the row's task
+    "speed2": ("f8", ()),  # the larger of |v|² and |ω|²
+    "scored": ("f8", len(SCORED)),  # limits and costs of the row's task
     "reward": ("f8", ()),
     "distance": ("f8", ()),
-    "work": ("f8", 4),
     "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
     "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
     "noise_level": ("f4", ()),  # relative
@@ -100,24 +114,47 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "word": ("u4", WORDS),  # random
     "stream": ("u4", 4),
 }
-_WHOLE = np.dtype(
-    [(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()]
-)
-_FIELDS: Any = dict(_WHOLE.fields or {})
-for _whole, _parts, _first in (
-    ("state", STATE, X),
-    ("wrench", WRENCH, W),
-):  # each part under its name, too
-    for _name, _size in _parts.items():
-        _place = _FIELDS[_whole][1] + 8 * LANES * getattr(_first, _name)
-        _FIELDS[_name] = np.dtype(("f8", (_size, LANES))), _place
-BLOCK = np.dtype(_FIELDS)
+
+
+def _add_alias(fields: Any, whole: str, part: str, row: int, shape: Any = ()) -> None:
+    """Let ``block.part`` be the rows of ``block.whole`` (float64) from ``row`` on."""
+    place = fields[whole][1] + 8 * LANES * row
+    fields[part] = np.dtype(("f8", (*np.empty(shape).shape, LANES))), place
+
+
+def _block_type() -> np.dtype[Any]:
+    """Return the type of a block.
+
+    Fields alias: block.velocity is a view of some rows of block.state, so that the state is loaded
+    in one loop and each quantity still has its name.
+    """
+    whole = np.dtype(
+        [(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()]
+    )
+    fields: Any = dict(whole.fields or {})
+    for name, size in STATE.items():
+        _add_alias(fields, "state", name, getattr(X, name), size)
+    for name, size in WRENCH.items():
+        _add_alias(fields, "wrench", name, getattr(W, name), size)
+    _add_alias(fields, "vehicle", "inertia", P.ixx, 3)
+    _add_alias(fields, "vehicle", "drag", P.drag_x, 3)
+    _add_alias(fields, "vehicle", "lift", P.thrust_coefficient)
+    _add_alias(fields, "vehicle", "exact", P.exact_motors)
+    _add_alias(fields, "vehicle", "radius", P.collision_radius)
+    _add_alias(fields, "vehicle", "delay", P.delay)
+    # The moment of each rotor per thrust, by axis
+    _add_alias(fields, "vehicle", "arm", P.roll_arm_0, (3, 4))
+    return np.dtype(fields)
+
+
+BLOCK = _block_type()
 _SIZE = BLOCK.itemsize
 
 
 class BatchArrays(NamedTuple):
-    """What control steps of n rows read and write. Where a shape says 1 or n, one column may serve
-    all rows.
+    """The arrays and constants of n rows that :func:`step` reads and writes.
+
+    Where a shape says 1 or n, one column may serve all rows.
     """
 
     state: FloatArray  # (STATE_SIZE, n), see STATE
@@ -131,15 +168,13 @@ class BatchArrays(NamedTuple):
     gust: FloatArray  # (GUST_SIZE, 0 or n), of force
     wind: FloatArray  # (3, n), velocity of the air without gusts, world frame, m/s
     wind_gust: FloatArray  # (GUST_SIZE, 0 or n)
-    frames: (
-        Float32Array  # (n, depth, frame size), depth 0 where an observation is the present features
-    )
+    # (n, depth, frame size); depth 0 where an observation is the present features
+    frames: Float32Array
     ages: IntArray  # (ages,), of the frames in an observation, control steps
     integral: FloatArray  # (0 or 3, n), of the position
     integral_numbers: FloatArray  # (4,), see PositionIntegral
     streams: Any  # uint32 (4, n), see random.py
-    # (2 OBSERVATION_SIZE + 2, 1 or n), μ and σ of Eq. 3.16, levels of the relative and additive
-    # noise
+    # (2 OBSERVATION_SIZE + 2, 1 or n): μ and σ of Eq. 3.16, relative and additive noise level
     scaling: FloatArray
     task_index: IntArray  # (n,), of the episodes under way
     task_parameters: FloatArray  # (tasks, columns), see TASK
@@ -149,39 +184,46 @@ class BatchArrays(NamedTuple):
     max_steps: IntArray  # (n,), of those that follow
     outcome: Any  # OUTCOME (n,)
     last_observations: Float32Array  # (n, size), of the episodes that outcome tells of
-    # (5,): physics step, s; physics steps in a control step; whether delays differ by row;
-    # whether
-    constants: FloatArray
-    # rotor positions do; whether a row that ends begins its next episode within the same step
+    physics_step: float  # s
+    substeps: int  # physics steps in a control step
+    own_delays: bool  # whether delays differ by row
+    autoreset: bool  # whether a row that ends begins its next episode within the same step
 
 
 @compiled
 def step(
     control, leads, mode, actions, observations, rewards, dones,
-    state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers, gust, wind, wind_gust,
-    frames, ages, integral, integral_numbers, streams, scaling,
-    task_index, task_parameters, task_weights, returns, limits, max_steps, outcome, last_observations, constants,
+    state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers,
+    gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams, scaling,
+    task_index, task_parameters, task_weights, returns, limits, max_steps,
+    outcome, last_observations,
+    physics_step, substeps, own_delays, autoreset,
 ):  # fmt: skip
-    """A control step of all rows, of which this thread takes as many as others leave it; see
-    :func:`.threads.share_out`.
+    """Compute a control step of all rows, of which this thread takes as many as others leave it;
+    see :func:`.threads.share_out`.
 
-    Arrays as flat arguments: with them in a named tuple numba took twice as long to compile, and
-    each block a tenth longer.
+    The arrays are flat arguments: with them in a named tuple numba took twice as long to compile,
+    and each block a tenth longer. The parts of a step are functions that numba inlines
+    (``inline="always"``): where LLVM inlined them, a step took 5 to 8 % longer.
 
     :param leads: whether this is the thread that returns to the batch.
     :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and
         ``dones`` bool (n,) are written; the others are :class:`BatchArrays`.
     :return: False if an action is not finite, and then nothing has happened.
     """
-    n, physics_step, substeps = state.shape[1], constants[0], np.int64(constants[1])
-    own_delays, own_arms, autoreset = constants[2] > 0.0, constants[3] > 0.0, constants[4] > 0.0
+    n = state.shape[1]
     chunks = (n + CHUNK - 1) // CHUNK
     if leads:
-        if mode != LOOK and not _finite(actions):
+        if mode != LOOK and not _is_finite(actions):
             return False
         control[LEFT] = chunks
     blocks = _new_block()
-    rows, found, taken, fresh = np.empty(n, np.int64), 0, 0, True  # rows whose observations are due
+    _load_shared(blocks[0], scaling, vehicles, task_parameters, physics_step)
+
+    # The rows whose observations are due at the end: those that begin an episode, or all in LOOK.
+    due = np.empty(n, np.int64)
+    n_due = 0
+    taken = 0
     while True:
         left = atomic_add(control, LEFT, -1)
         if left <= 0:
@@ -190,31 +232,20 @@ def step(
         chunk = (chunks - left) * CHUNK
         if mode == LOOK:
             for i in range(chunk, min(chunk + CHUNK, n)):
-                rows[found] = i
-                found += 1
+                due[n_due] = i
+                n_due += 1
             continue
         for first in range(chunk, min(chunk + CHUNK, n), LANES):
-            b = blocks[0]  # here: numba frees an array after its last use, whatever points into it
+            # Numba frees an array after its last use, whatever points into it: hence here.
+            b = blocks[0]
             count = min(LANES, n - first)
-            # What is the same for all rows is in the block already unless it is fresh.
             for lane in range(LANES):
                 b.row[lane] = first + min(lane, count - 1)
-            if fresh or scaling.shape[1] > 1:
-                _load_scaling(b, scaling)
-            if fresh or vehicles.shape[1] > 1:
-                _load_vehicles(b, vehicles, first, count, physics_step, fresh or own_arms)
-            if fresh or task_weights.shape[0] > 1:
-                _load_scored(b, task_index, task_parameters)
-            fresh = False
+            _load_own(b, first, count, scaling, vehicles, task_index, task_parameters, physics_step)
             _load_rows(state, first, count, b.state)
             if mode == FLY:
-                _load_rows(wrench, first, count, b.wrench)
-                _load_rows(wind, first, count, b.wind)
-                if gust.shape[1] > 0:
-                    add_gusts(b.force_world, gust, first, count)
-                if wind_gust.shape[1] > 0:
-                    add_gusts(b.wind, wind_gust, first, count)
-                _load_commands(actions, queue, own_delays, b, first, count)
+                _load_wrench(b, first, count, wrench, gust, wind, wind_gust)
+                _load_commands(b, first, count, actions, queue, own_delays)
                 fly(b, physics_step, substeps)
                 for k in range(X.target):
                     for lane in range(count):
@@ -224,92 +255,40 @@ def step(
                 streams[STEP, first + lane] += np.uint32(1)
             _load_rows(streams, first, count, b.stream)
             observe(b)
-            if gust.shape[1] > 0:
-                advance_gusts(b, gust, first, count)
-            if wind_gust.shape[1] > 0:
-                gust_words(b.word[GUST_WORDS:], b.stream)
-                advance_gusts(b, wind_gust, first, count)
-            if frames.shape[1] > 0:
-                for lane in range(count):
-                    i = first + lane
-                    store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
-                    if integral.shape[0] > 0:
-                        integrate_position(
-                            i, b.feature, lane, b.mean, b.inverse_std, integral_numbers, integral
-                        )
+            _advance_disturbances(b, first, count, gust, wind_gust)
+            _advance_frames(b, first, count, actions, integral_numbers, integral, frames)
             _write_observations(b, count, integral, ages, frames, observations)
+            ended = _end_episodes(
+                b, first, count, autoreset, observations, rewards, dones, returns, limits,
+                outcome, last_observations,
+            )  # fmt: skip
+            if autoreset and ended > 0:
+                for i in range(first, first + count):
+                    if dones[i]:
+                        due[n_due] = i
+                        n_due += 1
 
-            height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
-            ends = 0
-            for lane in range(count):
-                i = first + lane
-                returns[i] += b.reward[lane]
-                rewards[i] = b.reward[lane]
-                lost = (height[lane] <= radius[lane]) | (
-                    distance[lane] > scored[S.max_distance, lane]
-                )
-                dones[i] = lost | (b.stream[STEP, lane] >= limits[i])
-                ends += dones[i]
-            if ends == 0 and autoreset:
-                continue
-            for lane in range(count):
-                i = first + lane
-                if not dones[i] and autoreset:
-                    continue
-                outcome[i].collision = height[lane] <= radius[lane]
-                outcome[i].out_of_range = distance[lane] > scored[S.max_distance, lane]
-                outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
-                outcome[i].success = outcome[i].truncated and succeeds(b, lane)
-                outcome[i].distance = distance[lane]
-                outcome[i].total, outcome[i].reward = returns[i], b.reward[lane]
-                outcome[i].length = b.stream[STEP, lane]
-                for k in range(observations.shape[1]):
-                    last_observations[i, k] = observations[i, k]
-                if autoreset:
-                    rows[found] = i
-                    found += 1
-
-    for first in range(0, found, LANES):
+    for first in range(0, n_due, LANES):
         b = blocks[0]
-        count = min(LANES, found - first)
+        count = min(LANES, n_due - first)
         for lane in range(LANES):
-            b.row[lane] = rows[first + min(lane, count - 1)]
+            b.row[lane] = due[first + min(lane, count - 1)]
         for lane in range(count):
             i = b.row[lane]
-            if not dones[i]:
-                continue
-            returns[i], limits[i] = 0.0, max_steps[i]
-            count_episode(i, streams)
-            sample_episode(
-                i,
-                streams,
-                base_vehicles,
-                distribution_numbers,
-                randomize_numbers,
-                vehicles,
-                wrench,
-                gust,
-                wind,
-                wind_gust,
-            )
-            start_episode(
-                i, state, queue, streams, task_index, vehicles, task_parameters, task_weights
-            )
-            if frames.shape[1] > 0:
-                clear_frames(i, frames, integral)
-        if fresh or scaling.shape[1] > 1:
-            _load_scaling(b, scaling)
-        fresh = False
-        if b.row[count - 1] - b.row[0] == count - 1:  # side by side, since rows ascend
-            _load_rows(state, b.row[0], count, b.state)
-            _load_rows(streams, b.row[0], count, b.stream)
-        else:  # lanes behind the last row keep a row of the last block
-            for lane in range(count):
-                for k in range(STATE_SIZE):
-                    b.state[k, lane] = state[k, b.row[lane]]
-                for k in range(4):
-                    b.stream[k, lane] = streams[k, b.row[lane]]
-        observe(b)
+            if dones[i]:
+                returns[i] = 0.0
+                limits[i] = max_steps[i]
+                count_episode(i, streams)
+                sample_episode(
+                    i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles,
+                    wrench, gust, wind, wind_gust,
+                )  # fmt: skip
+                start_episode(
+                    i, state, queue, streams, task_index, vehicles, task_parameters, task_weights
+                )
+                if frames.shape[1] > 0:
+                    clear_frames(i, frames, integral)
+        _observe_rows(b, count, state, streams, scaling)
         _write_observations(b, count, integral, ages, frames, observations)
     atomic_add(control, DONE, taken)
     if leads:
@@ -322,27 +301,26 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, o
     """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body
     itself.
 
-    Motors do not feel the body, so that all physics steps of a control step can be worked out
-    before it moves.
+    Motors do not feel the body, so all physics steps of a control step can be computed before it
+    moves.
 
     :param actions: float32 (n, 4), clipped to [-1, 1].
-    :param out: (substeps, 2, 3): what rotors and wrench do in each physics step, force (N) and
-        torque (N m), body frame.
+    :param out: (substeps, 2, 3): force (N) and torque (N m) of rotors and wrench in each physics
+        step, body frame.
     """
     blocks = _new_block()
-    for each in range(len(out)):
+    blocks[0].row[:] = 0
+    _load_rows(state, 0, 1, blocks[0].state)
+    _load_rows(wrench, 0, 1, blocks[0].wrench)
+    _load_vehicles(blocks[0], vehicles, 0, 1, physics_step)
+    _load_commands(blocks[0], 0, 1, actions, queue, own_delays)
+    for substep in range(len(out)):
         b = blocks[0]
-        if each == 0:
-            b.row[:] = 0
-            _load_rows(state, 0, 1, b.state)
-            _load_rows(wrench, 0, 1, b.wrench)
-            _load_vehicles(b, vehicles, 0, 1, physics_step, True)
-            _load_commands(actions, queue, own_delays, b, 0, 1)
-        f0, f1, f2, f3 = turn_rotors(b, 0)
+        turn_rotors(b, 0)
         for axis in range(3):
-            out[each, 0, axis] = b.force_body[axis, 0]
-            out[each, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0, f0, f1, f2, f3)
-        out[each, 0, 2] += (f0 + f1) + (f2 + f3)
+            out[substep, 0, axis] = b.force_body[axis, 0]
+            out[substep, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0)
+        out[substep, 0, 2] += total_thrust(b, 0)
         for rotor in range(4):
             state[X.rotor_speeds + rotor, 0] = b.rotor_speeds[rotor, 0]
 
@@ -353,19 +331,41 @@ def write_body(state, position, quaternion, velocity, rates):
     column 0 of ``state``.
     """
     x, y, z, w = quaternion
-    r, state[X.quaternion, 0] = rotation_rows(w, x, y, z), w
+    body_rates = to_body(rotation_rows(w, x, y, z), rates[0], rates[1], rates[2])
+    state[X.quaternion, 0] = w
     for axis in range(3):
-        state[X.position + axis, 0], state[X.velocity + axis, 0] = position[axis], velocity[axis]
+        state[X.position + axis, 0] = position[axis]
         state[X.quaternion + 1 + axis, 0] = quaternion[axis]
-        state[X.body_rates + axis, 0] = (
-            r[0][axis] * rates[0] + r[1][axis] * rates[1] + r[2][axis] * rates[2]
-        )
+        state[X.velocity + axis, 0] = velocity[axis]
+        state[X.body_rates + axis, 0] = body_rates[axis]
+
+
+def physical_features(state: QuadcopterState) -> Float32Array:
+    """Return the features of a true state, in their units and without noise, float32
+    (n, OBSERVATION_SIZE), in the order of :data:`~sb3_quad.simulation.observation.FEATURES`.
+    """
+    out = np.empty((state.n, OBSERVATION_SIZE), np.float32)
+    _write_features(np.ascontiguousarray(state.array), out)
+    return out
+
+
+@compiled
+def _write_features(state, out):
+    blocks = _new_block()
+    for first in range(0, len(out), LANES):
+        b = blocks[0]
+        count = min(LANES, len(out) - first)
+        _load_rows(state, first, count, b.state)
+        features(b)
+        for lane in range(count):
+            for k in range(OBSERVATION_SIZE):
+                out[first + lane, k] = b.feature[k, lane]
 
 
 @compiled
 def _new_block():
-    """Room for a block, (1,), which begins with a cache line: vectors that straddle two take a
-    third longer.
+    """Return room for a block, (1,), which begins with a cache line: vectors that straddle two take
+    a third longer.
     """
     room = np.empty(_SIZE + 64, np.uint8)
     start = -room.ctypes.data % 64
@@ -373,8 +373,8 @@ def _new_block():
 
 
 @compiled
-def _finite(actions):
-    # By their bits: code compiled with fastmath may take it that no NaN exists.
+def _is_finite(actions):
+    # By their bits: code compiled with fastmath may assume that no NaN exists.
     wrong = 0
     for bits in actions.view(np.int32).reshape(-1):
         wrong += (bits & 0x7F800000) == 0x7F800000
@@ -382,24 +382,8 @@ def _finite(actions):
 
 
 @compiled
-def _write_observations(b, count, integral, ages, frames, out):
-    """The observations of a block to its rows of ``out``, float32 (n, size)."""
-    if frames.shape[1] == 0:
-        for lane in range(count):
-            i = b.row[lane]
-            for k in range(OBSERVATION_SIZE):
-                out[i, k] = b.feature[k, lane]
-        return
-    for lane in range(count):
-        since = np.int64(b.stream[STEP, lane])
-        observe_frames(
-            b.row[lane], since, b.feature, lane, b.inverse_std, integral, ages, frames, out
-        )
-
-
-@compiled
 def _load_rows(source, first, count, target):
-    """Some columns of a (rows, n) array to a block, or one column for all lanes."""
+    """Copy some columns of a (rows, n) array to a block, or its only column to all lanes."""
     for k in range(target.shape[0]):
         if source.shape[1] == 1:
             for lane in range(LANES):
@@ -412,46 +396,88 @@ def _load_rows(source, first, count, target):
                 target[k, lane] = source[k, first + min(lane, count - 1)]
 
 
-@compiled
-def _load_vehicles(b, vehicles, first, count, dt, arms):
-    """What the control step needs of the vehicles of a block, with the divisions done; without
-    ``arms`` those stay.
-    """
-    if vehicles.shape[1] > 1 and count == LANES:
-        _divide(b, vehicles, first, dt)
-    else:
-        _load_rows(vehicles, first, count, b.vehicle)
-        _divide(b, b.vehicle, 0, dt)
-    if arms:
-        _load_rows(vehicles[P.roll_arm_0 :], first, count, b.arm.reshape(12, LANES))
+@compiled(inline="always")
+def _load_shared(b, scaling, vehicles, tasks, dt):
+    """Load what is the same for all rows: these loads serve all blocks of a call."""
+    b.row[:] = 0
+    if scaling.shape[1] == 1:
+        _load_scaling(b, scaling)
+    if vehicles.shape[1] == 1:
+        _load_vehicles(b, vehicles, 0, 1, dt)
+    if tasks.shape[0] == 1:
+        for lane in range(LANES):
+            _load_task(b, lane, tasks, 0)
 
 
-@compiled
-def _divide(b, v, first, dt):
+@compiled(inline="always")
+def _load_own(b, first, count, scaling, vehicles, task_index, tasks, dt):
+    """Load what differs by row."""
+    if scaling.shape[1] > 1:
+        _load_scaling(b, scaling)
+    if vehicles.shape[1] > 1:
+        _load_vehicles(b, vehicles, first, count, dt)
+    if tasks.shape[0] > 1:
+        for lane in range(LANES):
+            _load_task(b, lane, tasks, task_index[b.row[lane]])
+
+
+@compiled(inline="always")
+def _load_vehicles(b, vehicles, first, count, dt):
+    """Load the vehicles of a block, with the divisions of a control step done."""
+    _load_rows(vehicles, first, count, b.vehicle)
+    v = b.vehicle
     for lane in range(LANES):
-        i = first + lane
-        ixx, iyy, izz, lift = v[P.ixx, i], v[P.iyy, i], v[P.izz, i], v[P.thrust_coefficient, i]
-        exact = b.exact[lane] = v[P.exact_motors, i]
-        b.motor[0, lane] = motor_factor(v[P.motor_gain_up, i], exact, dt)
-        b.motor[1, lane] = motor_factor(v[P.motor_gain_down, i], exact, dt)
-        b.push[lane] = dt / v[P.mass, i]
-        b.drag[0, lane], b.drag[1, lane], b.drag[2, lane] = (
-            v[P.drag_x, i],
-            v[P.drag_y, i],
-            v[P.drag_z, i],
-        )
-        b.fall[lane], b.lift[lane] = v[P.gravity, i] * dt, lift
-        b.twist[0, lane], b.twist[1, lane], b.twist[2, lane] = dt / ixx, dt / iyy, dt / izz
-        b.gyro[0, lane], b.gyro[1, lane], b.gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx
-        b.thrust_middle[lane] = v[P.thrust_middle, i] / lift
-        b.thrust_half_range[lane] = v[P.thrust_half_range, i] / lift
-        b.radius[lane], b.delay[lane] = v[P.collision_radius, i], v[P.delay, i]
+        lift, exact = b.lift[lane], b.exact[lane]
+        b.motor[0, lane] = motor_factor(v[P.motor_gain_up, lane], exact, dt)
+        b.motor[1, lane] = motor_factor(v[P.motor_gain_down, lane], exact, dt)
+        b.thrust_middle[lane] = v[P.thrust_middle, lane] / lift
+        b.thrust_half_range[lane] = v[P.thrust_half_range, lane] / lift
+        b.velocity_gain[lane] = dt / v[P.mass, lane]
+        b.fall[lane] = dt * v[P.gravity, lane]
+        ixx, iyy, izz = vector(b.inertia, lane)
+        b.gyro[0, lane] = izz - iyy
+        b.gyro[1, lane] = ixx - izz
+        b.gyro[2, lane] = iyy - ixx
+        for axis in range(3):
+            b.rates_gain[axis, lane] = dt / b.inertia[axis, lane]
+
+
+@compiled(inline="always")
+def _load_task(b, lane, tasks, task):
+    """Load limits and costs of the task that a row is flying; they are the last of its columns."""
+    for k in range(b.scored.shape[0]):
+        b.scored[k, lane] = tasks[task, T.max_distance + k]
 
 
 @compiled
-def _load_commands(actions, queue, own_delays, b, first, count):
-    """Actions into the delay's end, or where delays differ the row's own, and what leaves it into
-    the wanted speeds.
+def _load_scaling(b, scaling):
+    """Load μ, 1/σ and the noise levels of a block, in float32."""
+    for lane in range(LANES):
+        i = 0 if scaling.shape[1] == 1 else b.row[lane]
+        b.noise_level[lane] = scaling[2 * OBSERVATION_SIZE, i]
+        b.additive[lane] = scaling[2 * OBSERVATION_SIZE + 1, i]
+        for k in range(OBSERVATION_SIZE):
+            b.mean[k, lane] = scaling[k, i]
+            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(scaling[OBSERVATION_SIZE + k, i])
+
+
+@compiled(inline="always")
+def _load_wrench(b, first, count, wrench, gust, wind, wind_gust):
+    """Load wrench and wind of a block, and add their gusts."""
+    _load_rows(wrench, first, count, b.wrench)
+    _load_rows(wind, first, count, b.wind)
+    if gust.shape[1] > 0:
+        add_gusts(b.force_world, gust, first, count)
+    if wind_gust.shape[1] > 0:
+        add_gusts(b.wind, wind_gust, first, count)
+
+
+@compiled(inline="always")
+def _load_commands(b, first, count, actions, queue, own_delays):
+    """Put the commands of a block into the queue, and take those that are due to
+    ``b.wanted_speeds``.
+
+    A command enters at the queue's end, or where delays differ at the row's own delay.
     """
     command, wanted, own = b.command, b.wanted_speeds, b.delay
     delay = queue.shape[0]
@@ -465,17 +491,13 @@ def _load_commands(actions, queue, own_delays, b, first, count):
             for lane in range(LANES):
                 wanted[k, lane] = command[k, lane]
         return
+    _load_rows(queue[0], first, count, wanted)
     for k in range(4):
-        for lane in range(LANES):
-            wanted[k, lane] = queue[0, k, first + min(lane, count - 1)]
         for late in range(delay - 1):
-            here, behind = (
-                queue[late, k, first : first + count],
-                queue[late + 1, k, first : first + count],
-            )
+            # Views, and both values read whichever is taken: else the loop is not vectorised.
+            here = queue[late, k, first : first + count]
+            behind = queue[late + 1, k, first : first + count]
             for lane in range(count):
-                # Both are read whichever is taken, and the rows are views: else the loop is not
-                # vectorised.
                 new, old = command[k, lane], behind[lane]
                 here[lane] = new if own_delays and own[lane] == late + 1.0 else old
         if own_delays:
@@ -486,24 +508,97 @@ def _load_commands(actions, queue, own_delays, b, first, count):
             queue[delay - 1, k, first + lane] = command[k, lane]
 
 
-@compiled
-def _load_scored(b, index, parameters):
-    """Limits and costs of the tasks that the rows of a block are flying."""
-    for lane in range(LANES):
-        task = 0 if parameters.shape[0] == 1 else index[b.row[lane]]
-        for k in range(len(_SCORED)):
-            b.scored[k, lane] = parameters[task, _SCORED[k]]
+@compiled(inline="always")
+def _advance_disturbances(b, first, count, gust, wind_gust):
+    """Advance the gusts of a block by a control step; those of the wind have words of their own."""
+    if gust.shape[1] > 0:
+        advance_gusts(b, gust, first, count)
+    if wind_gust.shape[1] > 0:
+        gust_words(b.word[GUST_WORDS:], b.stream)
+        advance_gusts(b, wind_gust, first, count)
+
+
+@compiled(inline="always")
+def _advance_frames(b, first, count, actions, integral_numbers, integral, frames):
+    """Keep the actions of a block and advance its position integrals, where a policy sees them."""
+    if frames.shape[1] == 0:
+        return
+    for lane in range(count):
+        i = first + lane
+        store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
+        if integral.shape[0] > 0:
+            integrate_position(
+                i, b.feature, lane, b.mean, b.inverse_std, integral_numbers, integral
+            )
 
 
 @compiled
-def _load_scaling(b, scaling):
-    """μ, 1/σ and the noise levels of a block, in float32."""
-    for lane in range(LANES):
-        i = 0 if scaling.shape[1] == 1 else b.row[lane]
-        b.noise_level[lane], b.additive[lane] = (
-            scaling[2 * OBSERVATION_SIZE, i],
-            scaling[2 * OBSERVATION_SIZE + 1, i],
-        )
-        for k in range(OBSERVATION_SIZE):
-            b.mean[k, lane] = scaling[k, i]
-            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(scaling[OBSERVATION_SIZE + k, i])
+def _write_observations(b, count, integral, ages, frames, out):
+    """Write the observations of a block to its rows of ``out``, float32 (n, size)."""
+    if frames.shape[1] == 0:
+        for lane in range(count):
+            i = b.row[lane]
+            for k in range(OBSERVATION_SIZE):
+                out[i, k] = b.feature[k, lane]
+        return
+    for lane in range(count):
+        i, since = b.row[lane], np.int64(b.stream[STEP, lane])
+        observe_frames(i, since, b.feature, lane, b.inverse_std, integral, ages, frames, out)
+
+
+@compiled(inline="always")
+def _end_episodes(
+    b, first, count, autoreset, observations, rewards, dones, returns, limits,
+    outcome, last_observations,
+):  # fmt: skip
+    """Write rewards and dones of a block, and how the episodes ended; return how many have.
+
+    Without autoreset the outcome is that of every row's last step.
+    """
+    height, distance, limit = b.position[2], b.distance, b.scored[S.max_distance]
+    ended = 0
+    for lane in range(count):
+        i = first + lane
+        returns[i] += b.reward[lane]
+        rewards[i] = b.reward[lane]
+        crashed = height[lane] <= b.radius[lane]
+        out_of_range = distance[lane] > limit[lane]
+        dones[i] = crashed | out_of_range | (b.stream[STEP, lane] >= limits[i])
+        ended += dones[i]
+    if ended == 0 and autoreset:
+        return ended
+    for lane in range(count):
+        i = first + lane
+        if autoreset and not dones[i]:
+            continue
+        outcome[i].collision = height[lane] <= b.radius[lane]
+        outcome[i].out_of_range = distance[lane] > limit[lane]
+        outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
+        outcome[i].success = outcome[i].truncated and succeeds(b, lane)
+        outcome[i].distance = distance[lane]
+        outcome[i].total = returns[i]
+        outcome[i].reward = b.reward[lane]
+        outcome[i].length = b.stream[STEP, lane]
+        for k in range(observations.shape[1]):
+            last_observations[i, k] = observations[i, k]
+    return ended
+
+
+@compiled(inline="always")
+def _observe_rows(b, count, state, streams, scaling):
+    """Observe ``count`` rows of the batch, those in ``b.row``."""
+    if scaling.shape[1] > 1:
+        _load_scaling(b, scaling)
+    first = b.row[0]
+    if b.row[count - 1] - first == count - 1:
+        # The rows are neighbours, since they ascend.
+        _load_rows(state, first, count, b.state)
+        _load_rows(streams, first, count, b.stream)
+    else:
+        # Lanes behind the last row keep a row of the last block, which nobody reads.
+        for lane in range(count):
+            for k in range(STATE_SIZE):
+                b.state[k, lane] = state[k, b.row[lane]]
+            for k in range(4):
+                b.stream[k, lane] = streams[k, b.row[lane]]
+    observe(b)

@@ -1,116 +1,131 @@
 """The features of an observation (thesis 3.3.1), their noise and their scaling (Eq. 3.16).
 
-:data:`FEATURES` names them and :func:`features` computes them: a new one is a line in the table and
-its formula.
+:data:`FEATURES` names them and :func:`features` computes them. To add one, add a line to the table
+and its formula to the function; nothing else lists them.
 """
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import float32
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.simulation.compiled import LANES, compiled
-from sb3_quad.simulation.physics import rotation_rows
+from sb3_quad.simulation.physics import rotation, to_body, vector
 from sb3_quad.simulation.random import random_words, standard_normals
 from sb3_quad.simulation.state import first_rows, row_slices
+from sb3_quad.vehicles.layout import Turn
 
 
 class Feature(NamedTuple):
-    """Features of one kind.
+    """A group of features of one kind.
 
-    :param name: of the group; ``each`` begins the name of one feature, which ends in one of
-        ``parts``.
+    :param name: of the group.
+    :param prefix: what the name of each feature begins with; it ends in one of ``parts``.
     :param std: σ of Eq. 3.16 (Table A.2), in ``unit``.
+    :param axes: what the features belong to, which says how :func:`turn_features` turns them: the
+        ``world``'s axes, the ``body``'s axes, or the ``rotors``.
     """
 
     name: str
-    each: str
+    prefix: str
     parts: tuple[str, ...]
     std: float
     unit: str
+    axes: Literal["world", "body", "rotors"]
 
 
-_MATRIX = tuple(f"{row}{column}" for row in range(3) for column in range(3))
+_XYZ = ("x", "y", "z")
+_MATRIX = ("00", "01", "02", "10", "11", "12", "20", "21", "22")
 FEATURES = (
-    Feature(
-        "position", "position", ("x", "y", "z"), 10.0 / math.sqrt(3.0), "m"
-    ),  # r - r_T, world frame
-    Feature("rotation", "rotation", _MATRIX, math.sqrt(3.0), "-"),  # world to body
-    Feature("velocity", "velocity", ("x", "y", "z"), 5.0, "m/s"),  # body frame
-    Feature("body_rates", "body_rate", ("x", "y", "z"), 5.0, "rad/s"),  # body frame
+    # r - r_T
+    Feature("position", "position", _XYZ, 10.0 / math.sqrt(3.0), "m", "world"),
+    # The rotation matrix from world to body, row by row
+    Feature("rotation", "rotation", _MATRIX, math.sqrt(3.0), "-", "body"),
+    Feature("velocity", "velocity", _XYZ, 5.0, "m/s", "body"),
+    Feature("body_rates", "body_rate", _XYZ, 5.0, "rad/s", "body"),
 )
 _SIZES = {feature.name: len(feature.parts) for feature in FEATURES}
 F = first_rows(_SIZES)
 GROUPS = row_slices(_SIZES)
-"""By the name of a group, where its features stand in an observation."""
-FEATURE_NAMES = tuple(f"{feature.each}_{part}" for feature in FEATURES for part in feature.parts)
+"""The place of each group in an observation, by its name."""
+FEATURE_NAMES = tuple(f"{feature.prefix}_{part}" for feature in FEATURES for part in feature.parts)
 OBSERVATION_SIZE = len(FEATURE_NAMES)
-NORMALS = -(-OBSERVATION_SIZE // 2) * 2  # of the noise, each from a random word
-GUST_WORDS = NORMALS  # where the two random words of a gust begin, behind those
-WORDS = -(-(GUST_WORDS + 2) // 4) * 4  # random words of a control step
 DEFAULT_MEAN = np.zeros(OBSERVATION_SIZE)
-DEFAULT_STD = np.concatenate([np.full(len(feature.parts), feature.std) for feature in FEATURES])
+DEFAULT_STD = np.repeat([feature.std for feature in FEATURES], list(_SIZES.values()))
+
+# The noise takes a random word for each normal, and normals come in pairs. Two words for a gust
+# follow. Random words come in fours.
+NORMALS = 2 * math.ceil(OBSERVATION_SIZE / 2)
+GUST_WORDS = NORMALS
+WORDS = 4 * math.ceil((GUST_WORDS + 2) / 4)
+
+
+def turn_features(turn: Turn) -> FloatArray:
+    """Return the matrix from features in a vehicle's own axes to those in the axes of a layout.
+
+    :param turn: from the vehicle's own body axes and rotors to those of the layout.
+    :return: orthogonal, shape (OBSERVATION_SIZE, OBSERVATION_SIZE); its transpose turns them back.
+    """
+    matrix = np.eye(OBSERVATION_SIZE)
+    for feature in FEATURES:
+        place = GROUPS[feature.name]
+        if feature.axes == "body":
+            # A vector has three features, a matrix three for each body axis.
+            columns = len(feature.parts) // 3
+            matrix[place, place] = np.kron(turn.axes, np.eye(columns))
+        elif feature.axes == "rotors":
+            matrix[place, place] = np.eye(4)[list(turn.order)]
+    return matrix
 
 
 @compiled(fastmath=True)
 def features(b):
-    """``b.feature``, float32: what is observed of a loaded block, in the units of the table,
-    without noise.
+    """Write the features of a loaded block, in the units of the table and without noise.
+
+    They go to ``b.feature``, float32.
     """
-    position, target, q, v, w, out = (
-        b.position,
-        b.target,
-        b.quaternion,
-        b.velocity,
-        b.body_rates,
-        b.feature,
-    )
+    out = b.feature
     for lane in range(LANES):
-        vx, vy, vz = v[0, lane], v[1, lane], v[2, lane]
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_rows(
-            q[0, lane], q[1, lane], q[2, lane], q[3, lane]
-        )
+        r = rotation(b.quaternion, lane)
+        vx, vy, vz = vector(b.velocity, lane)
+        vx, vy, vz = to_body(r, vx, vy, vz)
         for k in range(3):
-            out[F.position + k, lane] = float32(position[k, lane] - target[k, lane])
-            out[F.body_rates + k, lane] = float32(w[k, lane])
-        out[F.rotation, lane] = float32(r00)
-        out[F.rotation + 1, lane] = float32(r10)
-        out[F.rotation + 2, lane] = float32(r20)
-        out[F.rotation + 3, lane] = float32(r01)
-        out[F.rotation + 4, lane] = float32(r11)
-        out[F.rotation + 5, lane] = float32(r21)
-        out[F.rotation + 6, lane] = float32(r02)
-        out[F.rotation + 7, lane] = float32(r12)
-        out[F.rotation + 8, lane] = float32(r22)
-        out[F.velocity, lane] = float32(r00 * vx + r10 * vy + r20 * vz)
-        out[F.velocity + 1, lane] = float32(r01 * vx + r11 * vy + r21 * vz)
-        out[F.velocity + 2, lane] = float32(r02 * vx + r12 * vy + r22 * vz)
+            out[F.position + k, lane] = float32(b.position[k, lane] - b.target[k, lane])
+            out[F.body_rates + k, lane] = float32(b.body_rates[k, lane])
+            # From world to body: the transpose of r
+            out[F.rotation + k, lane] = float32(r[k][0])
+            out[F.rotation + 3 + k, lane] = float32(r[k][1])
+            out[F.rotation + 6 + k, lane] = float32(r[k][2])
+        out[F.velocity, lane] = float32(vx)
+        out[F.velocity + 1, lane] = float32(vy)
+        out[F.velocity + 2, lane] = float32(vz)
 
 
 @compiled(fastmath=True)
 def _disturb_and_scale(b):
+    """Add noise to ``b.feature`` and scale it by Eq. 3.16, in place."""
     feature, noise, mean, inverse_std = b.feature, b.noise, b.mean, b.inverse_std
     added = float32(0.0)
     for lane in range(LANES):
         added = max(added, b.additive[lane])
     for k in range(OBSERVATION_SIZE):
         for lane in range(LANES):
-            relative = b.noise_level[lane] * feature[k, lane]
             if added == float32(0.0):
+                # Relative noise alone, the usual case, needs no square root.
                 noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
             else:
+                relative = b.noise_level[lane] * feature[k, lane]
                 fixed = b.additive[lane] / inverse_std[k, lane]
-                noisy = (
-                    feature[k, lane]
-                    + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
-                )
+                spread = math.sqrt(relative * relative + fixed * fixed)
+                noisy = feature[k, lane] + spread * noise[k, lane]
             feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
 
 
 @compiled(inline="always")
 def observe(b):
-    """``b.feature``: the observations of a loaded block, disturbed by the noise and scaled.
+    """Write the scaled features of a loaded block with their noise to ``b.feature``.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
     """

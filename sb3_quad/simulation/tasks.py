@@ -106,12 +106,8 @@ class Task(Frozen):
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
 """Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
 T = first_rows(TASK)
-# What a control step needs:
-SCORED = [
-    name
-    for name in TASK
-    if name.startswith(("max_", "success_")) or name.endswith(("_cost", "_range"))
-]
+SCORED = list(TASK)[list(TASK).index("max_distance") :]
+"""The fields that every control step needs: all from ``max_distance`` on, a number each."""
 S = first_rows(dict.fromkeys(SCORED, 1))
 
 RECOVERED = {
