@@ -58,6 +58,7 @@ class BatchEnv:
     """
 
     batch: QuadcopterBatch
+    flight_settings: FlightSettings
 
     def _make_batch(
         self, n: int, seed: int | None, n_threads: int | None, autoreset: bool, **keywords: Any
@@ -71,8 +72,8 @@ class BatchEnv:
         } | FlightSettings.model_fields.keys()
         for key in keywords.keys() - valid:
             raise ConfigError(f"{type(self).__name__}: {unknown('keyword', key, valid)}")
-        settings = validate(FlightSettings, keywords, type(self).__name__)
-        self.batch = QuadcopterBatch(n, settings, seed, n_threads, autoreset)
+        self.flight_settings = validate(FlightSettings, keywords, type(self).__name__)
+        self.batch = QuadcopterBatch(n, self.flight_settings, seed, n_threads, autoreset)
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         """A copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""

@@ -200,7 +200,7 @@ if __name__ == "__main__":
     model = DAgger(
         "MlpPolicy",
         env,
-        PIDExpert(),
+        expert=PIDExpert(),
         n_steps=250,
         batch_size=2048,
         gradient_steps=100,

@@ -127,7 +127,7 @@ if __name__ == "__main__":
     model = DAgger(
         "MlpPolicy",
         env,
-        GeometricExpert(),
+        expert=GeometricExpert(),
         n_steps=125,
         batch_size=2048,
         gradient_steps=100,

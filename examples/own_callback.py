@@ -52,7 +52,7 @@ env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=300, seed=0
 model = DAgger(
     "MlpPolicy",
     env,
-    GeometricExpert(),
+    expert=GeometricExpert(),
     n_steps=125,
     batch_size=2048,
     gradient_steps=100,

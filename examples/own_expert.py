@@ -54,7 +54,7 @@ if __name__ == "__main__":
     model = DAgger(
         "MlpPolicy",
         env,
-        expert,
+        expert=expert,
         n_steps=125,
         batch_size=2048,
         gradient_steps=100,

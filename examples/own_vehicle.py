@@ -46,7 +46,7 @@ env = QuadcopterVecEnv(240, task="state_recovery", vehicle=vehicle, max_episode_
 model = DAgger(
     "MlpPolicy",
     env,
-    expert,
+    expert=expert,
     n_steps=125,
     batch_size=2048,
     gradient_steps=100,

@@ -55,8 +55,8 @@ SMALL = {
 def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     env = QuadcopterVecEnv(8, seed=0, max_episode_steps=20)
     models = [
-        DAgger("MlpPolicy", env, PIDExpert(), **SMALL),
-        DAgger("MlpPolicy", env, PIDExpert(), clip_range_vf=0.2, **SMALL),
+        DAgger("MlpPolicy", env, expert=PIDExpert(), **SMALL),
+        DAgger("MlpPolicy", env, expert=PIDExpert(), clip_range_vf=0.2, **SMALL),
         PPOBC("MlpPolicy", env, expert=PIDExpert(), clip_range_vf=0.2, **SMALL),
         PPOBC("MlpPolicy", env, expert=PIDExpert(), bc_coef=LinearSchedule(1.0, 0.0, 0.5), **SMALL),
     ]
@@ -120,7 +120,7 @@ def save_extended(folder):
     model = DAgger(
         "MlpPolicy",
         QuadcopterVecEnv(4, **settings.in_any_task()),
-        GeometricExpert("hummingbird"),
+        expert=GeometricExpert("hummingbird"),
         **SMALL,
     )
     settings.write_into(model)
@@ -172,7 +172,7 @@ def test_the_example_flies_every_zip_where_sb3_quad_cannot_be_imported(tmp_path)
     assert len(distances) == len(zips) + 1
     for name, distance in zip(pretrained_names(), distances, strict=False):
         assert distance < BESIDE.get(name, 0.1), name
-    model = DAgger("MlpPolicy", QuadcopterVecEnv(4), PIDExpert(), **SMALL)
+    model = DAgger("MlpPolicy", QuadcopterVecEnv(4), expert=PIDExpert(), **SMALL)
     model.save(tmp_path / "silent.zip")
     result = subprocess.run(
         [*command, str(tmp_path / "silent.zip")], capture_output=True, text=True, check=False
