@@ -59,6 +59,7 @@ model = DAgger(
     n_epochs=1,
     gamma=0.99,
     learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+    dataset_capacity=1_500_000,
     seed=0,
     device="cpu",
 )

@@ -13,9 +13,7 @@ import argparse
 import numpy as np
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_quad import DAgger, GeometricExpert, PIDExpert
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
+from sb3_quad import DAgger, GeometricExpert, PIDExpert, QuadcopterVecEnv, fly
 from sb3_quad.experts.protocol import Expert
 
 
@@ -64,6 +62,7 @@ if __name__ == "__main__":
         beta=1.0,  # the expert flies the first rollout, and less of each following one
         beta_decay=0.2,
         beta_final=0.0,
+        dataset_capacity=1_500_000,
         seed=0,
         device="cpu",
     )

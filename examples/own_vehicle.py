@@ -53,6 +53,7 @@ model = DAgger(
     n_epochs=1,
     gamma=0.99,
     learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+    dataset_capacity=1_500_000,
     beta=1.0,  # the expert flies the first rollout, and less of each following one
     beta_decay=0.2,
     beta_final=0.0,

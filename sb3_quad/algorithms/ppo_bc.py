@@ -301,8 +301,8 @@ class PPOBC(ExpertMixin, PPO):
         assert self._last_obs is not None, "No previous observation was provided"
         self.policy.set_training_mode(False)
 
-        # + The update comes at the end of this rollout and takes the weight of that time. Only where
-        # there is one, states are labelled.
+        # + The update comes at the end of this rollout and takes the weight of that time. Without a
+        # weight, no state is labelled.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         progress = 1.0 - float(end) / float(self._total_timesteps)
