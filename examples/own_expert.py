@@ -1,5 +1,6 @@
-"""An expert of one's own: the geometric controller while tilted or turning, the thesis's PID else;
-it teaches an agent.
+"""An expert of your own teaches an agent.
+
+It is the geometric controller while the vehicle is tilted or turning, and the thesis's PID else.
 
     python examples/own_expert.py
 
@@ -26,10 +27,10 @@ class SwitchingExpert(Expert):
 
     def actions(self, state):
         """Float32 (n, 4), for the true state of n vehicles."""
-        upright = state.rotation[:, 2, 2] > np.cos(
-            np.radians(20.0)
-        )  # the body's z axis, seen from the world's
-        calm = np.linalg.norm(state.body_rates, axis=1) < 1.0  # rad/s
+        # The angle between the body's z axis and the world's is below 20 degrees.
+        upright = state.rotation[:, 2, 2] > np.cos(np.radians(20.0))
+        # rad/s
+        calm = np.linalg.norm(state.body_rates, axis=1) < 1.0
         return np.where(
             (upright & calm)[:, None], self.pid.actions(state), self.geometric.actions(state)
         )

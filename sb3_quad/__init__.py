@@ -5,7 +5,7 @@ Stable-Baselines3.
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie beside this folder rather than inside
+# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie next to this folder rather than in
 # it; an installed package holds them inside, and then this does nothing.
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():

@@ -111,7 +111,7 @@ class ExpertMixin:
             settings.write_into(self)
 
     def _threads(self) -> AbstractContextManager[None]:
-        """Return the context to learn in: one thread of PyTorch where compiled code does the work."""
+        """Return the context to learn in: compiled code leaves PyTorch one thread."""
         policy: Any = self.policy  # type: ignore[attr-defined]
         return one_torch_thread(
             isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy

@@ -132,7 +132,7 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
             predicted = policy._predict(inputs[rows], deterministic=True)
             loss = (predicted - outputs[rows]).square().mean()
             optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             optimiser.step()
             errors.append(loss.item())
     if hasattr(policy, "actor_target"):  # TD3's

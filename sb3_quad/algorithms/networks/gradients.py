@@ -22,7 +22,7 @@ Terms = dict[str, float]
 
 
 class Batch(NamedTuple):
-    """A mini-batch as rows of arrays of length m, of which no copy is made.
+    """A mini-batch as rows of arrays of length m, which are not copied.
 
     :param rows: (b,).
     :param observations: (m, ...).
@@ -122,7 +122,7 @@ def network_of(policy: ActorCriticPolicy) -> Network:
     if not (Perceptron.fits(actor) and Perceptron.fits(critic)):
         return policy
     network = Perceptrons(Perceptron(actor), Perceptron(critic), policy.log_std)
-    # A policy with parameters of its own beside them is computed by PyTorch.
+    # A policy with further parameters is computed by PyTorch.
     if len(network.parameters()) != len([*policy.parameters()]):
         return policy
     return network
