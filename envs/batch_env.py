@@ -70,6 +70,7 @@ class BatchEnv:
     """
 
     batch: QuadcopterBatch
+    flight_settings: FlightSettings
 
     def _make_batch(
         self,
@@ -93,9 +94,8 @@ class BatchEnv:
         for key in keywords.keys() - valid:
             raise ConfigError(f"{name}: {unknown('keyword', key, valid)}")
         settings = {"task": task, "task_kwargs": task_kwargs, **keywords}
-        self.batch = QuadcopterBatch(
-            n, validate(FlightSettings, settings, name), seed, n_threads, autoreset
-        )
+        self.flight_settings = validate(FlightSettings, settings, name)
+        self.batch = QuadcopterBatch(n, self.flight_settings, seed, n_threads, autoreset)
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         """Return a copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""

@@ -204,7 +204,7 @@ if __name__ == "__main__":
     model = DAgger(
         "MlpPolicy",
         env,
-        PIDExpert(),
+        expert=PIDExpert(),
         n_steps=250,
         batch_size=2048,
         gradient_steps=100,

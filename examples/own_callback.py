@@ -58,13 +58,14 @@ env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=300, seed=0
 model = DAgger(
     "MlpPolicy",
     env,
-    GeometricExpert(),
+    expert=GeometricExpert(),
     n_steps=125,
     batch_size=2048,
     gradient_steps=100,
     n_epochs=1,
     gamma=0.99,
     learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+    dataset_capacity=1_500_000,
     seed=0,
     device="cpu",
 )

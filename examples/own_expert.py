@@ -1,5 +1,6 @@
-"""An expert of one's own: the geometric controller while tilted or turning, the thesis's PID else;
-it teaches an agent.
+"""An expert of your own teaches an agent.
+
+It is the geometric controller while the vehicle is tilted or turning, and the thesis's PID else.
 
     python examples/own_expert.py
 
@@ -13,9 +14,7 @@ import argparse
 import numpy as np
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_quad import DAgger, GeometricExpert, PIDExpert
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
+from sb3_quad import DAgger, GeometricExpert, PIDExpert, QuadcopterVecEnv, fly
 from sb3_quad.experts.protocol import Expert
 
 
@@ -28,10 +27,10 @@ class SwitchingExpert(Expert):
 
     def actions(self, state):
         """Float32 (n, 4), for the true state of n vehicles."""
-        upright = state.rotation[:, 2, 2] > np.cos(
-            np.radians(20.0)
-        )  # the body's z axis, seen from the world's
-        calm = np.linalg.norm(state.body_rates, axis=1) < 1.0  # rad/s
+        # The angle between the body's z axis and the world's is below 20 degrees.
+        upright = state.rotation[:, 2, 2] > np.cos(np.radians(20.0))
+        # rad/s
+        calm = np.linalg.norm(state.body_rates, axis=1) < 1.0
         return np.where(
             (upright & calm)[:, None], self.pid.actions(state), self.geometric.actions(state)
         )
@@ -54,7 +53,7 @@ if __name__ == "__main__":
     model = DAgger(
         "MlpPolicy",
         env,
-        expert,
+        expert=expert,
         n_steps=125,
         batch_size=2048,
         gradient_steps=100,
@@ -64,6 +63,7 @@ if __name__ == "__main__":
         beta=1.0,  # the expert flies the first rollout, and less of each following one
         beta_decay=0.2,
         beta_final=0.0,
+        dataset_capacity=1_500_000,
         seed=0,
         device="cpu",
     )

@@ -1,5 +1,4 @@
-"""A reward of one's own: the task's coefficients by name, and a wrapper for anything that they
-don't hold.
+"""A reward of your own: the task's coefficients by name, and a wrapper for anything else.
 
     python examples/own_reward.py
 
@@ -15,10 +14,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
-from sb3_quad import PPOBC, GeometricExpert, pretrained
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
+from sb3_quad import PPOBC, QuadcopterVecEnv, fly
 
 
 class CalmActions(VecEnvWrapper):
@@ -44,7 +40,8 @@ class CalmActions(VecEnvWrapper):
     def step_wait(self):
         """The environment's own reward, less the cost."""
         observations, rewards, dones, infos = self.venv.step_wait()
-        self.last[dones] = 0.0  # these rows begin their next episode
+        # These rows begin their next episode.
+        self.last[dones] = 0.0
         return observations, rewards - self.cost * self.change.astype(np.float32), dones, infos
 
 
@@ -55,9 +52,8 @@ def make_env(n_envs, seed):
     env = QuadcopterVecEnv(
         n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed
     )
-    return VecMonitor(
-        CalmActions(env, cost=2.0)
-    )  # ep_rew_mean is of the new reward; SB3 warns of that
+    # Then ep_rew_mean is that of the new reward; SB3 warns of that.
+    return VecMonitor(CalmActions(env, cost=2.0))
 
 
 parser = argparse.ArgumentParser(
@@ -74,9 +70,11 @@ arguments = parser.parse_args()
 model = PPOBC(
     "MlpPolicy",
     make_env(240, 0),
-    expert=GeometricExpert(),
+    expert="geometric",
+    initial_policy="itm-imitation",
     bc_coef=5.0,
     bc_loss="huber",
+    bc_filter="none",
     n_steps=125,
     batch_size=5000,
     n_epochs=6,
@@ -88,7 +86,6 @@ model = PPOBC(
     seed=0,
     device="cpu",
 )
-transfer_policy(pretrained("itm-imitation"), model)
 for when in ("before", "after"):
     if when == "after":
         model.learn(arguments.timesteps)

@@ -6,13 +6,9 @@ python examples/train_dagger.py
 
 import argparse
 
-from stable_baselines3.common.utils import LinearSchedule
 from stop_on_signal import StopOnSignal
 
-from sb3_quad import DAgger, PIDExpert
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad import DAgger, PIDExpert, QuadcopterVecEnv, fly
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -26,25 +22,10 @@ parser.add_argument(
 parser.add_argument("--output", default="dagger.zip", help="where the agent goes (%(default)s)")
 arguments = parser.parse_args()
 
-model = DAgger(
-    "MlpPolicy",
-    QuadcopterVecEnv(240, task="target_tracking", seed=0),
-    expert=PIDExpert(),
-    n_steps=250,
-    batch_size=4096,
-    gradient_steps=60,
-    n_epochs=2,
-    learning_rate=LinearSchedule(4e-3, 2e-4, 1.0),
-    bc_loss="mse",
-    gamma=0.998,
-    dataset_capacity=500_000,
-    seed=0,
-    device="cpu",
-)
-FlightSettings().write_into(model)  # so that the zip says how its agent flies: ITM, 18 features
-model.learn(
-    arguments.timesteps, callback=StopOnSignal(arguments.output)
-)  # Ctrl-C ends it and saves
+targets = QuadcopterVecEnv(240, task="target_tracking", seed=0)
+model = DAgger("MlpPolicy", targets, expert="pid", seed=0, device="cpu")
+# Ctrl-C ends the training and saves the agent.
+model.learn(arguments.timesteps, callback=StopOnSignal(arguments.output))
 model.save(arguments.output)
 
 for task in ("state_recovery", "target_tracking"):

@@ -1,25 +1,19 @@
-"""Stage two of the thesis: an agent learns to recover by PPO with a cloning term towards the PID,
-and is trimmed.
+"""Stage two of the thesis: an agent learns to recover by PPO with a cloning term towards the PID.
 
     python examples/train_dagger.py
     python examples/train_ppo_bc.py dagger.zip
 
 The best agent by survival of recoveries is kept as best_model.zip, with a curve of both tasks in
-evaluations*.npz. The last one hovers beside its target by an offset, which trimming takes away.
+evaluations*.npz. The last one hovers next to its target by an offset, which is corrected in the
+end.
 """
 
 import argparse
 
-from stable_baselines3.common.utils import LinearSchedule
 from stop_on_signal import StopOnSignal
 
-from sb3_quad import PPOBC, PIDExpert
-from sb3_quad.algorithms.offset_correction import correct_offset
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad import PPOBC, QuadcopterVecEnv, fly
 from sb3_quad.callbacks import BestModel
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.settings import FlightSettings
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -38,38 +32,17 @@ parser.add_argument(
 parser.add_argument("--output", default="ppo_bc.zip", help="where the agent goes (%(default)s)")
 arguments = parser.parse_args()
 
-tasks = {"state_recovery": 0.6, "far_tracking": 0.4}
-reward = {
-    "precision_cost": 0.03,
-    "nearest_target": 0.0,
-}  # steep near the target; targets from 0 to 25 m away
+# A mixture of recoveries and targets up to 25 m away, with a reward that is steep near the target
+thrown = QuadcopterVecEnv(480, task="thesis_recovery", seed=0)
 model = PPOBC(
-    "MlpPolicy",
-    QuadcopterVecEnv(480, task=tasks, task_kwargs=reward, max_episode_steps=500, seed=0),
-    expert=PIDExpert(),
-    bc_coef=0.1,
-    bc_loss="mse",
-    # Where the agent recovers otherwise than the PID, which would crash, it is not cloned
-    bc_filter="agreement",
-    n_steps=125,
-    batch_size=3750,
-    n_epochs=6,
-    gamma=0.995,
-    gae_lambda=0.98,
-    critic_warmup=2,
-    learning_rate=LinearSchedule(1e-3, 5e-5, 1.0),
-    policy_kwargs={"log_std_init": -0.9},
-    seed=0,
-    device="cpu",
+    "MlpPolicy", thrown, expert="pid", initial_policy=arguments.agent, seed=0, device="cpu"
 )
-if arguments.agent:
-    transfer_policy(arguments.agent, model)
 
-FlightSettings().write_into(model)  # so that the zip says how its agent flies: ITM, 18 features
-every = max(arguments.timesteps // 5, 60_000)  # a rollout, at least
-recovery, tracking = (QuadcopterVecEnv(48, task) for task in ("state_recovery", "target_tracking"))
+# A rollout, at least
+every = max(arguments.timesteps // 5, 60_000)
+tracking = QuadcopterVecEnv(48, "target_tracking")
 best = BestModel(
-    recovery,
+    QuadcopterVecEnv(48, "state_recovery"),
     every,
     n_episodes=48,
     seed=1_000_000,
@@ -78,8 +51,9 @@ best = BestModel(
     by="survival",
 )
 model.learn(arguments.timesteps, callback=[best, StopOnSignal(arguments.output)])
-if arguments.timesteps > every:  # an agent that still crashes has no offset
-    correct_offset(model)
+# An agent that still crashes has no offset.
+if arguments.timesteps > every:
+    model.correct_offset()
 model.save(arguments.output)
 for task in ("state_recovery", "target_tracking"):
     flights = fly(model, task, n_flights=480, seed=1_000_000)

@@ -109,13 +109,14 @@ if __name__ == "__main__":
     model = DAgger(
         "MlpPolicy",
         env,
-        GeometricExpert(),
+        expert=GeometricExpert(),
         n_steps=125,
         batch_size=2048,
         gradient_steps=100,
         n_epochs=1,
         gamma=0.99,
         learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+        dataset_capacity=1_500_000,
         # The expert flies the first rollout, and less of each following one.
         beta=1.0,
         beta_decay=0.2,

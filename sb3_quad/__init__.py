@@ -5,7 +5,7 @@ Stable-Baselines3.
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie beside this folder rather than inside
+# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie next to this folder rather than in
 # it; an installed package holds them inside, and then this does nothing.
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():
@@ -21,9 +21,15 @@ if TYPE_CHECKING:
     from sb3_quad.algorithms.sac_bc import SACBC
     from sb3_quad.controllers.agent_settings import env_kwargs
     from sb3_quad.controllers.pretrained import load_pretrained, pretrained
+    from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
+    from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+    from sb3_quad.envs.vec_env import QuadcopterVecEnv
+    from sb3_quad.evaluation.compare import compare
+    from sb3_quad.evaluation.flights import fly
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
     from sb3_quad.simulation.sampled_vehicles import sample_vehicles
+    from sb3_quad.vehicles.vehicle import load_vehicle
 
 __all__ = [
     "PPOBC",
@@ -31,21 +37,34 @@ __all__ = [
     "DAgger",
     "GeometricExpert",
     "PIDExpert",
+    "QuadcopterEnv",
+    "QuadcopterVecEnv",
+    "QuadcopterVectorEnv",
     "__version__",
+    "compare",
     "env_kwargs",
+    "fly",
     "load_pretrained",
+    "load_vehicle",
     "pretrained",
     "sample_vehicles",
 ]
 
-_LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
+# Imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
+_LAZY = {
     "DAgger": "sb3_quad.algorithms.dagger",
     "GeometricExpert": "sb3_quad.experts.geometric",
     "PIDExpert": "sb3_quad.experts.pid",
     "PPOBC": "sb3_quad.algorithms.ppo_bc",
+    "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
+    "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
+    "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",
     "SACBC": "sb3_quad.algorithms.sac_bc",
+    "compare": "sb3_quad.evaluation.compare",
     "env_kwargs": "sb3_quad.controllers.agent_settings",
+    "fly": "sb3_quad.evaluation.flights",
     "load_pretrained": "sb3_quad.controllers.pretrained",
+    "load_vehicle": "sb3_quad.vehicles.vehicle",
     "pretrained": "sb3_quad.controllers.pretrained",
     "sample_vehicles": "sb3_quad.simulation.sampled_vehicles",
 }

@@ -90,7 +90,7 @@ def test_beta_follows_a_metric_from_the_next_rollout_on(one_way, last):
 def test_the_cloning_weight_can_rise_from_nothing_and_every_cloned_row_is_labelled():
     model = make(PPOBC, bc_coef=0.0, bc_loss="mse")
     schedule = CoefficientSchedule("bc_coef", 0.0, 1.0, follow="my/metric")
-    course = Course([0.0, 0.5, 1.0, 1.0], lambda model: model._rollout_bc_coef)
+    course = Course([0.0, 0.5, 1.0, 1.0], lambda model: model.rollout_buffer.bc_coef)
     losses = []
 
     class Note(BaseCallback):
@@ -100,7 +100,7 @@ def test_the_cloning_weight_can_rise_from_nothing_and_every_cloned_row_is_labell
         def _on_rollout_end(self):
             losses.append(
                 (
-                    model._rollout_bc_coef,
+                    model.rollout_buffer.bc_coef,
                     np.abs(model.rollout_buffer.expert_actions).sum(axis=2).min(),
                 )
             )

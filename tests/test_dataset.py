@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
+from sb3_quad.base.errors import ConfigError
 
 
 def pairs(first, n):
@@ -60,9 +61,25 @@ def test_in_order_they_follow_each_other():
 
 def test_pairs_do_not_depend_on_where_the_ring_begins(tmp_path):
     dataset, other = filled(8, 5, 6), AggregatedDataset(8, (2,), 1)
-    np.savez(tmp_path / "d.npz", **dataset.pairs)
-    other.add(**np.load(tmp_path / "d.npz"))
-    for each in (dataset, other):
-        each.add(*pairs(11, 3))
+    other.add(*pairs(50, 2))  # which the file replaces
+    dataset.save(tmp_path / "d.npz")
+    other.load(tmp_path / "d.npz")
+    for either in (dataset, other):
+        either.add(*pairs(11, 3))
     for mine, theirs in zip(contents(dataset), contents(other), strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_file_that_does_not_fit_leaves_the_pairs_as_they_are(tmp_path):
+    dataset = filled(8, 5)
+    before = contents(dataset)
+    AggregatedDataset(8, (3,), 1).save(tmp_path / "wider.npz")
+    np.savez(tmp_path / "uneven.npz", observations=np.zeros((2, 2)), actions=np.zeros((3, 1)))
+    np.savez(tmp_path / "other.npz", states=np.zeros((2, 2)))
+    (tmp_path / "text.npz").write_text("no archive")
+    for name in ("wider", "uneven", "other", "text", "missing"):
+        with pytest.raises(ConfigError, match=f"{name}.npz: ") as raised:
+            dataset.load(tmp_path / f"{name}.npz")
+        assert "\n" not in str(raised.value)
+    for array, old in zip(contents(dataset), before, strict=True):
+        np.testing.assert_array_equal(array, old)

@@ -66,7 +66,7 @@ found["command"] = main(["vehicles"])
 
 worlds = {"mass": [0.7, 1.3], "force": [0, 3], "gusts": {"std": 1.0}, "delay": [1, 3]}
 env = QuadcopterVecEnv(70, task="recovery_and_tracking", randomize=worlds, history=[0, 1], last_action=True)
-model = DAgger("MlpPolicy", env, GeometricExpert(), n_steps=20, batch_size=600, n_epochs=2, seed=0).learn(2 * 70 * 20)
+model = DAgger("MlpPolicy", env, expert=GeometricExpert(), n_steps=20, batch_size=600, n_epochs=2, seed=0).learn(2 * 70 * 20)
 found["weights"] = hashlib.sha256(b"".join(part.numpy().tobytes() for part in model.policy.state_dict().values())).hexdigest()
 print(json.dumps(found))
 """

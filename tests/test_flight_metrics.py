@@ -26,7 +26,7 @@ def test_flights_of_the_expert_are_measured_as_evaluation_does():
     model = DAgger(
         "MlpPolicy",
         env,
-        GeometricExpert(),
+        expert=GeometricExpert(),
         n_steps=300,
         batch_size=1800,
         n_epochs=1,

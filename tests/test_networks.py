@@ -100,7 +100,7 @@ def test_the_number_of_threads_changes_no_bit(threads):
 def test_from_the_seed_to_the_trained_weights_the_number_of_threads_changes_no_bit(
     algorithm, threads
 ):
-    found = []
+    weights = []
     for count in (1, 2, 3):
         threads(count)
         env = QuadcopterVecEnv(48, "state_recovery", max_episode_steps=20, seed=0)
@@ -110,10 +110,10 @@ def test_from_the_seed_to_the_trained_weights_the_number_of_threads_changes_no_b
         )
         begun = parameters_to_vector(model.policy.parameters())
         model.learn(2400)
-        found.append((begun, parameters_to_vector(model.policy.parameters())))
-        assert th.get_num_threads() == count and not th.equal(*found[-1])
-    for stage, alone in enumerate(found[0]):
-        assert all(th.equal(alone, other[stage]) for other in found[1:]), ("begun", "trained")[
+        weights.append((begun, parameters_to_vector(model.policy.parameters())))
+        assert th.get_num_threads() == count and not th.equal(*weights[-1])
+    for stage, alone in enumerate(weights[0]):
+        assert all(th.equal(alone, other[stage]) for other in weights[1:]), ("begun", "trained")[
             stage
         ]
 
@@ -141,73 +141,79 @@ def test_what_is_not_finite_stays_so(value, activation):
     )
 
 
-N, A = 700, 4  # rows and actions
-LOSSES = [
-    *(Loss(bc_coef=2.0, bc_loss=kind, vf_coef=0.5) for kind in range(len(losses.CLONING_LOSSES))),
-    *(
-        Loss(
-            policy_coef=1.0,
-            bc_coef=0.5,
-            bc_loss=kind,
-            bc_filter=kind,
-            vf_coef=0.5,
-            clip_range_vf=0.1,
-        )
-        for kind in (0, 1)
-    ),
-    Loss(
-        policy_coef=1.0,
-        normalize_advantage=True,
-        vf_coef=0.5,
-        clip_range_vf=0.1,
-        max_clipped_value=False,
-        ent_coef=0.01,
-    ),
-    Loss(policy_coef=1.0, bc_coef=1.0, ent_coef=0.01, l2_coef=0.1),
-    Loss(bc_coef=0.7, bc_loss=losses.NLL, aux_coef=0.5, aux_layer=1),
-    Loss(bc_coef=0.7, aux_coef=0.5, aux_layer=2, vf_coef=0.5),
+ON_POLICY = [
+    *({"bc_coef": 2.0, "bc_loss": kind, "bc_filter": "none"} for kind in losses.CLONING_LOSSES),
+    *({"bc_coef": 0.5, "bc_loss": kind, "clip_range_vf": 0.1} for kind in ("mse", "nll")),
+    {"bc_coef": 0.5, "normalize_advantage": False, "clip_range": 0.05, "target_kl": 1e9},
+    {
+        "bc_coef": 1e-9,
+        "clip_range_vf": 0.1,
+        "max_clipped_value": False,
+        "ent_coef": 0.01,
+    },
+    {"bc_coef": 1.0, "bc_filter": "none", "ent_coef": 0.01, "l2_coef": 0.1},
+    {"bc_coef": 1.0, "critic_warmup": 9, "clip_range_vf": 0.1, "l2_coef": 0.1},
+]
+IMITATION = [
+    *({"bc_loss": kind, "vf_coef": 0.5} for kind in losses.CLONING_LOSSES),
+    {"bc_loss": "nll", "aux_coef": 0.5, "policy_kwargs": {"net_arch": [32, 32]}},
+    {"aux_coef": 0.5, "policy_kwargs": {"net_arch": [32, 32, 16]}, "clip_range_vf": 0.1},
+    {"ent_coef": 0.01, "l2_coef": 0.1, "clip_range_vf": 0.1},
 ]
 
 
-def batches(seed=0):
-    """Mini-batches of actor and critic: labels, actions, log-probabilities and advantages; values
-    and returns.
-    """
-    rng = np.random.default_rng(seed)
-    observations, rows = rng.normal(size=(N, 18)).astype(np.float32), rng.integers(0, N, 500)
-    for_actor = np.hstack(
-        [
-            0.3 * rng.normal(size=(N, A)),
-            0.3 * rng.normal(size=(N, A)),
-            rng.normal(size=(N, 2)) - [2.0, 0.0],
-        ]
+@pytest.mark.parametrize(
+    ("algorithm", "module", "settings"),
+    [
+        *((PPOBC, ppo_bc, settings) for settings in ON_POLICY),
+        *((DAgger, dagger, settings) for settings in IMITATION),
+    ],
+)
+def test_compiled_gradients_are_those_of_the_loss_in_train(
+    monkeypatch, algorithm, module, settings
+):
+    """One mini-batch, by the compiled loss and by autograd, from a policy that has moved on."""
+    one_step = {"n_steps": 25, "batch_size": 500, "n_epochs": 1, "critic_warmup": 0}
+    if algorithm is DAgger:
+        one_step = {"n_steps": 25, "batch_size": 500, "n_epochs": 1, "gradient_steps": None}
+    model = algorithm(
+        "MlpPolicy",
+        QuadcopterVecEnv(20, "state_recovery", seed=0, max_episode_steps=20),
+        expert="geometric",
+        max_grad_norm=float("inf"),
+        seed=0,
+        device="cpu",
+        **{**one_step, **settings},
     )
-    for_critic = rng.normal(size=(N, 2)).astype(np.float32)
-    return Batch(rows, observations, for_actor.astype(np.float32)), Batch(
-        rows, observations, for_critic
-    )
-
-
-@pytest.mark.parametrize("with_critic", [True, False])
-@pytest.mark.parametrize("loss", LOSSES)
-def test_compiled_gradients_are_those_of_autograd(loss, with_critic):
-    policy = PPO(
-        "MlpPolicy", QuadcopterVecEnv(2), policy_kwargs={"log_std_init": -0.5}, seed=0, device="cpu"
-    ).policy
-    network, (actor, critic) = networks.network_of(policy), batches()
-    assert isinstance(network, Perceptrons)
+    monkeypatch.setattr(model, "train", lambda: None)
+    model.learn(500)
+    monkeypatch.undo()
+    th.manual_seed(0)
+    with th.no_grad():  # so that ratios, values and clips are not those of the rollout
+        for parameter in model.policy.parameters():
+            parameter += 0.03 * th.randn_like(parameter)
+    start = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    assert isinstance(networks.network_of(model.policy), Perceptrons)
     found = []
-    for each in (network, policy):
-        terms = networks.gradients(each, loss, actor, critic if with_critic else None)
-        found.append(
-            (terms, {name: parameter.grad for name, parameter in policy.named_parameters()})
-        )
+    for network_of in (networks.network_of, lambda policy: policy):
+        monkeypatch.setattr(module, "network_of", network_of)
+        model.policy.load_state_dict(start)
+        model._n_updates = 0
+        np.random.seed(0)  # noqa: NPY002 - PPOBC's mini-batches come from it, as PPO's do
+        model.train()
+        logged = {
+            name: value
+            for name, value in model.logger.name_to_value.items()
+            if name.startswith("train/") and name not in ("train/std", "train/n_updates")
+        }
+        gradients = {name: parameter.grad for name, parameter in model.policy.named_parameters()}
+        found.append((logged, gradients))
     (ours, compiled), (theirs, plain) = found
-    assert ours == pytest.approx(theirs, rel=1e-4, abs=1e-6)
-    for name, parameter in policy.named_parameters():  # no gradient is one of zero
+    assert "train/loss" in ours and ours == pytest.approx(theirs, rel=1e-4, abs=1e-6)
+    for name, parameter in model.policy.named_parameters():  # no gradient is one of zero
         one, other = (
-            th.zeros_like(parameter) if each[name] is None else each[name]
-            for each in (compiled, plain)
+            th.zeros_like(parameter) if grads[name] is None else grads[name]
+            for grads in (compiled, plain)
         )
         th.testing.assert_close(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()) + 1e-8)
 
@@ -224,9 +230,10 @@ def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
         np.hstack([labels, 0 * labels, 0 * labels, advantages], dtype=np.float32),
     )
     loss = Loss(bc_coef=1.0, bc_filter=losses.BC_FILTERS.index(bc_filter))
-    for network in (policy, networks.network_of(policy)):
-        terms = networks.gradients(network, loss, batch, None)
-        assert terms["bc_loss"] == pytest.approx(np.square(labels[kept]).sum() / 3)
+    terms = networks.network_of(policy).gradients(loss, batch, None)
+    assert terms["bc_loss"] == pytest.approx(np.square(labels[kept]).sum() / 3)
+    agreeing = losses.agree(th.zeros(3, 1), th.as_tensor(labels))
+    assert agreeing.nonzero().flatten().tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(
@@ -235,7 +242,13 @@ def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
         (
             PPOBC,
             ppo_bc,
-            {"bc_loss": "huber_mse", "bc_coef": 1.0, "critic_warmup": 1, "clip_range_vf": 0.2},
+            {
+                "bc_loss": "huber_mse",
+                "bc_coef": 1.0,
+                "bc_filter": "none",
+                "critic_warmup": 1,
+                "clip_range_vf": 0.2,
+            },
         ),
         (
             DAgger,

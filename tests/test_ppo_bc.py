@@ -5,21 +5,45 @@ PPO.
 import csv
 import inspect
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO
+from gymnasium.wrappers import TransformObservation
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
+from sb3_quad import load_pretrained
+from sb3_quad.algorithms import PPOBC, SACBC, DAgger, offset_correction
 from sb3_quad.algorithms.networks.losses import CLONING_LOSSES
-from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.simulation.settings import KEY
+from sb3_quad.training.config import load_config
+from sb3_quad.vehicles.vehicle import load_vehicle
 
-SMALL = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 3, "device": "cpu"}
+STOCK = {
+    name: parameter.default
+    for name, parameter in inspect.signature(PPO).parameters.items()
+    if parameter.default is not inspect.Parameter.empty
+}
+# PPO's own values where the recommended defaults of PPOBC differ
+PLAIN = {name: STOCK[name] for name in ("learning_rate", "gamma", "gae_lambda")} | {
+    "policy_kwargs": {"log_std_init": 0.0},
+    "bc_loss": "nll",
+    "bc_filter": "none",
+    "critic_warmup": 0,
+}
+SIZES = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 3, "device": "cpu"}
+SMALL = {**PLAIN, **SIZES}
 
 
 def swing_back(observation):
@@ -51,9 +75,9 @@ def part(model, name):
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 def test_without_additions_it_is_ppo_bit_for_bit(monkeypatch, env, settings):
     """By our own loop: stock PPO's is out of reach while ours learns."""
-    settings = {**SMALL, **settings}
+    settings = {**SIZES, **settings}
     stock = PPO("MlpPolicy", env, **settings).learn(256)
-    ours = PPOBC("MlpPolicy", env, bc_coef=0.0, max_clipped_value=False, **settings)
+    ours = PPOBC("MlpPolicy", env, bc_coef=0.0, max_clipped_value=False, **{**PLAIN, **settings})
     monkeypatch.delattr(PPO, "train")
     ours.learn(256)
     assert th.equal(parameters(stock), parameters(ours))
@@ -71,11 +95,11 @@ def test_with_a_vanishing_addition_it_is_ppo_to_rounding(settings):
     rounding is left of it.
     """
     for_ppo = {key: value for key, value in settings.items() if key != "max_clipped_value"}
-    stock = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SMALL).learn(128)
+    stock = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SIZES).learn(128)
     ours = PPOBC(
         "MlpPolicy", "Pendulum-v1", ent_coef=0.01, l2_coef=1e-12, bc_coef=0.0, **settings, **SMALL
     ).learn(128)
-    start = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SMALL)
+    start = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SIZES)
     assert (parameters(stock) - parameters(start)).abs().max() > 1e-3
     th.testing.assert_close(parameters(ours), parameters(stock), rtol=1e-3, atol=1e-5)
     assert ours._n_updates == stock._n_updates
@@ -83,14 +107,15 @@ def test_with_a_vanishing_addition_it_is_ppo_to_rounding(settings):
 
 def test_labelling_alone_changes_nothing():
     """An expert whose weight is zero is not asked, and takes no random numbers from training."""
-    stock = PPO("MlpPolicy", "Pendulum-v1", **SMALL).learn(256)
+    stock = PPO("MlpPolicy", "Pendulum-v1", **SIZES).learn(256)
     ours = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=0.0, **SMALL).learn(256)
     assert th.equal(parameters(stock), parameters(ours))
 
 
 def error(**settings):
     """Mean squared difference of actions from the expert's, after a short training."""
-    model = PPOBC("MlpPolicy", "Pendulum-v1", learning_rate=3e-3, **settings, **SMALL).learn(512)
+    changes = {**SMALL, "learning_rate": 3e-3, **settings}
+    model = PPOBC("MlpPolicy", "Pendulum-v1", **changes).learn(512)
     observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
     return np.square(
         model.predict(observations, deterministic=True)[0]
@@ -127,9 +152,8 @@ def test_labels_belong_to_the_state_before_the_step():
 
 
 def test_critic_warmup_moves_the_critic_only():
-    model = PPOBC(
-        "MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=1, **SMALL
-    )
+    changes = {**SMALL, "critic_warmup": 1}
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **changes)
     before = {
         name: part(model, name) for name in ("policy_net", "action_net", "log_std", "value_net")
     }
@@ -144,19 +168,19 @@ def test_critic_warmup_moves_the_critic_only():
 
 
 def test_evaluations_say_while_only_the_critic_has_learnt(tmp_path):
-    model = PPOBC(
-        "MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=2, **SMALL
-    )
-    before, told, unchanged = part(model, "log_std")["log_std"], [], []
+    changes = {**SMALL, "critic_warmup": 2}
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **changes)
+    before = part(model, "log_std")["log_std"]
+    reported, unchanged = [], []
 
     def report(line):
-        told.append("critic warm-up: the policy does not learn yet" in line)
+        reported.append("critic warm-up: the policy does not learn yet" in line)
         unchanged.append(th.equal(before, part(model, "log_std")["log_std"]))
 
     files = tmp_path / "best_model.zip", tmp_path / "evaluations.npz"
     best = BestModel(make_vec_env("Pendulum-v1", 1), 64, 1, 0, *files, report=report)
     model.learn(256, callback=best)
-    assert told == unchanged == [True, True, True, False]
+    assert reported == unchanged == [True, True, True, False]
 
 
 def test_schedule_of_the_cloning_weight_follows_progress(tmp_path):
@@ -261,19 +285,40 @@ def test_a_policy_that_diverges_stops_training_whatever_computes_its_gradients()
 )
 def test_bad_arguments_are_named(arguments):
     with pytest.raises(ConfigError, match=[*arguments][-1]):
-        PPOBC("MlpPolicy", "Pendulum-v1", **arguments, **SMALL)
+        PPOBC("MlpPolicy", "Pendulum-v1", **{**SMALL, **arguments})
 
 
 def test_state_dependent_exploration_clones_by_the_mean():
-    PPOBC(
-        "MlpPolicy", "Pendulum-v1", expert=swing_back, use_sde=True, bc_loss="mse", **SMALL
-    ).learn(64)
+    """The cloning term adds the gradient of the mean action's error, and none of the deviations."""
+    one_step = {**SIZES, "batch_size": 64, "n_epochs": 1}
+    changes = {**PLAIN, **one_step, "bc_loss": "mse", "learning_rate": 1e-12}
+    by_mean, by_deviation = [], []
+    for bc_coef in (1e-9, 5.0):
+        model = PPOBC(
+            "MlpPolicy",
+            "Pendulum-v1",
+            expert=swing_back,
+            bc_coef=bc_coef,
+            use_sde=True,
+            max_grad_norm=float("inf"),
+            **changes,
+        ).learn(64)
+        by_mean.append(model.policy.action_net.bias.grad.clone())
+        by_deviation.append(model.policy.log_std.grad.clone())
+    data = next(model.rollout_buffer.get())
+    with th.no_grad():
+        mean = model.policy.get_distribution(data.observations).mode()
+    expected = 5.0 * 2.0 * (mean - data.expert_actions).mean(dim=0)
+    assert expected.abs() > 0.05
+    th.testing.assert_close(by_mean[1] - by_mean[0], expected, rtol=1e-3, atol=1e-4)
+    th.testing.assert_close(*by_deviation)
 
 
-def test_the_signature_is_ppos_and_what_is_added():
-    stock, ours = (inspect.signature(algorithm).parameters for algorithm in (PPO, PPOBC))
+def test_the_signature_is_ppos_and_what_is_added_after_it_by_keyword():
+    ours = inspect.signature(PPOBC).parameters
     added = [
         "expert",
+        "initial_policy",
         "bc_coef",
         "bc_loss",
         "bc_filter",
@@ -282,12 +327,172 @@ def test_the_signature_is_ppos_and_what_is_added():
         "critic_warmup",
         "shuffle",
     ]
-    assert [*ours] == [
-        *(name for name in stock if name != "_init_setup_model"),
-        *added,
-        "_init_setup_model",
-    ]
-    assert all(ours[name].default == stock[name].default for name in stock)
+    stock = [name for name in inspect.signature(PPO).parameters if name != "_init_setup_model"]
+    assert [*ours] == [*stock, *added, "_init_setup_model"]
+    assert {ours[name].kind for name in added} == {inspect.Parameter.KEYWORD_ONLY}
+    recommended = {"learning_rate", "n_steps", "batch_size", "gamma", "gae_lambda"}
+    assert {name for name in STOCK if ours[name].default != STOCK[name]} == recommended
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "n_steps", "batch_size"), [(480, 125, 3750), (1, 125, 125), (8, 125, 67), (3, 7, 21)]
+)
+def test_by_default_a_rollout_is_16_mini_batches_or_fewer_of_64_rows(n_envs, n_steps, batch_size):
+    env = QuadcopterVecEnv(n_envs)
+    assert PPOBC("MlpPolicy", env, n_steps=n_steps, expert="pid").batch_size == batch_size
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "given"),
+    [(PPOBC, {"expert": swing_back}), (DAgger, {"expert": swing_back}), (SACBC, {})],
+)
+def test_learn_takes_sb3s_arguments_by_position(algorithm, given, tmp_path):
+    model = algorithm("MlpPolicy", "Pendulum-v1", tensorboard_log=str(tmp_path), **given)
+    seen = []
+
+    def callback(local, _):
+        seen.append(local["log_interval"] if "log_interval" in local else None)
+        return len(seen) < 3
+
+    assert model.learn(200, callback, 4, "run", True, False) is model
+    assert len(seen) == 3 and [path.name for path in tmp_path.iterdir()] == ["run_1"]
+    stock = {PPOBC: PPO, DAgger: PPO, SACBC: SAC}[algorithm]
+    theirs, ours = (inspect.signature(each.learn).parameters for each in (stock, algorithm))
+    assert [*theirs] == [*ours]
+    for name, parameter in theirs.items():
+        assert ours[name].kind == parameter.kind
+        expected = algorithm.__name__ if name == "tb_log_name" else parameter.default
+        assert ours[name].default == expected
+
+
+def test_settings_of_the_thesis_take_no_recommended_default():
+    """Each argument of the tables' files whose default is recommended instead of printed."""
+    printed = {"bc_loss": "nll", "gamma": 0.998, "gae_lambda": 0.95, "n_steps": 1500}
+    stage_two = {"bc_filter": "none", "critic_warmup": 0, "n_epochs": 6, "batch_size": 120_000}
+    stage_two |= {"learning_rate": 7.5e-4, **printed}
+    tables = {
+        "thesis/dagger.yml": {
+            "learning_rate": 5e-5,
+            "batch_size": 45_000,
+            "n_epochs": 12,
+            "gradient_steps": None,
+            "dataset_capacity": 0,
+            **printed,
+        },
+        "thesis/ppo_bc.yml": {"bc_coef": 0.005, **stage_two},
+        "thesis/reference.yml": {"bc_coef": 0.0, **stage_two},
+    }
+    for file, values in tables.items():
+        algo = "dagger" if "dagger" in file else "ppo_bc"
+        for env in ENVIRONMENTS:
+            config = load_config(algo, env, file)
+            assert {name: config.hyperparams[name] for name in values} == values
+            if algo == "ppo_bc":  # the deviation of stage one, or SB3's
+                assert config.policy_kwargs["log_std_init"] is None
+    env = QuadcopterVecEnv(2)
+    arguments = {"log_std_init": None, "net_arch": [8]}
+    assert "log_std_init" not in PPOBC("MlpPolicy", env, policy_kwargs=arguments).policy_kwargs
+
+
+@pytest.mark.parametrize("kind", ["model", "zip", "name"])
+def test_an_initial_policy_is_a_model_a_zip_or_a_name(kind, tmp_path):
+    env = QuadcopterVecEnv(2)
+    if kind == "name":
+        source = "itm-imitation"
+        policy = load_pretrained(source).policy
+    else:
+        arguments = {"net_arch": [24, 12], "activation_fn": th.nn.ReLU, "log_std_init": -1.5}
+        teacher = DAgger("MlpPolicy", env, expert="pid", policy_kwargs=arguments)
+        teacher.save(tmp_path / "teacher.zip")
+        source = teacher if kind == "model" else tmp_path / "teacher.zip"
+        policy = teacher.policy
+    model = PPOBC("MlpPolicy", env, expert="pid", initial_policy=source, seed=7)
+    theirs, ours = policy.state_dict(), model.policy.state_dict()
+    assert theirs.keys() == ours.keys() and type(model.policy.mlp_extractor.policy_net[1]) is type(
+        policy.mlp_extractor.policy_net[1]
+    )
+    for name, tensor in theirs.items():
+        assert th.equal(tensor, ours[name]) or name == "log_std"
+    assert ours["log_std"].tolist() == pytest.approx([-0.9] * 4)
+    kept = PPOBC(
+        "MlpPolicy", env, initial_policy=source, policy_kwargs={"log_std_init": None}, expert="pid"
+    )
+    assert th.equal(kept.policy.log_std, policy.log_std)
+    model.save(tmp_path / "model.zip")
+    assert PPO.load(tmp_path / "model.zip").policy_kwargs["log_std_init"] == -0.9
+    if kind == "model":
+        with pytest.raises(ConfigError, match="policy_kwargs must be the same"):
+            PPOBC("MlpPolicy", env, initial_policy=source, policy_kwargs={"net_arch": [8]})
+
+
+def flights_of(model):
+    return getattr(model, KEY, None)
+
+
+def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tmp_path):
+    own = {"vehicle": "crazyflie", "noise": 0.1, "observation_mean": [0.5] * 18}
+    env = VecMonitor(QuadcopterVecEnv(2, "state_recovery", max_episode_steps=50, **own))
+    model = PPOBC("MlpPolicy", env, expert="pid")
+    model.save(tmp_path / "model.zip")
+    settings, source = agent_settings(tmp_path / "model.zip")
+    assert source == tmp_path / "model.zip" and settings.vehicle == load_vehicle("crazyflie")
+    assert (settings.noise, settings.observation_mean) == (0.1, [0.5] * 18)
+    assert (settings.task, settings.max_episode_steps) == ("state_recovery", 50)
+
+    model.set_env(QuadcopterVecEnv(2, vehicle="hummingbird"))
+    assert flights_of(model)["vehicle"]["name"] == load_vehicle("hummingbird").name
+    single = make_vec_env("QuadTargetTracking-v0", 2, env_kwargs={"vehicle": "crazyflie"})
+    assert flights_of(DAgger("MlpPolicy", single))["vehicle"]["name"] == settings.vehicle.name
+
+    plain = QuadcopterVecEnv(2)
+    assert flights_of(SACBC("MlpPolicy", plain))["observation_mean"] is None
+    for wrapped in (VecNormalize(plain), VecFrameStack(plain, 2)):
+        assert flights_of(PPOBC("MlpPolicy", wrapped)) is None
+    assert flights_of(PPOBC("MlpPolicy", VecNormalize(plain, norm_obs=False))) is not None
+    assert flights_of(PPOBC("MlpPolicy", "Pendulum-v1")) is None
+
+    def turned():
+        box = gym.spaces.Box(-np.inf, np.inf, (18,), np.float32)
+        return TransformObservation(gym.make("QuadTargetTracking-v0"), lambda x: -x, box)
+
+    assert flights_of(PPOBC("MlpPolicy", make_vec_env(turned, 1))) is None
+
+
+def test_an_offset_is_corrected_by_the_settings_of_the_own_environment(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        offset_correction, "correct_offset", lambda *arguments: asked.append(arguments)
+    )
+    env = QuadcopterVecEnv(2, vehicle="crazyflie", noise=0.01)
+    model = PPOBC("MlpPolicy", VecMonitor(env), expert="pid")
+    model.correct_offset(seed=3, scale=0.7)
+    assert asked == [(model, 3, env.flight_settings, 0.7)]
+    with pytest.raises(ConfigError, match=r"correct_offset: .*set_env"):
+        PPOBC("MlpPolicy", "Pendulum-v1").correct_offset()
+
+
+def test_a_callback_finds_the_rollout_buffer_that_sb3_has(tmp_path):
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **SMALL)
+    rows = []
+
+    class Look(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            for data in self.model.rollout_buffer.get(48):
+                values, log_prob, _ = self.model.policy.evaluate_actions(
+                    data.observations, data.actions
+                )
+                th.testing.assert_close(values.flatten(), data.old_values)
+                th.testing.assert_close(log_prob, data.old_log_prob, rtol=1e-4, atol=1e-5)
+                expected = np.clip(swing_back(data.observations.numpy()), -2, 2)
+                np.testing.assert_allclose(data.expert_actions, expected, rtol=1e-6)
+                assert data.advantages.shape == data.returns.shape == (len(values),)
+                rows.append(len(values))
+
+    model.learn(64, callback=Look())
+    assert rows == [48, 16]
 
 
 def test_in_order_mini_batches_follow_each_other_in_time():
@@ -298,6 +503,7 @@ def test_in_order_mini_batches_follow_each_other_in_time():
         batch_size=6,
         shuffle=False,
         bc_coef=0.0,
+        critic_warmup=0,
     )
     buffer = model.rollout_buffer
     for step in range(4):
@@ -306,7 +512,7 @@ def test_in_order_mini_batches_follow_each_other_in_time():
             np.zeros((3, 3)), np.zeros((3, 1)), rewards, np.zeros(3), th.zeros(3), th.zeros(3)
         )
     buffer.returns[:] = buffer.rewards
-    seen = [
-        critic.tensors(model.device)[1][:, 1].tolist() for _, critic in buffer.get(6, model.shuffle)
-    ]
-    assert seen == [[0, 1, 2, 10, 11, 12], [20, 21, 22, 30, 31, 32]]
+    batches = [*buffer.minibatches(6, model.shuffle)]
+    seen = [buffer.samples(rows).returns.tolist() for rows in batches]
+    compiled = [buffer.batches(rows)[1].tensors(model.device)[1][:, 1].tolist() for rows in batches]
+    assert seen == compiled == [[0, 1, 2, 10, 11, 12], [20, 21, 22, 30, 31, 32]]

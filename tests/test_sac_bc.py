@@ -98,10 +98,20 @@ def test_dict_observations_are_cloned_as_sac_takes_them():
 
 
 def test_labels_lie_beside_the_actions_of_the_same_state():
-    data = pendulum(bc_coef=0.5).learn(1200).replay_buffer.sample(500)  # the episodes end after 800
+    """Sampling takes as many global random numbers as SB3's buffer does, and no others."""
+    buffer = pendulum(bc_coef=0.5).learn(1200).replay_buffer  # the episodes end after 800
+    np.random.seed(0)  # noqa: NPY002 - SB3 samples from it
+    data = buffer.sample(500)
+    after = np.random.random()  # noqa: NPY002
     np.testing.assert_allclose(
         2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5
     )
+    assert data.actions.shape == data.expert_actions.shape == (500, 1)
+    assert (data.actions != data.expert_actions).any()
+    np.random.seed(0)  # noqa: NPY002
+    np.random.randint(0, buffer.pos, size=500)  # noqa: NPY002
+    np.random.randint(0, high=4, size=500)  # noqa: NPY002
+    assert np.random.random() == after  # noqa: NPY002
 
 
 def test_cloning_moves_the_actor_towards_the_expert_and_leaves_the_critic_alone():
@@ -167,8 +177,12 @@ def test_the_q_filter_clones_where_the_critic_prefers_the_expert(prefers):
 
 
 def test_a_loss_that_is_not_finite_ends_the_training_and_other_arguments_are_sacs():
-    theirs, ours = (inspect.signature(each).parameters for each in (SAC, SACBC))
+    theirs, ours = (inspect.signature(algorithm).parameters for algorithm in (SAC, SACBC))
     assert all(ours[name].default == theirs[name].default for name in theirs)
+    stock = [name for name in theirs if name != "_init_setup_model"]
+    added = [*ours][len(stock) :]
+    assert [*ours][: len(stock)] == stock and added[:2] == ["expert", "initial_policy"]
+    assert {ours[name].kind for name in added} == {inspect.Parameter.KEYWORD_ONLY}
     model = pendulum(bc_coef=0.5).learn(16)
     model.replay_buffer.rewards[:] = np.nan
     with pytest.raises(TrainingError, match="lower learning_rate"):
@@ -257,6 +271,9 @@ def test_an_actor_takes_over_what_an_on_policy_zip_flies(tmp_path, monkeypatch, 
         tmp_path / "own.zip", again
     )  # of its own kind: the same weights, the critic's too
     assert th.equal(parameters(again.policy), parameters(model.policy))
+    if algorithm is SACBC:
+        started = SACBC("MlpPolicy", env, initial_policy=model, buffer_size=2000, seed=5)
+        assert th.equal(parameters(started.policy), parameters(model.policy))
 
 
 @pytest.mark.slow

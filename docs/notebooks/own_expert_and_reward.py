@@ -190,6 +190,7 @@ calm = PPOBC(
     expert=GeometricExpert(),
     bc_coef=5.0,
     bc_loss="huber",
+    bc_filter="none",
     n_steps=125,
     batch_size=5000,
     n_epochs=6,

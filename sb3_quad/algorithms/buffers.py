@@ -1,13 +1,13 @@
-"""What algorithms learn from: SB3's rollout and replay buffers with the expert's actions, and
-DAgger's dataset.
-"""
+"""Buffers with an expert's actions: SB3's rollout and replay buffers, and DAgger's dataset."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import (
     DictReplayBuffer,
     NStepReplayBuffer,
@@ -18,58 +18,92 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
 from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import read_arrays, write_arrays
+
+
+class ExpertRolloutSamples(NamedTuple):
+    """SB3's ``RolloutBufferSamples``, (b, ...) each, and the expert's actions (b, action_dim)."""
+
+    observations: th.Tensor
+    actions: th.Tensor
+    old_values: th.Tensor
+    old_log_prob: th.Tensor
+    advantages: th.Tensor
+    returns: th.Tensor
+    expert_actions: th.Tensor
 
 
 class ExpertRolloutBuffer(RolloutBuffer):
-    """SB3's rollout buffer with a row of expert actions beside each row of actions.
+    """SB3's rollout buffer with the expert's action for each state.
 
-    ``expert_actions`` has shape (buffer_size, n_envs, action_dim) while the buffer fills; the
-    algorithm writes row ``pos`` before it calls :meth:`add` for the same step. ``labelled`` says
-    whether it does so in this rollout.
+    ``expert_actions`` has shape (buffer_size, n_envs, action_dim) while the buffer fills. The
+    algorithm writes row ``pos`` before it calls :meth:`add` for the same step. ``bc_coef`` is the
+    weight that the cloning term will have in the update on this rollout. Where it is 0, no row is
+    labelled.
     """
 
     expert_actions: Float32Array
-    labelled = False
+    bc_coef = 0.0
 
     def reset(self) -> None:
-        self.expert_actions = np.zeros(
-            (self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32
-        )
+        shape = (self.buffer_size, self.n_envs, self.action_dim)
+        self.expert_actions = np.zeros(shape, dtype=np.float32)
         self._targets: tuple[Float32Array, Float32Array] | None = None
         super().reset()
 
-    def get(
-        self, batch_size: int | None = None, shuffle: bool = True
-    ) -> Generator[tuple[Batch, Batch], None, None]:  # type: ignore[override]
-        """Mini-batches of the actor and of the critic, the same rows; without ``shuffle``,
-        consecutive in time.
-        """
-        in_time, first = (
-            np.arange(self.buffer_size * self.n_envs).reshape(self.n_envs, -1).T.reshape(-1),
-            0,
-        )
-        sampled: Any = super().get(batch_size)
-        for rows in sampled:
-            if self._targets is None:
-                labels = [self.swap_and_flatten(self.expert_actions)] if self.labelled else []
-                for_actor = np.hstack(
-                    [*labels, self.actions, self.log_probs, self.advantages], dtype=np.float32
-                )
-                self._targets = for_actor, np.hstack([self.values, self.returns])
-            chosen = rows if shuffle else in_time[first : first + len(rows)]
-            first += len(rows)
-            yield (
-                Batch(chosen, self.observations, self._targets[0]),
-                Batch(chosen, self.observations, self._targets[1]),
-            )
+    def get(self, batch_size: int | None = None) -> Generator[ExpertRolloutSamples, None, None]:  # type: ignore[override]
+        """Yield mini-batches in random order, as SB3's buffer does, with the expert's actions."""
+        for rows in self.minibatches(batch_size or self.buffer_size * self.n_envs):
+            yield self._get_samples(rows)
 
-    def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> IntArray:  # type: ignore[override]
-        return batch_inds
+    def minibatches(self, batch_size: int, shuffle: bool = True) -> Iterator[IntArray]:
+        """Yield the row numbers (b,) of mini-batches.
+
+        :param shuffle: whether they are in random order. False: consecutive in time, that is the
+            first step of all environments, then the second.
+        """
+        assert self.full, "the rollout is not complete"
+        n_rows = self.buffer_size * self.n_envs
+        if shuffle:
+            rows = np.random.permutation(n_rows)  # noqa: NPY002 - as SB3 does, bit for bit
+        else:
+            # Flattened, the rows of an environment follow one another.
+            rows = np.arange(n_rows).reshape(self.n_envs, self.buffer_size).T.reshape(-1)
+        if not self.generator_ready:
+            for name in ("observations", "actions", "values", "log_probs", "advantages", "returns"):
+                setattr(self, name, self.swap_and_flatten(getattr(self, name)))
+            self.expert_actions = self.swap_and_flatten(self.expert_actions)
+            self.generator_ready = True
+        for start in range(0, n_rows, batch_size):
+            yield rows[start : start + batch_size]
+
+    def samples(self, rows: IntArray) -> ExpertRolloutSamples:
+        """Return the rows of a mini-batch as tensors."""
+        return self._get_samples(rows)
+
+    def batches(self, rows: IntArray) -> tuple[Batch, Batch]:
+        """Return a mini-batch as compiled code takes it: for the actor and for the critic."""
+        if self._targets is None:
+            flown = [self.actions, self.log_probs, self.advantages]
+            labels = [self.expert_actions] if self.bc_coef != 0.0 else []
+            for_actor = np.hstack([*labels, *flown], dtype=np.float32)
+            self._targets = for_actor, np.hstack([self.values, self.returns])
+        for_actor, for_critic = self._targets
+        actor = Batch(rows, self.observations, for_actor)
+        return actor, Batch(rows, self.observations, for_critic)
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: IntArray, env: VecNormalize | None = None
+    ) -> ExpertRolloutSamples:
+        stock = super()._get_samples(batch_inds, env)
+        return ExpertRolloutSamples(*stock, self.to_torch(self.expert_actions[batch_inds]))
 
 
 class ExpertReplaySamples(NamedTuple):
-    """SB3's ``ReplayBufferSamples``, (b, ...) each, with the expert's scaled actions; Dict
-    observations by key.
+    """SB3's ``ReplayBufferSamples``, (b, ...) each, and the expert's scaled actions.
+
+    Dict observations are tensors by key.
     """
 
     observations: th.Tensor | dict[str, th.Tensor]
@@ -82,30 +116,29 @@ class ExpertReplaySamples(NamedTuple):
 
 
 class ExpertReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer with the expert's scaled actions for each state.
+    """SB3's replay buffer with the expert's scaled action for each state.
 
-    The algorithm calls :meth:`label` before it calls :meth:`add` for the same step.
+    What it stores as one action is the action that was flown with the expert's behind it, (n_envs,
+    2 action_dim). So an action and its label cannot be separated, whichever rows SB3 samples.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.expert_actions = np.zeros((self.buffer_size, self.n_envs, self.action_dim), np.float32)
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        *args: Any,
+        **kwargs: Any,
+    ) -> None:
+        both = spaces.Box(-1.0, 1.0, (2 * spaces.flatdim(action_space),), np.float32)
+        super().__init__(buffer_size, observation_space, both, *args, **kwargs)
 
-    def label(self, actions: Float32Array) -> None:
-        """Set the expert's actions (n_envs, action_dim) for the row that is added next."""
-        self.expert_actions[self.pos] = actions
-
-    def _get_samples(
+    def _get_samples(  # type: ignore[override]
         self, batch_inds: IntArray, env: VecNormalize | None = None
-    ) -> ExpertReplaySamples:  # type: ignore[override]
-        # SB3 samples each row's environment itself and keeps it to itself: the same numbers are
-        # sampled twice.
-        before = np.random.get_state()  # noqa: NPY002
-        at = batch_inds, np.random.randint(0, high=self.n_envs, size=batch_inds.shape)  # noqa: NPY002
-        np.random.set_state(before)  # noqa: NPY002
-        return ExpertReplaySamples(
-            *super()._get_samples(batch_inds, env), self.to_torch(self.expert_actions[at])
-        )
+    ) -> ExpertReplaySamples:
+        data = super()._get_samples(batch_inds, env)
+        actions, expert_actions = data.actions.chunk(2, dim=1)
+        return ExpertReplaySamples(*data._replace(actions=actions), expert_actions=expert_actions)
 
 
 class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):  # type: ignore[misc]
@@ -117,7 +150,7 @@ class ExpertDictReplayBuffer(ExpertReplayBuffer, DictReplayBuffer):  # type: ign
 
 
 class AggregatedDataset:
-    """A bounded set of (observation, expert action) pairs, on the CPU; the oldest leave first.
+    """A bounded set of (observation, expert action) pairs on the CPU; the oldest leave first.
 
     :param capacity: most pairs held
     :param observation_shape: shape of one observation
@@ -133,13 +166,10 @@ class AggregatedDataset:
         dtype: npt.DTypeLike = np.float32,
     ) -> None:
         self.capacity = capacity
-        # np.empty takes no memory before it is written to, so a large capacity costs what is in
-        # use.
-        self._arrays = {
-            "observations": np.empty((capacity, *observation_shape), dtype),
-            "actions": np.empty((capacity, action_dim), np.float32),
-        }
-        self.added = 0  # since it was empty
+        # np.empty takes no memory before it is written to: a large capacity costs what is in use.
+        self.observations = np.empty((capacity, *observation_shape), dtype)
+        self.actions = np.empty((capacity, action_dim), np.float32)
+        self.added = 0  # pairs since it was empty
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
@@ -149,44 +179,71 @@ class AggregatedDataset:
         self.added = 0
 
     def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
-        """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than
-        ``capacity``, the last.
+        """Add observations (n, ...) and actions (n, action_dim), oldest first.
+
+        Of more than ``capacity`` pairs, the last are kept.
         """
         n = min(len(actions), self.capacity)
         places = (self.added + np.arange(n)) % self.capacity
-        for array, new in zip(self._arrays.values(), (observations, actions), strict=True):
-            array[places] = new[-n:]
+        self.observations[places] = observations[-n:]
+        self.actions[places] = actions[-n:]
         self.added += n
 
     def batch(self, rows: IntArray) -> Batch:
-        """A mini-batch of rows (b,), counted from the oldest, with their actions as targets."""
+        """Return a mini-batch of rows (b,), counted from the oldest, with actions as targets."""
         places = (rows + self.added) % self.capacity if self.added > self.capacity else rows
-        return Batch(places, self._arrays["observations"], self._arrays["actions"])
+        return Batch(places, self.observations, self.actions)
 
     @property
     def pairs(self) -> Arrays:
-        """Copies of observations (n, ...) and expert actions (n, action_dim), by name, oldest
-        first, as for :meth:`add`.
+        """Copies of observations (n, ...) and expert actions (n, action_dim) by name, oldest first.
+
+        :meth:`add` takes them.
         """
-        return {
-            name: array[self.batch(np.arange(len(self))).rows]
-            for name, array in self._arrays.items()
-        }
+        places = self.batch(np.arange(len(self))).rows
+        return {"observations": self.observations[places], "actions": self.actions[places]}
 
     @property
     def filled(self) -> Arrays:
-        """Views of the rows that are in use, in the order of memory."""
-        return {name: array[: len(self)] for name, array in self._arrays.items()}
+        """Views of the rows in use, in the order of memory."""
+        n = len(self)
+        return {"observations": self.observations[:n], "actions": self.actions[:n]}
+
+    def save(self, path: str | Path) -> None:
+        """Write the pairs to an ``.npz`` file, which is replaced as a whole or not at all.
+
+        :raises ConfigError: a folder that cannot be written, a full disk.
+        """
+        pairs: dict[str, Any] = self.pairs
+        write_arrays(path, **pairs)
+
+    def load(self, path: str | Path) -> None:
+        """Hold the pairs of a file that :meth:`save` has written, instead of the present ones.
+
+        :raises ConfigError: a file that is missing, damaged, or of other spaces; the present pairs
+            then stay.
+        """
+        new = read_arrays(path)
+        for name, array in self.filled.items():
+            if name not in new or new[name].shape[1:] != array.shape[1:]:
+                raise ConfigError(f"{path}: holds no {name} of shape (n, {array.shape[1:]})")
+        if len({len(array) for array in new.values()}) != 1:
+            raise ConfigError(f"{path}: holds arrays of different lengths")
+        self.clear()
+        self.add(**new)
 
 
 def sample_rows(
     n_rows: int, count: int, rng: np.random.Generator, shuffle: bool = True
 ) -> IntArray:
-    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder at
-    random; or all in order.
+    """Return ``count`` row numbers below ``n_rows``.
+
+    They are whole passes in random order, then a random remainder. Without ``shuffle``: all in
+    order, again and again.
     """
     if not shuffle:
         return np.arange(count, dtype=np.int64) % n_rows
     passes, rest = divmod(count, n_rows)
     parts = [rng.permutation(n_rows) for _ in range(passes)]
-    return np.concatenate([*parts, rng.integers(n_rows, size=rest)]).astype(np.int64, copy=False)
+    parts.append(rng.integers(n_rows, size=rest))
+    return np.concatenate(parts).astype(np.int64, copy=False)

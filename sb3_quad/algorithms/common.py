@@ -1,90 +1,128 @@
-"""What all algorithms that learn from an expert share."""
+"""The parts that all algorithms with an expert share."""
 
-import inspect
-from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
-from typing_extensions import Self
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.expert_like import ExpertLike
+from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.controllers.zips import load_model
+from sb3_quad.simulation.settings import KEY, FlightSettings
 
+_SHARE = (0, 1)
+_COUNT = (1, 2**40)
+_WEIGHT = (0, 2**40)
 LIMITS = {
-    **dict.fromkeys(("learning_rate", "gamma", "gae_lambda", "tau"), (0, 1)),
-    **dict.fromkeys(
-        ("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)
-    ),
-    **dict.fromkeys(("train_freq", "target_update_interval"), (1, 2**40)),
-    **dict.fromkeys(
-        ("max_grad_norm", "clip_range", "clip_range_vf", "target_kl", "critic_warmup"), (0, 2**40)
-    ),
-    **dict.fromkeys(("bc_coef", "aux_coef", "l2_coef", "vf_coef", "beta_decay"), (0, 2**40)),
+    "learning_rate": _SHARE,
+    "gamma": _SHARE,
+    "gae_lambda": _SHARE,
+    "tau": _SHARE,
+    "n_steps": _COUNT,
+    "batch_size": _COUNT,
+    "n_epochs": _COUNT,
+    "stats_window_size": _COUNT,
+    "buffer_size": _COUNT,
+    "train_freq": _COUNT,
+    "target_update_interval": _COUNT,
+    "max_grad_norm": _WEIGHT,
+    "clip_range": _WEIGHT,
+    "clip_range_vf": _WEIGHT,
+    "target_kl": _WEIGHT,
+    "critic_warmup": _WEIGHT,
+    "bc_coef": _WEIGHT,
+    "aux_coef": _WEIGHT,
+    "l2_coef": _WEIGHT,
+    "vf_coef": _WEIGHT,
+    "beta_decay": _WEIGHT,
 }
-"""Of arguments of the algorithms: the least, and the greatest that a settings file may have."""
-_CRITIC = (
-    "mlp_extractor.value_net.",
-    "value_net.",
-    "vf_features_extractor.",
-)  # names of the critic's own parameters
+"""Valid range of each argument of the algorithms; the greatest holds for settings files alone."""
+# Prefixes of the parameters that only the critic has.
+_CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 
 
 class ExpertMixin:
-    """The expert of an algorithm."""
+    """The expert of an algorithm, and what its zips say about its flights."""
 
-    expert: Any
-    _labeller: Controller | None = (
-        None  # asks the expert, and holds what a recurrent one carries on
-    )
+    env: VecEnv | None
+    expert: ExpertLike | None
+    # It asks the expert, and holds the state that a recurrent one carries on.
+    _labeller: Controller | None = None
 
-    def set_expert(self, expert: Any) -> None:
+    def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on, as a model must that was loaded without one."""
         self.expert = expert
 
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Learn in another environment from now on; see SB3's ``set_env``.
+
+        The model's zips say from then on that its agent flies as this environment does.
+        """
+        super().set_env(env, force_reset)  # type: ignore[misc]
+        self._note_flight_settings()
+
+    def correct_offset(self, seed: int = 0, scale: float = 1.0) -> offset_correction.Correction:
+        """Cancel the steady offset at which the agent hovers next to its targets.
+
+        Its own first layer is changed, so that its zip stays stock (thesis 4.3.1). See
+        :func:`~sb3_quad.algorithms.offset_correction.correct_offset`.
+
+        :param seed: of the flights that measure the offset, as the model's environment flies.
+        :param scale: α of Eq. 4.10; below 1, the agent is quicker near its target.
+        :return: the offset before and after, m.
+        :raises ConfigError: no quadcopter environment; an agent that crashes on the way to targets,
+            or whose first layer does not read the 18 features.
+        """
+        settings = flight_settings_of(self.env)
+        if settings is None:
+            raise ConfigError(
+                "correct_offset: the model has no quadcopter environment to measure the offset in;"
+                " give it one by model.set_env(...)"
+            )
+        return offset_correction.correct_offset(self, seed, settings, scale)  # type: ignore[arg-type]
+
     def _setup_model(self) -> None:
         for name, (least, _) in LIMITS.items():
-            given = getattr(self, name, None)
-            value = given(1.0) if callable(given) else given  # at the start of a schedule
+            value = getattr(self, name, None)
+            if callable(value):
+                value = value(1.0)  # a schedule, at its start
             if isinstance(value, (int, float)) and not value >= least:
                 raise ConfigError(f"{name} {value:g}: must be at least {least}")
-        with one_torch_thread(
-            compiled=True
-        ):  # the orthogonal weights of a network depend on how many threads make them
+        # The orthogonal weights of a new network depend on the number of threads that make them.
+        with one_torch_thread(compiled=True):
             super()._setup_model()  # type: ignore[misc]
+        self._note_flight_settings()
 
-    def _prepare_to_learn(self, anew: bool) -> None:
-        """Check the expert, and forget what the environments before have left where they begin
-        ``anew``.
-        """
-        raise NotImplementedError
+    def _note_flight_settings(self) -> None:
+        settings = flight_settings_of(self.env)
+        if settings is not None:
+            settings.write_into(self)
 
-    def learn(self, total_timesteps: int, callback: MaybeCallback = None, **keywords: Any) -> Self:
-        """As in SB3; ``tb_log_name`` is the name of the class unless another is given.
-
-        :raises ExpertError: no expert where one is needed, or one that does not fit the
-            environment.
-        """
-        self._prepare_to_learn(keywords.get("reset_num_timesteps", True))
+    def _threads(self) -> AbstractContextManager[None]:
+        """Return the context to learn in: compiled code leaves PyTorch one thread."""
         policy: Any = self.policy  # type: ignore[attr-defined]
-        with one_torch_thread(
+        return one_torch_thread(
             isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
-        ):
-            return super().learn(
-                total_timesteps, callback, **{"tb_log_name": type(self).__name__, **keywords}
-            )  # type: ignore[misc, no-any-return]
+        )
 
     def _refuse_dict_observations(self) -> None:
         space = self.observation_space  # type: ignore[attr-defined]
         if isinstance(space, spaces.Dict):
             raise ConfigError(
-                f"observation space {space}: {type(self).__name__} does not support Dict with an expert; wrap the environment "
-                "in gymnasium.wrappers.FlattenObservation"
+                f"observation space {space}: {type(self).__name__} does not support Dict with an"
+                " expert; wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
 
     def _excluded_save_params(self) -> list[str]:
@@ -92,24 +130,71 @@ class ExpertMixin:
         return [*super()._excluded_save_params(), "expert", "_labeller"]  # type: ignore[misc]
 
 
-def arguments_of(algorithm: type[BaseAlgorithm], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of some arguments that the constructor of SB3's ``algorithm`` takes, but for
-    ``_init_setup_model``.
+def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
+    """Return how the vehicles of an environment fly, also through wrappers that change rewards.
+
+    None: it is not of this package, or a wrapper changes observations or actions, so that an agent
+    of this environment would fly otherwise without the wrapper.
     """
-    names = inspect.signature(algorithm.__init__).parameters.keys() - {"self", "_init_setup_model"}
-    return {name: value for name, value in given.items() if name in names}
+    if env is None or not env.has_attr(KEY):
+        return None
+    normalised = unwrap_vec_normalize(env)
+    if normalised is not None and normalised.norm_obs:
+        return None
+    for wrapper in (gymnasium.ObservationWrapper, gymnasium.ActionWrapper):
+        if any(env.env_is_wrapped(wrapper)):
+            return None
+    settings: FlightSettings = env.get_attr(KEY, [0])[0]
+    return settings if env.observation_space.shape == (settings.observation.size,) else None
 
 
-def parameters_of_both(policy: Any) -> tuple[list[Any], list[Any]]:
-    """The parameters of the actor, with what it shares with the critic, and those of the critic
-    alone.
+def model_of(initial_policy: BaseAlgorithm | str | Path | None) -> BaseAlgorithm | None:
+    """Return the model that ``initial_policy`` is or names.
+
+    :param initial_policy: a model, the path of a zip, a run folder, or the name of a shipped agent.
+    :raises ConfigError: a missing or damaged file.
     """
-    named = [*policy.named_parameters()]
-    return [p for name, p in named if not name.startswith(_CRITIC)], [
-        p for name, p in named if name.startswith(_CRITIC)
-    ]
+    if isinstance(initial_policy, (str, Path)):
+        return load_model(agent_path(str(initial_policy)))
+    return initial_policy
+
+
+def policy_arguments(
+    given: dict[str, Any] | None,
+    initial: BaseAlgorithm | None,
+    family: type[BaseAlgorithm],
+    log_std_init: float | None = None,
+) -> dict[str, Any]:
+    """Return the ``policy_kwargs`` of a new model.
+
+    :param given: what the user gives; it holds. ``log_std_init=None`` there: no default.
+    :param initial: the model that it starts from. Where that is of the same ``family``, its
+        ``net_arch`` and ``activation_fn`` are taken.
+    :param log_std_init: the default.
+    """
+    arguments: dict[str, Any] = {}
+    if isinstance(initial, family):
+        for name in ("net_arch", "activation_fn"):
+            if name in initial.policy_kwargs:
+                arguments[name] = initial.policy_kwargs[name]
+    arguments |= {"log_std_init": log_std_init} | (given or {})
+    if arguments["log_std_init"] is None:
+        del arguments["log_std_init"]
+    return arguments
+
+
+def actor_and_critic_parameters(policy: Any) -> tuple[list[Any], list[Any]]:
+    """Return the parameters of the actor and those that only the critic has.
+
+    The actor's hold what it shares with the critic.
+    """
+    actor: list[Any] = []
+    critic: list[Any] = []
+    for name, parameter in policy.named_parameters():
+        (critic if name.startswith(_CRITIC) else actor).append(parameter)
+    return actor, critic
 
 
 def is_ever_nonzero(schedule: Schedule) -> bool:
-    """Whether a schedule gives its term a weight anywhere, as far as a hundred samples of it tell."""
+    """Return whether a schedule gives its term a weight anywhere, by a hundred samples of it."""
     return any(schedule(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())

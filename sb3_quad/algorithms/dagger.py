@@ -1,6 +1,8 @@
 """DAgger, data aggregation, as a Stable-Baselines3 algorithm (thesis 3.1.2, 4.2.1, Algorithm 3)."""
 
+import math
 import secrets
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,36 +10,54 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
+from typing_extensions import Self
 
 from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
-from sb3_quad.algorithms.common import ExpertMixin, arguments_of, parameters_of_both
+from sb3_quad.algorithms.common import (
+    ExpertMixin,
+    actor_and_critic_parameters,
+    model_of,
+    policy_arguments,
+)
 from sb3_quad.algorithms.networks.gradients import (
     Batch,
-    gradients,
+    Network,
+    Perceptrons,
     mean_actions,
     network_of,
     state_values,
 )
-from sb3_quad.algorithms.networks.losses import CLONING_LOSSES, CloningLoss, Loss
+from sb3_quad.algorithms.networks.losses import (
+    CLONING_LOSSES,
+    CloningLoss,
+    Loss,
+    cloning_errors,
+    l2_loss,
+    max_clipped_value_loss,
+)
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller, true_state_of
+from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.simulation.unobserved import UNOBSERVED, unobserved
 
-_VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
+# Observations that the critic evaluates at once after a rollout
+_VALUE_CHUNK = 16384
 
 
-class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
-    """Data aggregation (DAgger): the agent flies, the expert says what it would have done, the
-    agent learns that.
+class DAgger(ExpertMixin, OnPolicyAlgorithm):
+    """Data aggregation (DAgger): the agent flies, and learns what the expert would have done.
 
     In every control step and every environment, independently, the expert's action flies with
     probability β, else the agent's sampled action. Each visited observation joins a bounded dataset
@@ -57,32 +77,37 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
     generators that are seeded by it and by the updates made so far, so a resumed run continues
     exactly as the uninterrupted one would have.
 
-    Arguments that are not listed here mean what they mean in :class:`stable_baselines3.PPO`.
-    ``learning_rate`` and ``clip_range_vf`` can be functions of the remaining progress (from 1 to
-    0).
+    The defaults are those that we recommend for hundreds of quadcopters at once; Table A.4 of the
+    thesis is ``zoo_configs/thesis/dagger.yml``. Arguments that are not listed here mean what they
+    mean in :class:`stable_baselines3.PPO`. ``learning_rate`` and ``clip_range_vf`` can be functions
+    of the remaining progress (from 1 to 0).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs``
         holds ``log_std_init``, it begins at -2: sampled actions fly, and SB3's own 0 spreads them
-        over the whole action space
+        over the whole action space. ``log_std_init=None``: SB3's, or that of the initial policy
     :param env: The environment to learn from (if registered in Gym, can be str)
-    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as
-        ``GeometricExpert``, another SB3 model, or a function from observations to actions;
-        :class:`~sb3_quad.controllers.controller.Controller` says what each is shown. Or a name as
-        YAML takes it, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
-        :meth:`set_expert`, before learning continues
-    :param batch_size: Minibatch size, in pairs of the dataset
+    :param batch_size: Minibatch size, in pairs of the dataset; the whole dataset while it is
+        smaller
     :param n_epochs: Passes of the critic over each rollout; and of the actor, over as many pairs as
         a rollout holds, unless ``gradient_steps`` says otherwise
     :param clip_range_vf: ε of the clipped value loss (Eq. 3.8). None: plain mean squared error
     :param ent_coef: Entropy coefficient c_H
     :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by
         itself, so that a large error of the critic does not hold up the actor. None: no clipping
+    :param expert: Who labels: an object with ``actions(state)`` such as ``GeometricExpert``,
+        another SB3 model, or a function from observations to actions;
+        :class:`~sb3_quad.controllers.controller.Controller` says what each is shown. Or a name as
+        YAML takes it, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
+        :meth:`set_expert`, before learning continues
+    :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
+        shipped agent. Its policy and critic are taken; so are its ``net_arch`` and
+        ``activation_fn`` where ``policy_kwargs`` does not give them
     :param gradient_steps: Optimiser steps after each rollout, at most one for each row of
         ``n_epochs`` passes over it. Each takes ``batch_size`` pairs of the dataset. None:
         ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The critic takes part in as
         many of them as that, or in all if there are fewer, each with an equal share of its passes
     :param beta: β of the first rollout, from 0 to 1
-    :param beta_decay: What β loses with every rollout
+    :param beta_decay: How much β loses with every rollout
     :param beta_final: Where β stops falling
     :param bc_loss: ``"nll"``, Eq. 3.12, learns the standard deviation too; ``"mse"``, on the mean
         alone, leaves it to ``log_std_init`` and ``ent_coef``; so do ``"huber"``, squared up to 0.05
@@ -90,9 +115,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         and three times the squared error
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
-    :param aux_coef: Weight of an auxiliary loss, "huber_mse": the first units of the last hidden
-        layer but one learn, by tanh, to say what no observation shows,
-        :data:`~sb3_quad.simulation.unobserved.UNOBSERVED`. 0: none
+    :param aux_coef: Weight of an auxiliary loss, "huber_mse". The first units of the last hidden
+        layer but one, by tanh, learn to predict what no observation shows,
+        :data:`~sb3_quad.simulation.unobserved.UNOBSERVED`. 0: no such loss
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only,
         as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
@@ -107,18 +132,26 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        expert: Any = None,
-        learning_rate: float | Schedule = 1e-3,
+        learning_rate: float | Schedule = LinearSchedule(4e-3, 2e-4, 1.0),  # noqa: B008
         n_steps: int = 250,
-        batch_size: int = 8192,
-        n_epochs: int = 10,
+        batch_size: int = 4096,
+        n_epochs: int = 2,
         gamma: float = 0.998,
         gae_lambda: float = 0.95,
         clip_range_vf: float | Schedule | None = None,
         ent_coef: float = 0.0,
         vf_coef: float = 0.5,
         max_grad_norm: float | None = 0.5,
-        gradient_steps: int | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        *,
+        expert: ExpertLike | None = None,
+        initial_policy: BaseAlgorithm | str | Path | None = None,
+        gradient_steps: int | None = 60,
         beta: float = 0.5,
         beta_decay: float = 0.001,
         beta_final: float = 0.3,
@@ -126,23 +159,32 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         log_std_min: float = -3.0,
         l2_coef: float = 0.0,
         aux_coef: float = 0.0,
-        dataset_capacity: int = 1_500_000,
+        dataset_capacity: int = 500_000,
         shuffle: bool = True,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        given = {**locals(), "policy_kwargs": {"log_std_init": -2.0, **(policy_kwargs or {})}}
-        fixed: dict[str, Any] = {
-            "use_sde": False,
-            "sde_sample_freq": -1,
-            "supported_action_spaces": (spaces.Box,),
-        }
-        super().__init__(**arguments_of(OnPolicyAlgorithm, given), **fixed, _init_setup_model=False)
+        initial = model_of(initial_policy)
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0),
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            supported_action_spaces=(spaces.Box,),
+            _init_setup_model=False,
+        )
         self.batch_size = batch_size
         self.n_epochs = n_epochs
         self.gradient_steps = gradient_steps
@@ -156,14 +198,17 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         self.aux_coef = aux_coef
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
-        self.expert: Any = None
+        self.expert = None
         self._n_rollouts = 0
-        self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
+        # Seeds the generators where no seed is given.
+        self._entropy = secrets.randbits(63)
 
         if expert is not None:
             self.set_expert(expert)
         if _init_setup_model:
             self._setup_model()
+            if initial is not None:
+                transfer_policy(initial, self)
 
     def _setup_model(self) -> None:
         if not 0.0 <= self.beta_final <= self.beta <= 1.0:
@@ -175,7 +220,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(
-                f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}"
+                f"dataset_capacity {self.dataset_capacity}: must be 0 or at least"
+                f" n_steps * n_envs = {rollout}"
             )
         if self.gradient_steps is not None and self.gradient_steps < 1:
             raise ConfigError(f"gradient_steps {self.gradient_steps}: must be at least 1, or None")
@@ -187,24 +233,33 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
             )
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        self._aux_layer = len(self.policy.mlp_extractor.policy_net) // 2 - 1 if self.aux_coef else 0
-        if self.aux_coef and self._aux_layer < 1:
-            raise ConfigError(f"aux_coef {self.aux_coef:g}: needs at least two hidden layers")
+        action_dim = self.rollout_buffer.action_dim
+        # Hidden layers up to that of the auxiliary loss; 0: there is no such loss.
+        self._aux_layer = 0
+        if self.aux_coef:
+            self._aux_layer = len(self.policy.mlp_extractor.policy_net) // 2 - 1
+            action_dim += len(UNOBSERVED)
+            if self._aux_layer < 1:
+                raise ConfigError(f"aux_coef {self.aux_coef:g}: needs at least two hidden layers")
         dtype = self.rollout_buffer.observations.dtype
         self.dataset = AggregatedDataset(
             self.dataset_capacity or rollout,
             self.rollout_buffer.obs_shape,
-            self.rollout_buffer.action_dim + (len(UNOBSERVED) if self._aux_layer else 0),
+            action_dim,
             np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
 
-    def set_expert(self, expert: Any) -> None:
+    def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on.
 
         :raises ExpertError: an expert that does not fit the environment
         """
         if self.env is not None:
             self._labeller = Controller.for_env(expert, self.env, self._labeller)
+            if self.aux_coef and true_state_of(self.env) is None:
+                raise ConfigError(
+                    f"aux_coef {self.aux_coef:g}: needs an environment with true_state()"
+                )
         self.expert = expert
 
     @property
@@ -213,8 +268,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         return max(self.beta - self.beta_decay * self._n_rollouts, self.beta_final)
 
     def set_beta(self, beta: float) -> None:
-        """Let the expert fly with probability ``beta`` from the next rollout on, whatever
-        ``beta_decay`` says.
+        """Let the expert fly with probability ``beta`` from the next rollout on.
+
+        ``beta_decay`` plays no part then.
 
         :raises ConfigError: a number below 0 or above 1
         """
@@ -222,13 +278,41 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
             raise ConfigError(f"beta {beta}: a probability, from 0 to 1")
         self.beta = self.beta_final = float(beta)
 
-    def _generator(self, purpose: int) -> np.random.Generator:
-        """Random numbers for this rollout (0) or update (1): no state to save, and the same again
-        after a resume.
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "DAgger",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for ``total_timesteps``; all arguments are those of SB3's ``learn``.
+
+        With ``reset_num_timesteps`` β begins again. The dataset stays until ``dataset.clear()``.
+
+        :raises ExpertError: no expert, or one that does not fit the environment
         """
-        return np.random.default_rng(
-            [self._entropy if self.seed is None else self.seed, purpose, self._n_updates]
-        )
+        self.set_expert(self.expert)
+        if reset_num_timesteps:
+            self._n_rollouts = 0
+        with self._threads():
+            return super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+
+    def _generator(self, purpose: int) -> np.random.Generator:
+        """Return random numbers for this rollout (0) or update (1).
+
+        There is no state to save: after a resume they are the same again.
+        """
+        seed = self._entropy if self.seed is None else self.seed
+        return np.random.default_rng([seed, purpose, self._n_updates])
 
     def collect_rollouts(
         self,
@@ -237,46 +321,49 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly ``n_rollout_steps`` steps by the mixture of expert and agent, and add what was seen
-        to the dataset.
+        """Fly ``n_rollout_steps`` steps by the mixture of expert and agent, and keep the labels.
 
-        Fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs. The
-        critic evaluates the whole rollout at the end, since it does not change before.
+        It fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs.
         """
         self.policy.set_training_mode(False)
         self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)  # +
-        network, rng, beta = network_of(self.policy), self._generator(0), self.current_beta  # +
-        n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
-        low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
+        network = network_of(self.policy)
+        rng = self._generator(0)
+        beta = self.current_beta  # +
+        n_envs = env.num_envs
+        action_space: Any = self.action_space
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
-        labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)  # +
-        said: list[Float32Array] = []  # + what the auxiliary loss teaches
+        # + The label of each step, and what the auxiliary loss teaches
+        labels = np.empty((n_rollout_steps, n_envs, rollout_buffer.action_dim), dtype=np.float32)
+        aux_targets: list[Float32Array] = []
         true_state = true_state_of(env) if self._aux_layer else None
-        not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
-        timeouts: list[
-            tuple[int, int, npt.NDArray[Any]]
-        ] = []  # step, environment, last observation
+        # Step, environment and last observation of each episode that a time limit has ended
+        timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []
+        not_yet = th.zeros(n_envs)
         n_by_expert = 0
 
         rollout_buffer.reset()
         callback.on_rollout_start()
 
         for step in range(n_rollout_steps):
+            # + Label the state before the step.
             observations: Any = self._last_obs
-            labels[step] = labeller.labels(
-                observations, self._last_episode_starts
-            )  # + of the state before the step
-            said += [unobserved(true_state and true_state())] if self._aux_layer else []  # +
+            labels[step] = labeller.labels(observations, self._last_episode_starts)
+            if true_state is not None:
+                aux_targets.append(unobserved(true_state()))
+
+            # + The expert's action flies with probability β, else a sample of the agent's.
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
-            by_expert = rng.random(n_envs) < beta  # +
+            by_expert = rng.random(n_envs) < beta
             actions = np.where(by_expert[:, None], labels[step], sampled)
-            clipped_actions = np.clip(actions, low, high).reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
+            n_by_expert += int(by_expert.sum())
+            shaped = actions.reshape(n_envs, *action_space.shape)
+            clipped_actions = np.clip(shaped, action_space.low, action_space.high)
 
             new_obs, rewards, dones, infos = env.step(clipped_actions)
 
             self.num_timesteps += n_envs
-            n_by_expert += int(by_expert.sum())
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
@@ -284,37 +371,25 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
             ended = np.flatnonzero(dones)
             self._update_info_buffer([infos[row] for row in ended], dones[ended])
             for row in ended:
-                if (
-                    infos[row].get("TimeLimit.truncated")
-                    and infos[row].get("terminal_observation") is not None
-                ):
-                    timeouts.append((step, int(row), infos[row]["terminal_observation"]))
+                last = infos[row].get("terminal_observation")
+                if infos[row].get("TimeLimit.truncated") and last is not None:
+                    timeouts.append((step, int(row), last))
 
-            rollout_buffer.add(
-                observations, actions, rewards, self._last_episode_starts, not_yet, not_yet
-            )  # type: ignore[arg-type]
+            starts: Any = self._last_episode_starts
+            rollout_buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
 
         flown = rollout_buffer.observations.reshape(-1, *rollout_buffer.obs_shape)
-        chunks = (
-            flown[first : first + _VALUE_CHUNK] for first in range(0, len(flown), _VALUE_CHUNK)
-        )
-        values = np.concatenate([state_values(network, chunk) for chunk in chunks])
-        rollout_buffer.values = values.reshape(rollout_buffer.values.shape)
-        # A time limit is no failure: what would have followed is worth V of the last observation
-        if timeouts:
-            steps, rows, last = zip(*timeouts, strict=True)
-            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * state_values(
-                network, np.stack(last)
-            )
+        self._evaluate(network, rollout_buffer, flown, timeouts)
         last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
         rollout_buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
-        if self.dataset_capacity == 0:  # +
+        # + Add the labels to the dataset.
+        if self.dataset_capacity == 0:
             self.dataset.clear()
-        targets = np.concatenate([labels, said], axis=2) if said else labels  # +
-        self.dataset.add(flown, targets.reshape(len(flown), -1))  # +
+        targets = np.concatenate([labels, aux_targets], axis=2) if aux_targets else labels
+        self.dataset.add(flown, targets.reshape(len(flown), -1))
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
@@ -324,93 +399,165 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         callback.on_rollout_end()
         return True
 
+    def _evaluate(
+        self,
+        network: Network,
+        rollout_buffer: RolloutBuffer,
+        flown: npt.NDArray[Any],
+        timeouts: list[tuple[int, int, npt.NDArray[Any]]],
+    ) -> None:
+        """Let the critic evaluate a whole rollout at once; it does not change while that is flown.
+
+        A time limit is no failure: the rewards that would have followed are worth V of the last
+        observation.
+        """
+        values = [
+            state_values(network, flown[first : first + _VALUE_CHUNK])
+            for first in range(0, len(flown), _VALUE_CHUNK)
+        ]
+        rollout_buffer.values = np.concatenate(values).reshape(rollout_buffer.values.shape)
+        if timeouts:
+            steps, rows, last = zip(*timeouts, strict=True)
+            following = self.gamma * state_values(network, np.stack(last))
+            rollout_buffer.rewards[list(steps), list(rows)] += following
+
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
 
-        It is PPO's loop over mini-batches, with two of them in a step, and what differs marked by
-        ``+``.
+        It is PPO's loop over mini-batches, with two of them in a step, in one piece as SB3 has it.
+        Additions are marked with ``+``.
 
         :raises TrainingError: a loss or gradient that is not finite; the parameters stay those of
             the last good step
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        clip_range_vf = (
-            self.clip_range_vf(self._current_progress_remaining)
-            if callable(self.clip_range_vf)
-            else None
-        )
-        # + The loss of Eq. 4.3.
-        loss = Loss(
+        clip_range_vf = None
+        if callable(self.clip_range_vf):
+            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)
+
+        # + Compiled code computes the same gradients in less time, to rounding.
+        network = network_of(self.policy)
+        compiled_loss = Loss(
             bc_coef=1.0,
             bc_loss=CLONING_LOSSES.index(self.bc_loss),
             vf_coef=self.vf_coef,
-            clip_range_vf=np.inf if clip_range_vf is None else clip_range_vf,
+            clip_range_vf=math.inf if clip_range_vf is None else clip_range_vf,
             ent_coef=self.ent_coef,
             l2_coef=self.l2_coef,
             aux_coef=self.aux_coef,
             aux_layer=self._aux_layer,
         )
-        network, (actor, critic) = network_of(self.policy), parameters_of_both(self.policy)
+        actor_parameters, critic_parameters = actor_and_critic_parameters(self.policy)
 
-        # + Rows of the dataset for the actor, and of the rollout for the critic, which takes part
-        # in every so many steps.
-        buffer, rng = self.rollout_buffer, self._generator(1)
+        # + Rows of the dataset for the actor
+        buffer = self.rollout_buffer
+        rng = self._generator(1)
         n_rows = buffer.buffer_size * buffer.n_envs
-        n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
-        n_batches = min(n_batches, self.n_epochs * n_rows)
-        n_critic = min(self.n_epochs * -(-n_rows // self.batch_size), n_batches)
-        actor_rows = sample_rows(
-            len(self.dataset), n_batches * self.batch_size, rng, self.shuffle
-        ).reshape(n_batches, -1)
-        critic_rows = iter(
-            np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle), n_critic)
-        )
+        batch_size = min(self.batch_size, len(self.dataset))
+        n_passes = self.n_epochs * math.ceil(n_rows / self.batch_size)
+        n_batches = min(self.gradient_steps or n_passes, self.n_epochs * n_rows)
+        actor_rows = sample_rows(len(self.dataset), n_batches * batch_size, rng, self.shuffle)
+        # + Rows of the rollout for the critic, which takes part in every so many steps
+        n_critic = min(n_passes, n_batches)
+        critic_rows = sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle)
+        critic_batches = iter(np.array_split(critic_rows, n_critic))
         flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
         targets = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
-        limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
-        monitored: dict[str, list[float]] = {}  # by name: the term of each step
+        max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
+        # The terms of each step, by name
+        history: dict[str, list[float]] = {}
 
-        for i, rows in enumerate(actor_rows):
-            due = (i + 1) * n_critic // n_batches > i * n_critic // n_batches
-            for_critic = Batch(next(critic_rows), flown, targets) if due else None
-            terms = gradients(network, loss, self.dataset.batch(rows), for_critic)
-            if not due:
-                for parameter in critic:
+        for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
+            actor_batch = self.dataset.batch(rows)
+            critic_batch = None
+            if (i + 1) * n_critic // n_batches > i * n_critic // n_batches:
+                critic_batch = Batch(next(critic_batches), flown, targets)
+
+            if isinstance(network, Perceptrons):  # +
+                terms = network.gradients(compiled_loss, actor_batch, critic_batch)
+            else:
+                observations, labels = actor_batch.tensors(self.device)
+                try:
+                    entropy: Any = self.policy.get_distribution(observations).entropy()
+                except ValueError as error:  # of a distribution whose mean is not finite
+                    raise self._diverged({"bc_loss": math.nan}) from error
+                # + The cloning term L_BC (Eq. 3.12); behind the action lie the auxiliary targets
+                mean = self.policy.action_dist.mode()
+                log_std = self.policy.log_std
+                action_dim = mean.shape[1]
+                errors = cloning_errors(self.bc_loss, mean, log_std, labels[:, :action_dim])
+                losses = {"bc_loss": errors.mean()}
+                loss = losses["bc_loss"]
+                if self._aux_layer:  # +
+                    aux_labels = labels[:, action_dim:]
+                    layers = self.policy.mlp_extractor.policy_net[: 2 * self._aux_layer]
+                    features = self.policy.extract_features(
+                        observations, self.policy.pi_features_extractor
+                    )
+                    predicted = layers(features)[:, : aux_labels.shape[1]]
+                    errors = cloning_errors("huber_mse", predicted, log_std, aux_labels)
+                    losses["aux_loss"] = errors.mean()
+                    loss = loss + self.aux_coef * losses["aux_loss"]
+
+                # Value loss using the TD(gae_lambda) target
+                if critic_batch is not None:
+                    observations, value_targets = critic_batch.tensors(self.device)
+                    old_values, returns = value_targets.T
+                    values = self.policy.predict_values(observations).flatten()
+                    if clip_range_vf is None:
+                        losses["value_loss"] = F.mse_loss(returns, values)
+                    else:  # + Eq. 3.8
+                        losses["value_loss"] = max_clipped_value_loss(
+                            values, old_values, returns, clip_range_vf
+                        )
+                    loss = loss + self.vf_coef * losses["value_loss"]
+
+                # Entropy loss favor exploration
+                losses["entropy_loss"] = -th.mean(entropy)
+                loss = loss + self.ent_coef * losses["entropy_loss"]
+                if self.l2_coef > 0.0:  # + Eq. 2.25
+                    losses["l2_loss"] = l2_loss([*self.policy.parameters()])
+                    loss = loss + self.l2_coef * losses["l2_loss"]
+
+                self.policy.optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                terms = {name: term.item() for name, term in losses.items()}
+                terms["loss"] = loss.item()
+
+            # + In a step without it, the critic does not move.
+            if critic_batch is None:
+                for parameter in critic_parameters:
                     parameter.grad = None
             # Clip grad norm, + of actor and critic each by itself
-            norms = [
-                th.nn.utils.clip_grad_norm_(group, limit)
-                for group in ((actor, critic) if due else (actor,))
-            ]
-            if not np.isfinite([*terms.values(), *map(float, norms)]).all():  # +
+            norm = th.nn.utils.clip_grad_norm_(actor_parameters, max_grad_norm)
+            critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, max_grad_norm)
+            if not np.isfinite([*terms.values(), float(norm), float(critic_norm)]).all():  # +
                 self.policy.optimizer.zero_grad()
-                raise TrainingError(
-                    f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms['bc_loss']:.3g}, value loss "
-                    f"{terms.get('value_loss', 0.0):.3g}); lower learning_rate, or look for rewards and observations that are "
-                    "not finite"
-                )
+                raise self._diverged(terms)
             self.policy.optimizer.step()
             self.policy.log_std.data.clamp_(min=self.log_std_min)  # +
             self._n_updates += 1
             for name, term in terms.items():
-                monitored.setdefault(name, []).append(term)
+                history.setdefault(name, []).append(term)
 
-        for name, values in monitored.items():
-            self.logger.record(f"train/{name}", float(np.mean(values)))
+        # Logs
+        explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        for name, values_of_term in history.items():
+            self.logger.record(f"train/{name}", float(np.mean(values_of_term)))
         self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-        self.logger.record(
-            "train/explained_variance",
-            explained_variance(buffer.values.flatten(), buffer.returns.flatten()),
-        )
+        self.logger.record("train/explained_variance", explained_var)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
 
-    def _prepare_to_learn(self, anew: bool) -> None:
-        self.set_expert(self.expert)
-        if anew:  # β begins anew; the dataset stays until ``dataset.clear()``
-            self._n_rollouts = 0
+    def _diverged(self, terms: dict[str, float]) -> TrainingError:
+        """Return the error for a loss or gradient that is not finite."""
+        return TrainingError(
+            f"training diverged at {self.num_timesteps} timesteps (cloning loss"
+            f" {terms['bc_loss']:.3g}, value loss {terms.get('value_loss', 0.0):.3g}); lower"
+            " learning_rate, or look for rewards and observations that are not finite"
+        )
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "dataset", "_aux_layer"]

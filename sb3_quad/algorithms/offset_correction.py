@@ -1,17 +1,16 @@
-"""Trimming an agent, in place: its steady offset from the target is cancelled by its own weights,
-so its zip stays stock.
+"""Correcting an agent in place: its own weights cancel its steady offset from the target.
 
-:func:`correct_offset` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its
-target, by the same vector wherever the target is. The thesis cancels that in the scaling of the
-observation (Eq. 3.16): the measured offset goes into the position components of μ. To make an agent
-quicker near its target, σ is multiplied by an α below 1 (Eq. 4.10). Here α is a constant, so that
-both can go into the actor's first layer, since W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ /
-(α σ)): the agent flies without any wrapper. An α well below 1 costs recoveries and far targets; PPO
-after it wins them back.
+Its zip stays stock. :func:`correct_offset` does what the thesis does (4.3.1). An agent that PPO has
+trained hovers next to its target, by the same vector wherever the target is. The thesis cancels
+that in the scaling of the observation (Eq. 3.16): the measured offset goes into the position
+components of μ. To make an agent quicker near its target, σ is multiplied by an α below 1 (Eq.
+4.10). Here α is a constant, so that both can go into the actor's first layer, since W (s - μ) / (α
+σ) + b = (W / α) s / σ + (b - W μ / (α σ)): the agent flies without any wrapper. An α well below 1
+costs recoveries and far targets; PPO after it wins them back.
 
-That fits one heading. :func:`correct_hover` is for agents whose offset turns with the heading: at its
-target, level and at rest, an agent should give hover thrust, and one that was trained by samples
-gives that but for a hundredth. What its last layer W, b must change by, D = [ΔW, Δb], follows in
+That fits one heading. :func:`correct_hover` is for agents whose offset turns with the heading. At
+its target, level and at rest, an agent should give hover thrust, and one that was trained by
+samples gives that but for a hundredth. The change D = [ΔW, Δb] of its last layer W, b follows in
 closed form::
 
     min  mean_ψ |h̄(ψ) D + y(ψ)|² + λ mean_s |h(s) D|²
@@ -38,24 +37,28 @@ from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import first_vehicle
 
 _POSITION = GROUPS["position"]
-N_OFFSETS = 120  # flights to random targets, of which the final offset is the mean
-ROUNDS = 3  # the offset is measured anew after each correction
-STIFFNESS = 0.1  # λ
-N_HEADINGS, N_SAMPLES = 72, 256  # headings, and observations of each with noise of their own
+# The offset is the mean of the last positions of so many flights to random targets. It is measured
+# again after each correction.
+N_OFFSETS = 120
+ROUNDS = 3
+# λ of the hover's correction
+STIFFNESS = 0.1
+# Headings at the target, and noisy observations of each
+N_HEADINGS = 72
+N_SAMPLES = 256
+# The actions of these flights should stay: every third state of their first 3 s
 TASKS = {"state_recovery": 0.5, "recovery_and_tracking": 0.5}
-N_FLIGHTS, STEPS, EVERY = (
-    240,
-    300,
-    3,
-)  # flights whose states must not see a change: their first 3 s, every third step
+N_FLIGHTS = 240
+STEPS = 300
+EVERY = 3
 
 
 class Correction(NamedTuple):
-    """What trimming did.
+    """The effect of a correction.
 
-    :param before: size of the steady offset in m; of :func:`correct_hover`, the mean action at the
-        target less that of hover, root mean square over headings and rotors.
-    :param after: the same, after it.
+    :param before: size of the steady offset in m. After :func:`correct_hover` it is the mean action
+        at the target less that of hover, root mean square over headings and rotors.
+    :param after: the same, after the correction.
     """
 
     before: float
@@ -67,21 +70,22 @@ def correct_offset(
 ) -> Correction:
     """Find μ for an agent and fold it into its first layer, and α before it.
 
-    :param scale: α.
     :param seed: of the flights that measure it.
     :param settings: vehicle, noise and scaling that the agent flies with.
+    :param scale: α.
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not
         read the 18 features.
     """
     own = settings or FlightSettings()
     first_layer(model)
     _, std = scaling(own)
-    before = hover_offset(model, seed=seed, settings=own)
-    scale_position(model, scale)
-    after = before if scale == 1.0 else hover_offset(model, seed=seed, settings=own)
-    for each in row_seeds(seed, ROUNDS):
+    before = after = hover_offset(model, seed=seed, settings=own)
+    if scale != 1.0:
+        scale_position(model, scale)
+        after = hover_offset(model, seed=seed, settings=own)
+    for seed_of_round in row_seeds(seed, ROUNDS):
         shift_position(model, after, std[_POSITION])
-        after = hover_offset(model, seed=each, settings=own)
+        after = hover_offset(model, seed=seed_of_round, settings=own)
     return Correction(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
 
 
@@ -91,18 +95,20 @@ def hover_offset(
     seed: int = 0,
     settings: FlightSettings | None = None,
 ) -> FloatArray:
-    """Mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking, over the flights
-    that last.
+    """Return the mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking.
+
+    It is taken over the flights that last.
 
     :param settings: how it flies; task and episode length are those of this measurement.
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
     """
     own = {} if settings is None else settings.in_any_task()
     flights = fly(controller, "target_tracking", n_flights, seed, **own)
-    lost = 1.0 - float(flights.survival.mean())
-    if lost > 0.5:
+    crashed = 1.0 - float(flights.survival.mean())
+    if crashed > 0.5:
         raise ConfigError(
-            f"the steady offset from the target cannot be measured: {100 * lost:.0f} % of the flights to targets end early"
+            f"the steady offset from the target cannot be measured: {100 * crashed:.0f} % of the"
+            " flights to targets end early"
         )
     return np.asarray(flights.final_offset[flights.survival].mean(axis=0))
 
@@ -135,12 +141,14 @@ def correct_hover(
         features.
     """
     layer = getattr(model.policy, "action_net", None)
-    reads = model.observation_space.shape == (OBSERVATION_SIZE,) and not hasattr(
-        model.policy, "lstm_actor"
-    )
-    if not isinstance(layer, th.nn.Linear) or not reads:
-        raise ConfigError("trimming needs an MlpPolicy that reads the 18 features")
+    if (
+        not isinstance(layer, th.nn.Linear)
+        or model.observation_space.shape != (OBSERVATION_SIZE,)
+        or hasattr(model.policy, "lstm_actor")
+    ):
+        raise ConfigError("offset correction needs an MlpPolicy that reads the 18 features")
     own = settings or FlightSettings()
+    # h̄(ψ), and h(s) of flights
     at_target = _latents(model, _at_target(own, np.random.default_rng(seed)))
     at_target = at_target.reshape(N_HEADINGS, N_SAMPLES, -1).mean(dim=1)
     seen = _Observations()
@@ -148,9 +156,8 @@ def correct_hover(
     flown = _latents(model, np.concatenate(seen.kept[::EVERY]))
     hover = first_vehicle(own.vehicle).hover_action
     with th.no_grad():
-        weights = th.cat(
-            [layer.weight, layer.bias[:, None]], dim=1
-        ).T.double()  # (inputs + 1, actions)
+        # The layer as one matrix (inputs + 1, actions), and the least squares that change it
+        weights = th.cat([layer.weight, layer.bias[:, None]], dim=1).T.double()
         before = at_target @ weights - hover
         metric = at_target.T @ at_target / len(at_target) + STIFFNESS * flown.T @ flown / len(flown)
         metric += 1e-6 * th.eye(len(metric), dtype=metric.dtype)
@@ -158,26 +165,31 @@ def correct_hover(
         layer.weight.copy_(weights[:-1].T)
         layer.bias.copy_(weights[-1])
         after = at_target @ weights - hover
-    return Correction(*(float(action.square().mean().sqrt()) for action in (before, after)))
+    return Correction(_root_mean_square(before), _root_mean_square(after))
+
+
+def _root_mean_square(actions: th.Tensor) -> float:
+    return float(actions.square().mean().sqrt())
 
 
 def first_layer(model: BaseAlgorithm, size: int = OBSERVATION_SIZE) -> th.nn.Linear:
-    """The layer of an agent's actor that reads ``size`` numbers.
+    """Return the layer of an agent's actor that reads ``size`` numbers.
 
     :raises ConfigError: it has none.
     """
-    owner = getattr(model.policy, "actor", None) or getattr(
-        model.policy, "mlp_extractor", None
-    )  # an actor: of SAC or TD3
-    found = [
-        getattr(owner, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(owner, name)
-    ]
-    layer = next(iter(found[0]), None) if found else None
-    if not isinstance(layer, th.nn.Linear) or layer.in_features != size:
-        raise ConfigError(
-            f"trimming needs an MlpPolicy whose first layer reads the {size} features"
-        )
-    return layer
+    # SAC and TD3 have an actor, on-policy algorithms an extractor for both networks.
+    policy = model.policy
+    owner = getattr(policy, "actor", None) or getattr(policy, "mlp_extractor", None)
+    for name in ("policy_net", "latent_pi", "mu"):
+        layers = getattr(owner, name, None)
+        if layers is not None:
+            layer = next(iter(layers), None)
+            if isinstance(layer, th.nn.Linear) and layer.in_features == size:
+                return layer
+            break
+    raise ConfigError(
+        f"offset correction needs an MlpPolicy whose first layer reads the {size} features"
+    )
 
 
 class _Observations(Hook):
@@ -197,7 +209,7 @@ class _Observations(Hook):
 
 
 def _latents(model: BaseAlgorithm, observations: Float32Array) -> th.Tensor:
-    """Inputs of the actor's last layer and a 1, float64, (n, inputs + 1)."""
+    """Return inputs of the actor's last layer and a 1, float64, (n, inputs + 1)."""
     policy: Any = model.policy
     with th.no_grad():
         tensor = th.as_tensor(observations, device=model.device)
@@ -207,25 +219,28 @@ def _latents(model: BaseAlgorithm, observations: Float32Array) -> th.Tensor:
 
 
 def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Array:
-    """Observations at the target, level and at rest: N_HEADINGS headings, N_SAMPLES of each."""
-    heading = np.repeat(np.linspace(0.0, 2.0 * np.pi, N_HEADINGS, endpoint=False), N_SAMPLES)
+    """Return noisy observations at the target, level and at rest: N_SAMPLES of each heading."""
+    headings = np.linspace(0.0, 2.0 * np.pi, N_HEADINGS, endpoint=False)
+    heading = np.repeat(headings, N_SAMPLES)
+    cosine = np.cos(heading)
+    sine = np.sin(heading)
+    zero = np.zeros(heading.size)
     features = np.zeros((heading.size, OBSERVATION_SIZE))
-    cosine, sine, zero = np.cos(heading), np.sin(heading), np.zeros(heading.size)
     features[:, GROUPS["rotation"]] = np.stack(
         [cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1], axis=1
     )
     mean, std = scaling(settings)
-    relative, additive = (level.mean() for level in levels(settings.noise))
-    features *= 1.0 + relative * rng.standard_normal(features.shape)
-    features += additive * std * rng.standard_normal(features.shape)
+    relative, additive = levels(settings.noise)
+    features *= 1.0 + relative.mean() * rng.standard_normal(features.shape)
+    features += additive.mean() * std * rng.standard_normal(features.shape)
     return np.asarray((features - mean) / std, dtype=np.float32)
 
 
 def scaling(settings: FlightSettings) -> tuple[FloatArray, FloatArray]:
-    """μ and σ of Eq. 3.16, (18,) both."""
-    mean = (
-        DEFAULT_MEAN if settings.observation_mean is None else np.asarray(settings.observation_mean)
-    )
-    return mean, DEFAULT_STD if settings.observation_std is None else np.asarray(
-        settings.observation_std
+    """Return μ and σ of Eq. 3.16, (18,) both."""
+    mean = settings.observation_mean
+    std = settings.observation_std
+    return (
+        DEFAULT_MEAN if mean is None else np.asarray(mean),
+        DEFAULT_STD if std is None else np.asarray(std),
     )

@@ -1,35 +1,60 @@
-"""PPO with a weighted behavioural-cloning loss towards an expert: stage two of the thesis (4.2.2,
-Eq. 4.4).
-"""
+"""PPO with behavioural cloning towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
 
 import math
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import (
+    FloatSchedule,
+    LinearSchedule,
+    explained_variance,
+    obs_as_tensor,
+)
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
+from typing_extensions import Self
 
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import (
     ExpertMixin,
-    arguments_of,
+    actor_and_critic_parameters,
     is_ever_nonzero,
-    parameters_of_both,
+    model_of,
+    policy_arguments,
 )
-from sb3_quad.algorithms.networks.gradients import act, gradients, network_of
-from sb3_quad.algorithms.networks.losses import BC_FILTERS, CLONING_LOSSES, CloningLoss, Loss
+from sb3_quad.algorithms.networks.gradients import Perceptrons, Terms, act, network_of
+from sb3_quad.algorithms.networks.losses import (
+    BC_FILTERS,
+    CLONING_LOSSES,
+    CloningFilter,
+    CloningLoss,
+    Loss,
+    agree,
+    cloning_errors,
+    l2_loss,
+    max_clipped_value_loss,
+)
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.expert_like import ExpertLike
+
+# By default a rollout is so many mini-batches, but none has less than so many rows.
+N_MINIBATCHES = 16
+LEAST_ROWS = 64
 
 
-class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
+class PPOBC(ExpertMixin, PPO):
     """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
 
     The minimised loss is Eq. 4.4 of the thesis: PPO-clip + c_v · value loss + c_L2 · ½Σw² − c_H ·
@@ -37,15 +62,26 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
     prints the probability ratio as a difference of logs (the ratio is its exponential); Eq. 3.6 is
     a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
 
-    All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. An update that
-    adds nothing (a cloning weight and an ``l2_coef`` of 0, no ``critic_warmup``, and either no
-    ``clip_range_vf`` or ``max_clipped_value=False``) is PPO's, bit for bit; any other is equal to
-    PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model loads with
-    ``PPO.load``, even where this package is not installed.
+    All arguments of :class:`stable_baselines3.PPO` keep their meaning. The defaults are those that
+    we recommend for hundreds of quadcopters at once and an expert that is good near its target but
+    not everywhere, such as the PID. Table A.3 of the thesis is ``zoo_configs/thesis/ppo_bc.yml``.
+    With few environments, give ``n_steps`` and ``learning_rate`` as for PPO (SB3's are 2048 and
+    3e-4).
 
+    An update that adds nothing (a cloning weight and an ``l2_coef`` of 0, no ``critic_warmup``, and
+    either no ``clip_range_vf`` or ``max_clipped_value=False``) is PPO's, bit for bit. Any other is
+    equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model
+    loads with ``PPO.load``, even where this package is not installed.
+
+    :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
+    :param policy_kwargs: unless it holds ``log_std_init``, that is -0.9. ``log_std_init=None``:
+        SB3's, or that of the initial policy.
     :param expert: who labels the visited states: an object with ``actions(state)`` on the true
         state of our environments, an SB3 model, or a callable from observations to actions; or a
         name as YAML takes it, such as ``"pid"``. Needed when learning starts with a cloning weight.
+    :param initial_policy: the agent to start from: a model, the path of a zip, or the name of a
+        shipped agent. Its policy and critic are taken; so are its ``net_arch`` and
+        ``activation_fn`` where ``policy_kwargs`` does not give them.
     :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining
         progress (SB3's ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum
@@ -53,38 +89,36 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
         which leaves the deviation alone; ``"huber"``, that is linear beyond 0.05; or
         ``"huber_mse"``, that and three times the squared error.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"agreement"``, where expert and
-        policy differ by less than 0.3 (root mean square over the action): an expert for small
-        angles, such as the PID, then holds the agent on its way to the target and has no say where
+        policy differ by less than 0.3 (root mean square over the action). An expert for small
+        angles, such as the PID, then holds the agent on its way to the target, and has no say where
         the agent has learnt to recover and the expert would crash.
     :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std``
-        are left out.
-    :param max_clipped_value: the value loss of Eq. 3.8, the larger of the clipped and the unclipped
-        error, where ``clip_range_vf`` is given; False for stock PPO's clipped error.
+        take no part.
+    :param max_clipped_value: whether the value loss is that of Eq. 3.8, the larger of the clipped
+        and the unclipped error, where ``clip_range_vf`` is given. False: PPO's clipped error.
     :param critic_warmup: for this many rollouts only the critic learns. A critic that comes from
         another task, or from another policy, would otherwise spoil the actor with its first
         advantages.
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
         prepares them ("chronologically", 4.2.3).
-    :raises ConfigError: a value out of range, a name that is not known, or a space that is not
-        supported, when built.
+    :raises ConfigError: a value out of range, an unknown name, or a space that is not supported,
+        when built.
     :raises ExpertError: when learning starts, or at the latest with the first rollout that is to be
         cloned: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss or gradient that is not finite; the parameters are those of the
         step before.
     """
 
-    _rollout_bc_coef = 0.0  # the weight of the cloning term in the update on the present rollout
-
     def __init__(
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        n_steps: int = 2048,
-        batch_size: int = 64,
+        learning_rate: float | Schedule = LinearSchedule(1e-3, 5e-5, 1.0),  # noqa: B008
+        n_steps: int = 125,
+        batch_size: int | None = None,
         n_epochs: int = 10,
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
+        gamma: float = 0.995,
+        gae_lambda: float = 0.98,
         clip_range: float | Schedule = 0.2,
         clip_range_vf: float | Schedule | None = None,
         normalize_advantage: bool = True,
@@ -102,26 +136,53 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
-        expert: Any = None,
-        bc_coef: float | Schedule = 0.005,
-        bc_loss: CloningLoss = "nll",
-        bc_filter: str = "none",
+        *,
+        expert: ExpertLike | None = None,
+        initial_policy: BaseAlgorithm | str | Path | None = None,
+        bc_coef: float | Schedule = 0.1,
+        bc_loss: CloningLoss = "mse",
+        bc_filter: CloningFilter = "agreement",
         l2_coef: float = 0.0,
         max_clipped_value: bool = True,
-        critic_warmup: int = 0,
+        critic_warmup: int = 2,
         shuffle: bool = True,
         _init_setup_model: bool = True,
     ):
-        stock = {**locals(), "rollout_buffer_class": rollout_buffer_class or ExpertRolloutBuffer}
-        super().__init__(**arguments_of(PPO, stock), _init_setup_model=False)
-        if bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", bc_loss, CLONING_LOSSES))
-        if bc_filter not in BC_FILTERS:
-            raise ConfigError(unknown("bc_filter", bc_filter, BC_FILTERS))
+        initial = model_of(initial_policy)
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            # The default is known when the environments are. PPO warns where this is no divisor.
+            batch_size=max(n_steps, 2) if batch_size is None else batch_size,
+            n_epochs=n_epochs,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip_range=clip_range,
+            clip_range_vf=clip_range_vf,
+            normalize_advantage=normalize_advantage,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class or ExpertRolloutBuffer,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            target_kl=target_kl,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -0.9),
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.batch_size = batch_size  # type: ignore[assignment]
         self.expert = expert
         self.bc_coef = bc_coef
         self.bc_loss: CloningLoss = bc_loss
-        self.bc_filter = bc_filter
+        self.bc_filter: CloningFilter = bc_filter
         self.l2_coef = l2_coef
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
@@ -130,71 +191,101 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
 
         if _init_setup_model:
             self._setup_model()
+            if initial is not None:
+                transfer_policy(initial, self)
 
     def _setup_model(self) -> None:
+        filters = [name for name in BC_FILTERS if name != "q"]
+        if self.bc_loss not in CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
+        if self.bc_filter not in filters:
+            raise ConfigError(unknown("bc_filter", self.bc_filter, filters))
         self._refuse_dict_observations()
         if not issubclass(self.rollout_buffer_class or RolloutBuffer, ExpertRolloutBuffer):
             raise ConfigError(
                 f"rollout_buffer_class {self.rollout_buffer_class}: must be an ExpertRolloutBuffer"
             )
+        if cast(int | None, self.batch_size) is None:
+            n_rows = self.n_steps * self.n_envs
+            n_minibatches = min(N_MINIBATCHES, max(n_rows // LEAST_ROWS, 1))
+            self.batch_size = math.ceil(n_rows / n_minibatches)
         super()._setup_model()
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(
-                f"PPOBC clones into a Box action space only, this environment has {self.action_space}"
+                "PPOBC clones into a Box action space only, this environment has"
+                f" {self.action_space}"
             )
         self.bc_coef = FloatSchedule(self.bc_coef)
         if self.expert is not None and self.will_clone():
             self._check_cloning()
 
     def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "rollout_buffer_class",
-            "rollout_buffer_kwargs",
-            "_rollout_bc_coef",
-        ]
+        own = ["rollout_buffer_class", "rollout_buffer_kwargs"]
+        return [*super()._excluded_save_params(), *own]
 
     @property
     def policy_is_idle(self) -> bool:
-        """Whether the policy is still the one that it began with, since only the critic has learnt
-        (``critic_warmup``).
-        """
+        """Whether only the critic has learnt so far (``critic_warmup``)."""
         return 0 < self.critic_warmup >= self._n_rollouts_trained
 
     def set_bc_coef(self, bc_coef: float) -> None:
-        """Weigh the cloning term with ``bc_coef`` from the next rollout on, instead of the schedule
-        given before.
+        """Weigh the cloning term with ``bc_coef`` from the next rollout on.
+
+        It replaces the schedule. A rollout under way keeps its weight, by which its states have
+        been labelled or not.
 
         :raises ConfigError: a weight that is negative or not finite.
         :raises ExpertError: a weight, and no expert.
         """
-        if not 0.0 <= bc_coef < float("inf"):
+        if not 0.0 <= bc_coef < math.inf:
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
         if bc_coef > 0.0:
             self._check_cloning()
-        self.bc_coef = FloatSchedule(
-            bc_coef
-        )  # a rollout under way keeps the weight by which it was labelled, or not
+        self.bc_coef = FloatSchedule(bc_coef)
 
     def will_clone(self) -> bool:
-        """Whether the schedule gives the cloning term a weight anywhere, as far as a hundred
-        samples of it tell.
+        """Return whether the schedule ever gives the cloning term a weight.
+
+        A hundred samples of it are taken.
         """
         return is_ever_nonzero(self.bc_coef)  # type: ignore[arg-type]
 
     def _check_cloning(self) -> None:
         if self.expert is None:
             raise ExpertError(
-                "PPOBC needs an expert to clone: PPOBC(..., expert='geometric'), model.set_expert(...), or bc_coef=0"
+                "PPOBC needs an expert to clone: PPOBC(..., expert='geometric'),"
+                " model.set_expert(...), or bc_coef=0"
             )
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError(
-                "use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example"
+                "use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for"
+                " example"
             )
 
-    def _prepare_to_learn(self, anew: bool) -> None:
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "PPOBC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for ``total_timesteps``; all arguments are those of SB3's ``PPO.learn``.
+
+        :raises ExpertError: no expert where one is needed, or one that does not fit.
+        """
         if self.will_clone():
             self._check_cloning()
+        with self._threads():
+            return super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
 
     def collect_rollouts(
         self,
@@ -203,21 +294,26 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly a rollout: PPO's loop, with what is added to it marked by ``+``."""
+        """Fly a rollout by PPO's loop. Additions are marked with ``+``.
+
+        It is as long as SB3's, in one piece, so that the two can be compared line by line.
+        """
         assert self._last_obs is not None, "No previous observation was provided"
         self.policy.set_training_mode(False)
 
-        # + The update on this rollout comes at its end, and with the weight of that time: that
-        # weight decides about labels.
+        # + The update comes at the end of this rollout and takes the weight of that time. Without a
+        # weight, no state is labelled.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
-        self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
-        clones = buffer.labelled = self._rollout_bc_coef != 0.0
-        # + An expert that has not seen a rollout begins anew.
-        self._labeller = Controller.for_env(self.expert, env, self._labeller) if clones else None
-        network = (
-            network_of(self.policy) if clones else self.policy
-        )  # + without additions as PPO, bit for bit
+        progress = 1.0 - float(end) / float(self._total_timesteps)
+        buffer.bc_coef = float(self.bc_coef(progress))  # type: ignore[operator]
+        # + A recurrent expert that has not seen the last rollout begins again.
+        labeller = None
+        network: Any = self.policy
+        if buffer.bc_coef != 0.0:
+            labeller = Controller.for_env(self.expert, env, self._labeller)
+            network = network_of(self.policy)
+        self._labeller = labeller
 
         n_steps = 0
         rollout_buffer.reset()
@@ -244,11 +340,11 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
                         actions, self.action_space.low, self.action_space.high
                     )
 
-            if self._labeller is not None:  # + of the state before the step
+            # + Label the state before the step.
+            if labeller is not None:
                 observations: Any = self._last_obs
-                buffer.expert_actions[buffer.pos] = self._labeller.labels(
-                    observations, self._last_episode_starts
-                )
+                labels = labeller.labels(observations, self._last_episode_starts)
+                buffer.expert_actions[buffer.pos] = labels
 
             new_obs, rewards, dones, infos = env.step(clipped_actions)
 
@@ -273,8 +369,13 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
                         rewards[idx] += self.gamma * self.policy.predict_values(terminal_obs)[0]
 
             rollout_buffer.add(
-                self._last_obs, actions, rewards, self._last_episode_starts, values, log_probs
-            )  # type: ignore[arg-type]
+                self._last_obs,  # type: ignore[arg-type]
+                actions,
+                rewards,
+                self._last_episode_starts,  # type: ignore[arg-type]
+                values,
+                log_probs,
+            )
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
 
@@ -287,93 +388,189 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
         return True
 
     def train(self) -> None:
-        """One update on the rollout just flown: PPO's loop, with what is added to it marked by
-        ``+``.
+        """Update the policy on the rollout just flown, by PPO's lines. Additions are marked ``+``.
+
+        It is as long as SB3's, in one piece, so that the two can be compared line by line.
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        progress = self._current_progress_remaining
-        clip_range = self.clip_range(progress)  # type: ignore[operator]
-        clip_range_vf = None if self.clip_range_vf is None else self.clip_range_vf(progress)  # type: ignore[operator]
+        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        clip_range_vf = None
+        if self.clip_range_vf is not None:
+            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
 
-        # + The loss of Eq. 4.4. Without additions it is PPO's, and its gradients come from
-        # PyTorch's layers, as PPO's do.
+        # + While the critic warms up, no term moves the actor's weights.
         buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
+        bc_coef = buffer.bc_coef
         warming_up = self._n_rollouts_trained < self.critic_warmup
-        loss = Loss(
+        ent_coef = 0.0 if warming_up else self.ent_coef
+        l2_coef = 0.0 if warming_up else self.l2_coef
+        actor_parameters, _ = actor_and_critic_parameters(self.policy)
+
+        # + Compiled code computes the same gradients in less time, to rounding. Without additions
+        # PyTorch does it, as in PPO, bit for bit.
+        own_value_loss = clip_range_vf is not None and self.max_clipped_value
+        adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
+        network = network_of(self.policy) if adds else self.policy
+        compiled_loss = Loss(
             policy_coef=1.0,
             clip_range=clip_range,
             normalize_advantage=self.normalize_advantage,
-            bc_coef=self._rollout_bc_coef,
+            bc_coef=bc_coef,
             bc_loss=CLONING_LOSSES.index(self.bc_loss),
             bc_filter=BC_FILTERS.index(self.bc_filter),
             vf_coef=self.vf_coef,
             clip_range_vf=math.inf if clip_range_vf is None else clip_range_vf,
             max_clipped_value=self.max_clipped_value,
-            ent_coef=0.0 if warming_up else self.ent_coef,
-            l2_coef=0.0 if warming_up else self.l2_coef,
-        )
-        own_value_loss = clip_range_vf is not None and self.max_clipped_value
-        adds = self._rollout_bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
-        network, (actor, _) = (
-            network_of(self.policy) if adds else self.policy,
-            parameters_of_both(self.policy),
+            ent_coef=ent_coef,
+            l2_coef=l2_coef,
         )
 
-        monitored: dict[str, list[float]] = {}  # by name: the term of each mini-batch
+        # The terms of each mini-batch, by name
+        history: dict[str, list[float]] = {}
         continue_training = True
 
+        # train for n_epochs epochs
         for epoch in range(self.n_epochs):
             approx_kl_divs = []
-            for batch, for_critic in buffer.get(self.batch_size, self.shuffle):
-                terms = gradients(network, loss, batch, for_critic)
+            # Do a complete pass on the rollout buffer
+            for rows in buffer.minibatches(self.batch_size, self.shuffle):  # +
+                if isinstance(network, Perceptrons):  # +
+                    terms = network.gradients(compiled_loss, *buffer.batches(rows))
+                else:
+                    rollout_data = buffer.samples(rows)
+                    actions = rollout_data.actions
+                    if isinstance(self.action_space, spaces.Discrete):
+                        # Convert discrete action from float to long
+                        actions = rollout_data.actions.long().flatten()
+
+                    try:
+                        values, log_prob, entropy = self.policy.evaluate_actions(
+                            rollout_data.observations, actions
+                        )
+                    except ValueError as error:  # + of a distribution whose mean is not finite
+                        raise self._diverged({"mean action": math.nan}) from error
+                    values = values.flatten()
+                    # Normalize advantage
+                    advantages = rollout_data.advantages
+                    # Normalization does not make sense if mini batchsize == 1
+                    if self.normalize_advantage and len(advantages) > 1:
+                        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+                    # ratio between old and new policy, should be one at the first iteration
+                    log_ratio = log_prob - rollout_data.old_log_prob
+                    ratio = th.exp(log_ratio)
+
+                    # clipped surrogate loss
+                    policy_loss_1 = advantages * ratio
+                    policy_loss_2 = advantages * th.clamp(ratio, 1 - clip_range, 1 + clip_range)
+                    policy_loss = -th.min(policy_loss_1, policy_loss_2).mean()
+
+                    # Value loss using the TD(gae_lambda) target
+                    returns = rollout_data.returns
+                    if clip_range_vf is None:
+                        # No clipping
+                        value_loss = F.mse_loss(returns, values)
+                    elif self.max_clipped_value:  # + Eq. 3.8
+                        value_loss = max_clipped_value_loss(
+                            values, rollout_data.old_values, returns, clip_range_vf
+                        )
+                    else:
+                        # Clip the difference between old and new value
+                        # NOTE: this depends on the reward scaling
+                        values_pred = rollout_data.old_values + th.clamp(
+                            values - rollout_data.old_values, -clip_range_vf, clip_range_vf
+                        )
+                        value_loss = F.mse_loss(returns, values_pred)
+
+                    # Entropy loss favor exploration
+                    if entropy is None:
+                        # Approximate entropy when no analytical form
+                        entropy_loss = -th.mean(-log_prob)
+                    else:
+                        entropy_loss = -th.mean(entropy)
+
+                    loss = policy_loss + ent_coef * entropy_loss + self.vf_coef * value_loss
+                    losses = {
+                        "policy_gradient_loss": policy_loss,
+                        "value_loss": value_loss,
+                        "entropy_loss": entropy_loss,
+                    }
+                    # + The cloning term L_BC, of the rows that are cloned; the others count as 0
+                    if bc_coef != 0.0:
+                        mean = self.policy.action_dist.mode()
+                        labels = rollout_data.expert_actions
+                        errors = cloning_errors(self.bc_loss, mean, self.policy.log_std, labels)
+                        if self.bc_filter == "agreement":
+                            errors = errors * agree(mean, labels)
+                        losses["bc_loss"] = errors.mean()
+                        loss = loss + bc_coef * losses["bc_loss"]
+                    # + Weight decay as a term of the loss (Eq. 2.25)
+                    if l2_coef != 0.0:
+                        losses["l2_loss"] = l2_loss([*self.policy.parameters()])
+                        loss = loss + l2_coef * losses["l2_loss"]
+
+                    # Calculate approximate form of reverse KL Divergence for early stopping
+                    with th.no_grad():
+                        losses["approx_kl"] = th.mean((ratio - 1) - log_ratio)
+                        losses["clip_fraction"] = th.mean((th.abs(ratio - 1) > clip_range).float())
+
+                    self.policy.optimizer.zero_grad()
+                    loss.backward()  # type: ignore[no-untyped-call]
+                    terms = {name: term.item() for name, term in losses.items()}
+                    terms["loss"] = loss.item()
+
+                # Logging
                 for name, term in terms.items():
-                    monitored.setdefault(name, []).append(term)
+                    history.setdefault(name, []).append(term)
                 approx_kl_divs.append(terms["approx_kl"])
 
                 if self.target_kl is not None and terms["approx_kl"] > 1.5 * self.target_kl:
                     continue_training = False
                     if self.verbose >= 1:
                         print(
-                            f"Early stopping at step {epoch} due to reaching max kl: {terms['approx_kl']:.2f}"
+                            f"Early stopping at step {epoch} due to reaching max kl:"
+                            f" {terms['approx_kl']:.2f}"
                         )
                     break
 
-                for parameter in actor if warming_up else ():  # + only the critic learns
-                    parameter.grad = None
+                # Optimization step
+                if warming_up:  # + of the critic alone
+                    for parameter in actor_parameters:
+                        parameter.grad = None
+                # Clip grad norm
                 norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
                 if not np.isfinite([terms["loss"], float(norm)]).all():  # +
-                    parts = ", ".join(
-                        f"{name} {term:.3g}"
-                        for name, term in (terms | {"gradient": float(norm)}).items()
-                    )
-                    raise TrainingError(
-                        f"the loss is not finite after {self.num_timesteps} timesteps ({parts}): try a smaller learning_rate "
-                        "or bc_coef, and check the expert's actions"
-                    )
+                    raise self._diverged(terms | {"gradient": float(norm)})
                 self.policy.optimizer.step()
 
             self._n_updates += 1
             if not continue_training:
                 break
 
-        self._n_rollouts_trained += 1
-        explained_var = explained_variance(
-            self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
-        )
+        self._n_rollouts_trained += 1  # +
+        explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
 
-        averages = {name: float(np.mean(values)) for name, values in monitored.items()}
-        averages |= {
-            "approx_kl": float(np.mean(approx_kl_divs)),
-            "loss": terms["loss"],
-            "explained_variance": explained_var,
-        }
+        # Logs
+        averages = {name: float(np.mean(values)) for name, values in history.items()}
+        averages["approx_kl"] = float(np.mean(approx_kl_divs))
+        averages["loss"] = terms["loss"]
         for name, average in averages.items():
             self.logger.record(f"train/{name}", average)
+        self.logger.record("train/explained_variance", explained_var)
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/clip_range", clip_range)
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
-        self.logger.record("train/bc_coef", self._rollout_bc_coef)  # +
+        self.logger.record("train/bc_coef", bc_coef)  # +
+
+    def _diverged(self, terms: Terms) -> TrainingError:
+        """Return the error for a loss or gradient that is not finite."""
+        values = ", ".join(f"{name} {term:.3g}" for name, term in terms.items())
+        return TrainingError(
+            f"the loss is not finite after {self.num_timesteps} timesteps ({values}): try a smaller"
+            " learning_rate or bc_coef, and check the expert's actions"
+        )

@@ -1,5 +1,6 @@
 """Soft actor-critic that also clones an expert: a value-based stage two."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,14 +8,17 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn import functional as F
+from typing_extensions import Self
 
 from sb3_quad.algorithms.buffers import (
     ExpertDictReplayBuffer,
@@ -22,41 +26,48 @@ from sb3_quad.algorithms.buffers import (
     ExpertReplayBuffer,
     ExpertReplaySamples,
 )
-from sb3_quad.algorithms.common import ExpertMixin, arguments_of, is_ever_nonzero
-from sb3_quad.algorithms.networks.losses import CloningLoss, agree, cloning_errors
+from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, model_of, policy_arguments
+from sb3_quad.algorithms.networks.losses import (
+    BC_FILTERS,
+    CLONING_LOSSES,
+    CloningFilter,
+    CloningLoss,
+    agree,
+    cloning_errors,
+)
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.expert_like import ExpertLike
 
-BC_LOSSES: tuple[CloningLoss, ...] = ("mse", "huber", "huber_mse")
-BC_FILTERS = ("none", "q", "agreement")
+_STOCK_BUFFERS = (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer)
 
 
-class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
+class SACBC(ExpertMixin, SAC):
     """Soft Actor-Critic with a cloning term in the actor's loss (SAC+BC).
 
     All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the
     additions at their defaults it is SAC, bit for bit. A saved model loads with ``SAC.load``, even
     where this package is not installed. For any environment with a Box action space.
 
-    What is added, with its source:
+    The additions and their sources:
 
-    =====================
-    ============================================================================================
-    ``critic_layer_norm``  layer-normalised critics, which overestimate unseen actions less: RLPD,
-                           https://arxiv.org/abs/2302.02948
-    ``bc_coef``            a cloning term in the actor's loss: Nair et al.,
-    https://arxiv.org/abs/1709.10089; weighed by
-                           the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The
-                           expert labels every state that is visited, as in DAgger, not its own
-                           flights alone
-    ``bc_filter="q"``      only where the critic prefers the expert's action: the Q filter of Nair
-    et al. =====================
-    ============================================================================================
+    - ``critic_layer_norm``: layer-normalised critics, which overestimate unseen actions less: RLPD,
+      https://arxiv.org/abs/2302.02948
+    - ``bc_coef``: a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089;
+      weighed by the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert
+      labels every state that is visited, as in DAgger, not its own flights alone
+    - ``bc_filter="q"``: only where the critic prefers the expert's action: the Q filter of Nair et
+      al.
 
     :param expert: who labels: an object with ``actions(state)`` on the true state of our
         environments, an SB3 model, or a function from observations to actions; or a name as YAML
         takes it, such as ``"pid"``. It is never saved. Needed when learning starts with cloning.
+    :param initial_policy: the agent to start from: a model, the path of a zip, or the name of a
+        shipped agent. One of SAC hands on all its weights, and its ``net_arch`` and
+        ``activation_fn`` where ``policy_kwargs`` does not give them. Any other is imitated by the
+        actor.
     :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a
         schedule of the remaining progress.
     :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear
@@ -64,14 +75,14 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         the policy, within -1 and 1.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's
         action is greater than Q of the policy's mean action; ``"agreement"``, where both differ by
-        less than 0.3, as of :class:`PPOBC`.
+        less than 0.3, as for :class:`PPOBC`.
     :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that
         comes from imitation is not moved by a critic that has learnt nothing yet.
     :param critic_layer_norm: whether the critics normalise the inputs of their activations, without
-        parameters: in stock ``SAC`` the zip loads and its actor is the same, but its critics do not
+        parameters. In stock ``SAC`` the zip loads and its actor is the same, but its critics do not
         normalise.
-    :raises ConfigError: a value out of range, a name that is not known, or a space that is not
-        supported, when built.
+    :raises ConfigError: a value out of range, an unknown name, or a space that is not supported,
+        when built.
     :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss that is not finite.
     """
@@ -105,91 +116,162 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
-        expert: Any = None,
+        *,
+        expert: ExpertLike | None = None,
+        initial_policy: BaseAlgorithm | str | Path | None = None,
         bc_coef: float | Schedule = 0.0,
         bc_loss: CloningLoss = "mse",
-        bc_filter: str = "none",
+        bc_filter: CloningFilter = "none",
         critic_warmup: int = 0,
         critic_layer_norm: bool = False,
         _init_setup_model: bool = True,
     ):
-        super().__init__(**arguments_of(SAC, locals()), _init_setup_model=False)
-        for name, value, valid in (
-            ("bc_loss", bc_loss, BC_LOSSES),
-            ("bc_filter", bc_filter, BC_FILTERS),
-        ):
-            if value not in valid:
-                raise ConfigError(unknown(name, value, valid))
+        initial = model_of(initial_policy)
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_arguments(policy_kwargs, initial, OffPolicyAlgorithm),
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
         self.expert = expert
         self.bc_coef = bc_coef
         self.bc_loss: CloningLoss = bc_loss
-        self.bc_filter = bc_filter
+        self.bc_filter: CloningFilter = bc_filter
         self.critic_warmup = critic_warmup
         self.critic_layer_norm = critic_layer_norm
         self._clones = False
-        self._labels: Float32Array | None = (
-            None  # (n_envs, action_dim): its scaled actions for the present states
-        )
-        self._starts: BoolArray | None = (
-            None  # (n_envs,): which rows have just begun an episode; None: all
-        )
+        # The expert's scaled actions for the present states, (n_envs, action_dim)
+        self._labels: Float32Array | None = None
+        # Which rows have just begun an episode, (n_envs,); None: all
+        self._starts: BoolArray | None = None
 
         if _init_setup_model:
             self._setup_model()
+            if initial is not None:
+                transfer_policy(initial, self)
 
     def _setup_model(self) -> None:
+        # The negative log-likelihood is no error of an action that tanh squashes.
+        kinds = [name for name in CLONING_LOSSES if name != "nll"]
+        if self.bc_loss not in kinds:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, kinds))
+        if self.bc_filter not in BC_FILTERS:
+            raise ConfigError(unknown("bc_filter", self.bc_filter, BC_FILTERS))
         self.bc_coef = FloatSchedule(self.bc_coef)
         self._clones = is_ever_nonzero(self.bc_coef)
         if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
             raise ConfigError(
-                f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict observations; give 1"
+                f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
+                " observations; give 1"
             )
         if self._clones:
-            if self.replay_buffer_class not in (
-                None,
-                ReplayBuffer,
-                NStepReplayBuffer,
-                DictReplayBuffer,
-            ):
-                raise ConfigError(
-                    f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's actions"
-                )
-            kind = ExpertReplayBuffer if self.n_steps == 1 else ExpertNStepReplayBuffer
-            if isinstance(self.observation_space, spaces.Dict):
-                kind = ExpertDictReplayBuffer
-            returns = {} if self.n_steps == 1 else {"n_steps": self.n_steps, "gamma": self.gamma}
-            both = self.observation_space, self.action_space
-            memory = self.device, self.n_envs, self.optimize_memory_usage
-            self.replay_buffer = kind(
-                self.buffer_size, *both, *memory, **self.replay_buffer_kwargs, **returns
-            )
+            self.replay_buffer = self._expert_buffer()
         super()._setup_model()
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
             _normalise_layers(self.critic_target)
 
+    def _expert_buffer(self) -> ExpertReplayBuffer:
+        """Return a buffer as SB3 would make it, but with room for the labels."""
+        if self.replay_buffer_class not in _STOCK_BUFFERS:
+            raise ConfigError(
+                f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's"
+                " actions"
+            )
+        kind = ExpertReplayBuffer
+        keywords = dict(self.replay_buffer_kwargs)
+        if isinstance(self.observation_space, spaces.Dict):
+            kind = ExpertDictReplayBuffer
+        elif self.n_steps > 1:
+            kind = ExpertNStepReplayBuffer
+            keywords |= {"n_steps": self.n_steps, "gamma": self.gamma}
+        return kind(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **keywords,
+        )
+
     @property
     def policy_is_idle(self) -> bool:
-        """Whether the policy is still the one that it began with, since only the critic has learnt
-        (``critic_warmup``).
-        """
+        """Whether only the critic has learnt so far (``critic_warmup``)."""
         return 0 < self.critic_warmup >= self._n_updates
 
     def will_clone(self) -> bool:
-        """Whether the expert is needed at all."""
+        """Return whether the expert is needed at all."""
         return self._clones
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "SACBC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for ``total_timesteps``; all arguments are those of SB3's ``SAC.learn``.
+
+        :raises ExpertError: no expert where one is needed, or one that does not fit.
+        """
+        if self.will_clone() and self.expert is None:
+            raise ExpertError(
+                "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
+            )
+        if reset_num_timesteps or self._last_obs is None:
+            # The environments begin again.
+            self._starts = None
+            self._labeller = None
+        with self._threads():
+            return super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        if (
-            self._clones
-        ):  # before the step: an expert that sees the true state labels the present one
-            assert self.env is not None and self._last_obs is not None
+        # Before the step: an expert that sees the true state labels the present one.
+        if self._clones:
+            assert self.env is not None
+            observations: Any = self._last_obs
             self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
-            labels = self._labeller.labels(self._last_obs, self._starts)  # type: ignore[arg-type]
-            scaled = self.policy.scale_action(labels.reshape(n_envs, *self.action_space.shape))  # type: ignore[misc]
-            self._labels = np.asarray(scaled, dtype=np.float32).reshape(n_envs, -1)
+            labels = self._labeller.labels(observations, self._starts)
+            scaled: Any = self.policy.scale_action(
+                labels.reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
+            )
+            self._labels = scaled.reshape(n_envs, -1)
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
@@ -201,42 +283,48 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         dones: npt.NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        if isinstance(replay_buffer, ExpertReplayBuffer) and self._labels is not None:
-            replay_buffer.label(self._labels)
+        if isinstance(replay_buffer, ExpertReplayBuffer):
+            assert self._labels is not None
+            flown = buffer_action.reshape(self._labels.shape)
+            buffer_action = np.hstack([flown, self._labels])
         self._starts = dones
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     @staticmethod
     def _least_q(critic: Any, observations: Any, actions: th.Tensor) -> th.Tensor:
-        """The least of the critics' values, (b, 1)."""
+        """Return the least of the critics' values, (b, 1)."""
         return th.cat(critic(observations, actions), dim=1).min(dim=1, keepdim=True).values
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Updates on the replay buffer: SAC's loop, with what is added to it marked by ``+``."""
+        """Update on the replay buffer by SAC's lines. Additions are marked with ``+``.
+
+        It is as long as SB3's, in one piece, so that the two can be compared line by line.
+        """
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:
             optimizers += [self.ent_coef_optimizer]
         self._update_learning_rate(optimizers)
-        bc_coef = self.bc_coef(self._current_progress_remaining)  # type: ignore[operator]  # +
-        monitored: dict[str, list[float]] = {}  # by name: a number of each gradient step
+        # + Weight of the cloning term in this update
+        bc_coef = self.bc_coef(self._current_progress_remaining)  # type: ignore[operator]
+        # The terms of each gradient step, by name
+        history: dict[str, list[float]] = {}
 
-        def monitor(**values: th.Tensor) -> None:
-            for name, value in values.items():
-                monitored.setdefault(name, []).append(value.item())
+        def log(name: str, value: th.Tensor) -> None:
+            history.setdefault(name, []).append(value.item())
 
         for gradient_step in range(gradient_steps):
-            data: Any = self.replay_buffer.sample(
-                batch_size, env=self._vec_normalize_env
-            )  # + with the expert's actions
+            # Sample the replay buffer, + with the expert's actions where there are any
+            data: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             discounts = data.discounts if data.discounts is not None else self.gamma
             if self.use_sde:
                 self.actor.reset_noise()
 
             actions_pi, log_prob = self.actor.action_log_prob(data.observations)
             log_prob = log_prob.reshape(-1, 1)
-            mean = self.actor.action_dist.mode() if bc_coef > 0.0 else None  # +
+            # + The deterministic actions, before the distribution is that of the next states
+            mean = self.actor.action_dist.mode() if bc_coef > 0.0 else None
             warming_up = self._n_updates + gradient_step < self.critic_warmup  # +
 
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
@@ -246,55 +334,59 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
                 ent_coef_loss = -(
                     self.log_ent_coef * (log_prob + self.target_entropy).detach()
                 ).mean()
-                monitor(ent_coef_loss=ent_coef_loss)
+                log("ent_coef_loss", ent_coef_loss)
                 if not warming_up:
                     self.ent_coef_optimizer.zero_grad()
                     ent_coef_loss.backward()  # type: ignore[no-untyped-call]
                     self.ent_coef_optimizer.step()
             else:
                 ent_coef = self.ent_coef_tensor
-            monitor(ent_coef=ent_coef)
+            log("ent_coef", ent_coef)
 
+            # The Bellman backup: entropy of the next action included
             with th.no_grad():
                 next_actions, next_log_prob = self.actor.action_log_prob(data.next_observations)
                 next_q = self._least_q(self.critic_target, data.next_observations, next_actions)
                 next_values = next_q - ent_coef * next_log_prob.reshape(-1, 1)
                 targets = data.rewards + (1 - data.dones) * discounts * next_values
 
+            # Critic loss
             current = self.critic(data.observations, data.actions)
             critic_loss: Any = 0.5 * sum(F.mse_loss(q, targets) for q in current)
-            monitor(critic_loss=critic_loss)
-            if not np.isfinite(monitored["critic_loss"][-1]):  # +
-                advice = (
-                    "lower learning_rate, or look for rewards and observations that are not finite"
-                )
+            log("critic_loss", critic_loss)
+            if not np.isfinite(history["critic_loss"][-1]):  # +
                 raise TrainingError(
-                    f"the critic's loss is not finite after {self.num_timesteps} timesteps: {advice}"
+                    f"the critic's loss is not finite after {self.num_timesteps} timesteps: lower"
+                    " learning_rate, or look for rewards and observations that are not finite"
                 )
             self.critic.optimizer.zero_grad()
             critic_loss.backward()
             self.critic.optimizer.step()
 
-            if not warming_up:  # +
+            # Actor loss, + unless only the critic learns
+            if not warming_up:
                 q_pi = self._least_q(self.critic, data.observations, actions_pi)
                 actor_loss = (ent_coef * log_prob - q_pi).mean()
-                monitor(actor_loss=actor_loss)
+                log("actor_loss", actor_loss)
                 if mean is not None and isinstance(data, ExpertReplaySamples):  # +
-                    bc_loss, cloned = self._bc_loss(data.observations, mean, data.expert_actions)
+                    bc_loss, bc_share = self._bc_loss(data.observations, mean, data.expert_actions)
                     actor_loss = actor_loss + bc_coef * q_pi.detach().abs().mean() * bc_loss
-                    monitor(bc_loss=bc_loss, bc_share=cloned)
+                    log("bc_loss", bc_loss)
+                    log("bc_share", bc_share)
                 self.actor.optimizer.zero_grad()
-                own = [*self.actor.parameters()]
-                actor_loss.backward(inputs=own)  # type: ignore[no-untyped-call]  # + the critic needs no gradient of this loss
+                # + The critic needs no gradient of this loss.
+                parameters = [*self.actor.parameters()]
+                actor_loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
                 self.actor.optimizer.step()
 
+            # Update target networks
             if gradient_step % self.target_update_interval == 0:
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in monitored.items():
+        for name, values in history.items():
             self.logger.record(f"train/{name}", np.mean(values))
         if self._clones:  # +
             self.logger.record("train/bc_coef", bc_coef)
@@ -302,40 +394,33 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
     def _bc_loss(
         self, observations: Any, mean: th.Tensor, labels: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """The cloning term over the mini-batch, and the share of its rows that are cloned; the
-        others count as zero.
+        """Return the cloning term over the mini-batch, and the share of its rows that are cloned.
 
-        :param mean: the policy's mean actions, (b, dim), as ``labels`` the expert's.
+        Rows that are not cloned count as zero.
+
+        :param mean: the policy's mean actions, (b, action_dim).
+        :param labels: the expert's, likewise.
         """
-        errors = cloning_errors(
-            self.bc_loss, mean, mean, labels
-        )  # no kind of error here needs log_std
+        # No kind of error here needs log_std.
+        errors = cloning_errors(self.bc_loss, mean, mean, labels)
         kept = th.ones_like(errors, dtype=th.bool)
         with th.no_grad():
             if self.bc_filter == "q":
-                theirs, own = (
-                    self._least_q(self.critic, observations, each) for each in (labels, mean)
-                )
-                kept = (theirs > own).flatten()
+                q_expert = self._least_q(self.critic, observations, labels)
+                q_policy = self._least_q(self.critic, observations, mean)
+                kept = (q_expert > q_policy).flatten()
             elif self.bc_filter == "agreement":
                 kept = agree(mean, labels)
         return (errors * kept).mean(), kept.float().mean()
-
-    def _prepare_to_learn(self, anew: bool) -> None:
-        if self.will_clone() and self.expert is None:
-            raise ExpertError(
-                "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
-            )
-        if anew or self._last_obs is None:  # the environments begin anew
-            self._starts = self._labeller = None
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_labels", "_starts"]
 
 
 def _normalise_layers(critic: ContinuousCritic) -> None:
-    """Normalise what goes into each activation over its layer; nothing is learnt there, so a zip's
-    names stay those of SAC.
+    """Normalise the inputs of each activation over its layer.
+
+    Nothing is learnt there, so the names in a zip stay those of SAC.
     """
     networks: list[Any] = critic.q_networks
     for network in networks:

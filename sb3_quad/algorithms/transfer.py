@@ -1,4 +1,4 @@
-"""Starting from a trained agent: its policy and critic, in a new algorithm with a fresh optimiser."""
+"""Starting from a trained agent: its policy and critic in a new algorithm with a new optimiser."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -15,113 +15,128 @@ from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.zips import load_model
 
 
-def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
-    """Give ``model`` the policy and critic of an SB3 zip, of any algorithm with the same spaces and
-    networks.
+def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) -> None:
+    """Give ``model`` the policy and critic of another agent with the same spaces and networks.
 
-    An off-policy ``model`` also takes an agent with other networks, such as DAgger's: its actor is
-    made to imitate that, by :func:`clone_policy`, and its critic stays new. ``model`` then needs
+    An off-policy ``model`` also takes an agent with other networks, such as DAgger's. Its actor is
+    made to imitate that one by :func:`clone_policy`, and its critic stays new. ``model`` then needs
     its environment.
 
-    ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that
-    holds. The optimiser stays as it is, so a new model starts with a fresh one.
+    ``log_std`` comes from ``source``, unless the model's settings give a ``log_std_init``: then
+    that holds. The optimiser stays as it is, so a new model starts with a new one.
 
+    :param source: a model, or the path of an SB3 zip, of any algorithm.
     :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ;
         the message names them.
     """
-    try:
-        _, parameters, _ = load_from_zip_file(
-            path, load_data=False, device="cpu"
-        )  # unpickles nothing
-        theirs, ours = dict(parameters["policy"]), model.policy.state_dict()
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise ConfigError(f"{path}: not a complete SB3 zip ({one_line(error)})") from None
+    if isinstance(source, BaseAlgorithm):
+        name = f"the policy of {type(source).__name__}"
+        theirs = dict(source.policy.state_dict())
+    else:
+        name = str(source)
+        theirs = _saved_policy(source)
+    ours = model.policy.state_dict()
     if isinstance(model, OffPolicyAlgorithm) and theirs.keys() != ours.keys():
+        teacher = source if isinstance(source, BaseAlgorithm) else load_model(source)
         try:
-            clone_policy(load_model(path), model, seed=model.seed or 0)
+            clone_policy(teacher, model, seed=model.seed or 0)
         except ExpertError as error:  # other spaces
-            raise ConfigError(f"{path}: {error}") from None
+            raise ConfigError(f"{name}: {error}") from None
         return
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
-        raise ConfigError(f"{path}: holds parameters that are not finite")
+        raise ConfigError(f"{name}: holds parameters that are not finite")
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:
         theirs["log_std"] = ours["log_std"]
     try:
         model.policy.load_state_dict(theirs)
     except RuntimeError as error:
-        what = one_line(error).partition(": ")[2]
-        way_out = "train takes them from it unless --conf-file is given"
+        difference = one_line(error).partition(": ")[2]
         raise ConfigError(
-            f"{path}: environment spaces and policy_kwargs must be the same ({what}); {way_out}"
+            f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
+            " train takes them from it unless --conf-file is given"
         ) from None
 
 
-CLONE_ROWS = 20_000  # states that are flown for a clone, at least
-CLONE_FLIGHT = 500  # steps of each environment, at least
-CLONE_STEPS = 2_500  # of Adam
-CLONE_ROUNDS = 10  # of flying, then fitting
+def _saved_policy(path: str | Path) -> dict[str, th.Tensor]:
+    """Return the parameters of the policy in a zip; nothing is unpickled."""
+    try:
+        _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")
+        return dict(parameters["policy"])
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except Exception as error:  # what a damaged archive raises depends on where the damage is
+        raise ConfigError(f"{path}: not a complete SB3 zip ({one_line(error)})") from None
+
+
+# At least so many states are flown for a clone, and so many steps in each environment.
+CLONE_ROWS = 20_000
+CLONE_FLIGHT = 500
+# Steps of Adam, spread over so many rounds of flying, then fitting.
+CLONE_STEPS = 2_500
+CLONE_ROUNDS = 10
 CLONE_BATCH = 1024
-CLONE_RATE = 2e-3  # falls to a hundredth
-CLONE_LOG_STD = -2.0  # of a SAC actor without log_std_init; its sampled actions still fly
+# The learning rate falls to a hundredth of this.
+CLONE_RATE = 2e-3
+# Of a SAC actor without log_std_init. Its sampled actions still fly.
+CLONE_LOG_STD = -2.0
 
 
 def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> float:
-    """Let the actor of ``model``, SAC's or TD3's, imitate ``teacher`` on states that the two of
-    them fly in its environments.
+    """Let the actor of ``model``, SAC's or TD3's, imitate ``teacher`` in its environments.
 
-    A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped: no
-    weights can be copied, so they are fitted, by the squared error of the deterministic actions (an
-    error of their arctanh would be all about the limits). One half of the environments is flown by
-    the teacher, the other by the present clone, as in DAgger: the states that the clone itself gets
-    into are among those it learns from. The deviation of a SAC actor becomes e to the
-    ``log_std_init`` of its ``policy_kwargs`` everywhere, e^-2 without one. The environments are
-    reset afterwards by whoever learns.
+    A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped. So no
+    weights can be copied. They are fitted by the squared error of the deterministic actions; an
+    error of their arctanh would be all about the limits. One half of the environments is flown by
+    the teacher, the other by the present clone, as in DAgger, so that the clone learns from the
+    states that it gets into itself. The deviation of a SAC actor becomes e to the ``log_std_init``
+    of its ``policy_kwargs`` everywhere, e^-2 without one. Whoever learns next resets the
+    environments.
 
-    :param teacher: what :class:`~sb3_quad.controllers.controller.Controller` takes.
+    :param teacher: a source of :class:`~sb3_quad.controllers.controller.Controller`.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.
     """
-    env, policy, actor = model.get_env(), model.policy, cast(Any, model.actor)
+    env = model.get_env()
     assert env is not None
-    n, expert, rng = env.num_envs, Controller.for_env(teacher, env), np.random.default_rng(seed)
+    policy: Any = model.policy
+    actor = cast(Any, model.actor)
+    n = env.num_envs
+    expert = Controller.for_env(teacher, env)
+    rng = np.random.default_rng(seed)
     flown_by_teacher = (np.arange(n) % 2 == 0)[:, None]
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
-    states: list[Any] = []  # (n, ...) of each step
-    targets: list[
-        Any
-    ] = []  # the teacher's actions in them as the actor gives its own, (n, actions)
+    # Of each step: the observations (n, ...), and the teacher's actions as the actor gives them.
+    states: list[Any] = []
+    targets: list[Any] = []
     errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)
     for step in range(steps):
         labels = expert.labels(observation, begins)
+        scaled: Any = policy.scale_action(labels.reshape(n, *actor.action_space.shape))
         states.append(observation)
-        targets.append(
-            policy.scale_action(labels.reshape(n, *env.action_space.shape)).reshape(n, -1)
-        )  # type: ignore[misc]
+        targets.append(scaled.reshape(n, -1))
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
-        if (step + 1) * CLONE_ROUNDS // steps == step * CLONE_ROUNDS // steps:
+        is_round_over = (step + 1) * CLONE_ROUNDS // steps > step * CLONE_ROUNDS // steps
+        if not is_round_over:
             continue
-        inputs, outputs = (
-            th.as_tensor(np.concatenate(part), device=model.device) for part in (states, targets)
-        )
+        # Fit all that has been flown so far.
+        inputs = th.as_tensor(np.concatenate(states), device=model.device)
+        outputs = th.as_tensor(np.concatenate(targets), device=model.device)
         for _ in range(CLONE_STEPS // CLONE_ROUNDS):
             for group in optimiser.param_groups:
                 group["lr"] = CLONE_RATE * max(1.0 - len(errors) / CLONE_STEPS, 0.01)
             rows = th.as_tensor(rng.integers(len(inputs), size=CLONE_BATCH), device=model.device)
-            loss = (
-                (policy._predict(inputs[rows], deterministic=True) - outputs[rows]).square().mean()
-            )
+            predicted = policy._predict(inputs[rows], deterministic=True)
+            loss = (predicted - outputs[rows]).square().mean()
             optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             optimiser.step()
             errors.append(loss.item())
     if hasattr(policy, "actor_target"):  # TD3's
-        cast(Any, policy).actor_target.load_state_dict(actor.state_dict())
+        policy.actor_target.load_state_dict(actor.state_dict())
     if isinstance(getattr(actor, "log_std", None), th.nn.Linear):
         with th.no_grad():
             actor.log_std.weight.zero_()

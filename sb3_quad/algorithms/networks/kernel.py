@@ -1,10 +1,9 @@
-"""Multilayer perceptrons, forward and backward, compiled: blocks of rows go through all layers
-while they are in the cache.
+"""Multilayer perceptrons, forward and backward, compiled.
 
-A block holds ``ROWS`` rows of the mini-batch side by side, (width, ROWS), so that every loop over
-rows is a vector loop. Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a
-row: weights (outputs, inputs), then biases. A chunk is a number of blocks; whichever thread
-computes it, its sums are the same.
+Blocks of rows go through all layers while they are in the cache. A block holds ``ROWS`` rows of the
+mini-batch side by side, (width, ROWS), so that every loop over rows is a vector loop. Widths are
+padded to multiples of 4 with zeros. A layer's parameters lie in a row: weights (outputs, inputs),
+then biases. A chunk is a number of blocks; whichever thread computes it, its sums are the same.
 """
 
 from typing import NamedTuple
@@ -16,14 +15,16 @@ from sb3_quad.algorithms.networks.losses import actor_loss, auxiliary_loss, crit
 from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.simulation.compiled import compiled
 
-# Of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes
-# with it
+# Rows of a block: long loops, and yet a layer of 64 and its gradients fit into half a megabyte
 ROWS = 256
 LINEAR, TANH, RELU = range(3)
 _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
-_TILE = np.uint64(16)  # inputs at once: their rows stay in the first cache
-_FAST = {"reassoc", "contract", "nsz"}  # not "nnan": what is not finite must stay so
-_END = np.float32(7.90531110763549805)  # beyond, float32's tanh is 1
+# Inputs at once: their rows stay in the first cache
+_TILE = np.uint64(16)
+# Not "nnan": NaN and infinity must stay what they are
+_FAST = {"reassoc", "contract", "nsz"}
+# Beyond, float32's tanh is 1
+_END = np.float32(7.90531110763549805)
 
 
 class Layers(NamedTuple):
@@ -44,10 +45,9 @@ class Layers(NamedTuple):
 @compiled(fastmath=_FAST)
 def _multiply(w, x, h):
     """h = w x; w (rows, columns), x (columns, ROWS), h (rows, ROWS)."""
-    rows, columns = (
-        uint64(w.shape[0]),
-        uint64(w.shape[1]),
-    )  # unsigned: Python's indices from the end would cost a third
+    # Unsigned: Python's indices from the end would cost a third.
+    rows = uint64(w.shape[0])
+    columns = uint64(w.shape[1])
     for tile in range(_0, columns, _TILE):
         for j in range(_0, rows, _2):
             for k in range(tile, min(columns, tile + _TILE), _4):
@@ -73,14 +73,16 @@ def _multiply(w, x, h):
 @compiled(fastmath=_FAST)
 def _add_products(g, x, dw):
     """dw += g xᵀ; g (rows, ROWS), x (columns, ROWS), dw (rows, columns)."""
-    rows, columns = uint64(dw.shape[0]), uint64(dw.shape[1])
+    rows = uint64(dw.shape[0])
+    columns = uint64(dw.shape[1])
     for tile in range(_0, columns, _TILE):
         for j in range(_0, rows, _2):
             for k in range(tile, min(columns, tile + _TILE), _4):
                 a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = float32(0.0)
                 for i in range(ROWS):
                     x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
-                    g0, g1 = g[j, i], g[j + _1, i]
+                    g0 = g[j, i]
+                    g1 = g[j + _1, i]
                     a0 += g0 * x0
                     a1 += g0 * x1
                     a2 += g0 * x2
@@ -98,8 +100,9 @@ def _add_products(g, x, dw):
 
 @compiled(fastmath=_FAST)
 def _activate(h, bias, kind):
-    """h = f(h + bias), (rows, ROWS). tanh is the quotient of polynomials that Eigen uses, exact to
-    4e-7.
+    """h = f(h + bias), (rows, ROWS).
+
+    tanh is the quotient of polynomials that Eigen uses, exact to 4e-7.
     """
     for j in range(h.shape[0]):
         b = bias[j]
@@ -117,7 +120,8 @@ def _activate(h, bias, kind):
                 q = float32(1.19825839466702e-06) * s + float32(1.18534705686654e-04)
                 q = q * s + float32(2.26843463243900e-03)
                 q = q * s + float32(4.89352518554385e-03)
-                h[j, i] = u * p / q + float32(0.0) * x  # what is not finite goes on as NaN
+                # The last term lets NaN and infinity come out as NaN.
+                h[j, i] = u * p / q + float32(0.0) * x
         elif kind == RELU:
             for i in range(ROWS):
                 x = h[j, i] + b
@@ -129,8 +133,9 @@ def _activate(h, bias, kind):
 
 @compiled(fastmath=_FAST)
 def _undo_activation(g, h, kind, db):
-    """g = g f'(x), by h = f(x), both (rows, ROWS); db (rows,) += its sums over the rows of the
-    mini-batch.
+    """g = g f'(x) with h = f(x), both (rows, ROWS).
+
+    db (rows,) += the sums of g over the rows of the mini-batch.
     """
     for j in range(g.shape[0]):
         total = float32(0.0)
@@ -154,8 +159,9 @@ def _touch(rows, index, first, count):
 
 @compiled
 def _load(rows, index, first, count, h):
-    """Gather ``count`` rows of (m, size), from ``first`` on in ``index``, into a block (width,
-    ROWS), zeros around them.
+    """Gather ``count`` rows of (m, size), from ``first`` on in ``index``, into a block.
+
+    The block is (width, ROWS), with zeros around the rows.
     """
     h[0, 0] = _touch(rows, index, first, count)
     for k in range(h.shape[0]):
@@ -169,25 +175,26 @@ def _load(rows, index, first, count, h):
 
 @compiled
 def _layer(scratch, at, width):
-    """The ``width`` units of a layer that begin at a place in the scratch memory: (width, ROWS)."""
+    """Return the ``width`` units of a layer at a place in the scratch memory, (width, ROWS)."""
     return scratch[at : at + width * ROWS].reshape(width, ROWS)
 
 
 @compiled
 def _forward(scratch, x, index, first, count, layers):
-    """Compute all layers of a block, which lie behind one another, the inputs first; returns where
-    the outputs begin.
+    """Compute all layers of a block, which lie behind one another, the inputs first.
+
+    :return: where the outputs begin.
     """
     widths, kinds, parameters, _ = layers
     _load(x, index, first, count, _layer(scratch, 0, widths[0]))
-    at = place = 0
+    at = 0
+    place = 0
     for layer in range(1, len(widths)):
-        rows, columns = widths[layer], widths[layer - 1]
-        before, at, middle = (
-            _layer(scratch, at, columns),
-            at + columns * ROWS,
-            place + rows * columns,
-        )
+        rows = widths[layer]
+        columns = widths[layer - 1]
+        before = _layer(scratch, at, columns)
+        at += columns * ROWS
+        middle = place + rows * columns
         h = _layer(scratch, at, rows)
         _multiply(parameters[place:middle].reshape(rows, columns), before, h)
         _activate(h, parameters[middle : middle + rows], kinds[layer - 1])
@@ -197,16 +204,20 @@ def _forward(scratch, x, index, first, count, layers):
 
 @compiled
 def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, terms):
-    """Add to ``sums`` the gradient by the parameters of a block whose outputs begin at ``at``.
+    """Add the gradient of a block by the parameters to ``sums``.
 
-    The outputs' gradient lies behind the layers; from there on, two layers' gradients take turns.
-    That of the auxiliary loss, an actor's, is added on the way.
+    The block's outputs begin at ``at``, and their gradient lies behind the layers. From there on,
+    two layers' gradients take turns. That of an actor's auxiliary loss is added on the way.
     """
     widths, kinds, _, transposed = layers
-    here, there, place = widths.sum() * ROWS, (widths.sum() + widths.max()) * ROWS, len(sums)
+    here = widths.sum() * ROWS
+    there = (widths.sum() + widths.max()) * ROWS
+    place = len(sums)
     for layer in range(len(widths) - 1, 0, -1):
-        rows, columns = widths[layer], widths[layer - 1]
-        g, h = _layer(scratch, here, rows), _layer(scratch, at, rows)
+        rows = widths[layer]
+        columns = widths[layer - 1]
+        g = _layer(scratch, here, rows)
+        h = _layer(scratch, at, rows)
         at -= columns * ROWS
         place -= rows * (columns + 1)
         middle = place + rows * columns
@@ -217,15 +228,17 @@ def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, 
                 transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns)
             )
             if a > 0 and layer - 1 == loss.aux_layer:
-                hidden, its = _layer(scratch, at, columns), _layer(scratch, there, columns)
-                auxiliary_loss(hidden, index, first, count, targets, loss, a, its, terms)
+                hidden = _layer(scratch, at, columns)
+                g_hidden = _layer(scratch, there, columns)
+                auxiliary_loss(hidden, index, first, count, targets, loss, a, g_hidden, terms)
             here, there = there, here
 
 
 @compiled
 def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
-    """The outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs), into ``out``, for some
-    of all ``chunks``.
+    """Write the outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs) into ``out``.
+
+    It does so for the chunks from ``first_chunk`` to ``last_chunk`` of all ``chunks``.
 
     :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each unit of
         all layers, and twice for the widest layer's gradients.
@@ -247,10 +260,10 @@ def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
 def gradient(
     first_chunk, last_chunk, chunks, scratch, layers, x, index, targets, loss, log_std, sums, terms
 ):
-    """The gradient of a loss (:mod:`.losses`) by all parameters; a block stays in the cache for its
-    way forth and back.
+    """Write the gradient of a loss (:mod:`.losses`) by all parameters into ``sums``.
 
-    As :func:`forward`, and:
+    A block stays in the cache for its way forth and back. Further arguments are as for
+    :func:`forward`.
 
     :param targets: (m, columns) of the loss, of the same rows.
     :param loss: :class:`~sb3_quad.algorithms.networks.losses.Loss`.
@@ -258,8 +271,11 @@ def gradient(
     :param sums: float32 (chunks, parameters + a), the gradient of each chunk.
     :param terms: float64 (chunks, TERMS), likewise, the loss's terms.
     """
-    n, size, outputs = len(index), len(layers.parameters), layers.widths[-1]
-    blocks, behind = (n + ROWS - 1) // ROWS, layers.widths.sum() * ROWS
+    n = len(index)
+    size = len(layers.parameters)
+    outputs = layers.widths[-1]
+    blocks = (n + ROWS - 1) // ROWS
+    behind = layers.widths.sum() * ROWS
     for chunk in range(first_chunk, last_chunk):
         sums[chunk, :] = 0.0
         terms[chunk, :] = 0.0
@@ -267,34 +283,17 @@ def gradient(
             first = block * ROWS
             count = min(ROWS, n - first)
             at = _forward(scratch, x, index, first, count, layers)
-            y, g = _layer(scratch, at, outputs), _layer(scratch, behind, outputs)
+            y = _layer(scratch, at, outputs)
+            g = _layer(scratch, behind, outputs)
             g[:, :] = 0.0
             g[0, 0] = 0.0 * _touch(targets, index, first, count)
+            g_log_std = sums[chunk, size:]
             if len(log_std) > 0:
                 actor_loss(
-                    y,
-                    index,
-                    first,
-                    count,
-                    targets,
-                    loss,
-                    log_std,
-                    g,
-                    sums[chunk, size:],
-                    terms[chunk],
+                    y, index, first, count, targets, loss, log_std, g, g_log_std, terms[chunk]
                 )
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
-            _backward(
-                scratch,
-                at,
-                layers,
-                sums[chunk, :size],
-                index,
-                first,
-                count,
-                targets,
-                loss,
-                len(log_std),
-                terms[chunk],
-            )
+            own = sums[chunk, :size]
+            a = len(log_std)
+            _backward(scratch, at, layers, own, index, first, count, targets, loss, a, terms[chunk])

@@ -1,10 +1,13 @@
-"""The losses of Eqs. 4.3 and 4.4, each as tensors for PyTorch's autograd and, beside it, compiled
-with its derivatives.
+"""The losses of Eqs. 4.3 and 4.4: tensors for autograd, and the same compiled with derivatives.
 
-In shapes, ``b`` is the mini-batch, ``a`` the action dimension. A target is a row of numbers. Of an
-actor: the expert's action, if there is a cloning term; then, if there is a policy term, the action
-flown, its log-probability then, and its advantage; or then, if there is an auxiliary term, what the
-first units of a hidden layer are to say. Of a critic: V when the rollout was flown, and the return.
+In shapes, ``b`` is the mini-batch, ``a`` the action dimension. Compiled losses read their targets
+from rows of numbers. A row for an actor holds, as far as the loss has such a term:
+
+- the cloning term: the expert's action (a);
+- the policy term: the action flown (a), its log-probability then, its advantage;
+- the auxiliary term: what the first units of a hidden layer should predict.
+
+A row for a critic holds V from when the rollout was flown, and the return.
 """
 
 import math
@@ -20,27 +23,28 @@ from sb3_quad.simulation.compiled import compiled
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
 CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
 MSE, NLL, HUBER, HUBER_MSE = range(4)
-BC_FILTERS = ("none", "agreement")
-AGREEMENT = 1
-HUBER_DELTA = (
-    0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
-)
-MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
-# Root mean squared difference of actions up to which "agreement" clones; the range of an action
-# is 2
+CloningFilter = Literal["none", "agreement", "q"]
+BC_FILTERS: tuple[CloningFilter, ...] = ("none", "agreement", "q")
+"""Where to clone. ``"q"`` needs critics of actions, which SACBC alone has."""
+AGREEMENT = BC_FILTERS.index("agreement")
+# The range of an action is 2. "huber" grows linearly from this error on.
+HUBER_DELTA = 0.05
+# Weight of the squared error in "huber_mse".
+MSE_WEIGHT = 3.0
+# "agreement" clones up to this root mean squared difference of actions.
 NEAR = 0.3
 CLONING, POLICY, KL, CLIPPED, AUXILIARY, TERMS = range(6)
-"""What compiled losses add up: terms of the actor. A critic has one only, ``VALUE``."""
+"""The sums that a compiled actor's loss adds up to. A critic's has one only, ``VALUE``."""
 VALUE = 0
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Loss(NamedTuple):
-    """Weights and constants of a loss, under the names of the algorithms' arguments.
+    """Weights and constants of a compiled loss, under the names of the algorithms' arguments.
 
-    ``policy_coef`` weighs PPO's clipped surrogate. ``bc_loss`` and ``bc_filter`` are places in
+    ``policy_coef`` weighs PPO's clipped surrogate. ``bc_loss`` and ``bc_filter`` are indices of
     ``CLONING_LOSSES`` and ``BC_FILTERS``. ``aux_layer`` counts hidden layers from 1; 0: no
-    auxiliary term. An infinite ``clip_range_vf`` clips nothing. Normalised, an advantage is
+    auxiliary term. An infinite ``clip_range_vf`` clips nothing. A normalised advantage is
     (advantage - ``advantage_shift``) * ``advantage_scale``.
     """
 
@@ -61,41 +65,57 @@ class Loss(NamedTuple):
     advantage_scale: float = 1.0
 
 
+def weighted_sum(loss: Loss, terms: dict[str, float]) -> float:
+    """Return the loss that terms with logged names add up to."""
+    return (
+        loss.policy_coef * terms.get("policy_gradient_loss", 0.0)
+        + loss.bc_coef * terms.get("bc_loss", 0.0)
+        + loss.aux_coef * terms.get("aux_loss", 0.0)
+        + loss.vf_coef * terms.get("value_loss", 0.0)
+        + loss.ent_coef * terms.get("entropy_loss", 0.0)
+        + loss.l2_coef * terms.get("l2_loss", 0.0)
+    )
+
+
 def cloning_errors(
     kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor
 ) -> th.Tensor:
-    """How far the policy is from the expert's ``actions`` (b, a), by row, (b,); L_BC is the mean
-    over the rows.
+    """Return how far the policy is from the expert's ``actions`` (b, a), by row, (b,).
 
-    ``"nll"``: Eq. 3.12, the negative log-likelihood, a sum over the action's dimensions; it also
-    shrinks the standard deviation towards the error that is left. The others are means over the
-    dimensions and leave the deviation alone. ``"mse"``: squared. ``"huber"``: half the squared
-    error up to 0.05, linear beyond, in units of 0.05: a tumble, where little can be learnt from
-    noise, takes less of the gradient. ``"huber_mse"``: that and three times the squared error.
+    L_BC is the mean over the rows. ``"nll"`` is Eq. 3.12, the negative log-likelihood, a sum over
+    the action's dimensions; it also shrinks the standard deviation towards the error that is left.
+    The others are means over the dimensions and leave the deviation alone. ``"mse"``: squared.
+    ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. A tumble, where
+    little can be learnt from noise, then takes less of the gradient. ``"huber_mse"``: that and
+    three times the squared error.
     """
     if kind == "nll":
         return gaussian_nll(mean, log_std, actions)
     squared = (mean - actions).square().mean(dim=1)
     if kind == "mse":
         return squared
-    huber = (
-        F.huber_loss(mean, actions, delta=HUBER_DELTA, reduction="none").mean(dim=1) / HUBER_DELTA
-    )
+    errors = F.huber_loss(mean, actions, delta=HUBER_DELTA, reduction="none")
+    huber = errors.mean(dim=1) / HUBER_DELTA
     return huber if kind == "huber" else huber + MSE_WEIGHT * squared
 
 
 @compiled
 def cloning_error(kind, error, log_std):
-    """The same compiled, for one dimension of an action: its error, and the derivatives of that by
-    mean and by log_std.
+    """Return the error of one dimension of an action and its derivatives by mean and log_std.
 
-    But for ``"nll"``, all three are yet to be divided by the action's dimension.
+    It is :func:`cloning_errors` compiled. For all kinds but ``"nll"``, the caller divides the three
+    by the action's dimension.
     """
     if kind == NLL:
         z = error * math.exp(-log_std)
         return 0.5 * z * z + log_std + _HALF_LOG_2PI, z * math.exp(-log_std), 1.0 - z * z
-    weight = 1.0 if kind == MSE else MSE_WEIGHT if kind == HUBER_MSE else 0.0
-    value, slope = weight * error * error, 2.0 * weight * error
+    weight = 0.0
+    if kind == MSE:
+        weight = 1.0
+    elif kind == HUBER_MSE:
+        weight = MSE_WEIGHT
+    value = weight * error * error
+    slope = 2.0 * weight * error
     if kind in (HUBER, HUBER_MSE):
         steep = error / HUBER_DELTA
         value += 0.5 * error * steep if abs(steep) <= 1.0 else abs(error) - 0.5 * HUBER_DELTA
@@ -104,60 +124,60 @@ def cloning_error(kind, error, log_std):
 
 
 def gaussian_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """-log π(a|s) of a diagonal Gaussian, (b,), summed over the action's dimensions."""
+    """Return -log π(a|s) of a diagonal Gaussian, (b,), summed over the action's dimensions."""
     scaled = (actions - mean) * th.exp(-log_std)
     return (0.5 * scaled.square() + log_std + _HALF_LOG_2PI).sum(dim=1)
 
 
 def gaussian_entropy(log_std: th.Tensor) -> th.Tensor:
-    """H of a diagonal Gaussian, a scalar: the same in every state, because the standard deviation
-    is (Eq. 4.2).
+    """Return H of a diagonal Gaussian, a scalar.
+
+    It is the same in every state because the standard deviation is (Eq. 4.2).
     """
     return (log_std + 0.5 + _HALF_LOG_2PI).sum()
 
 
 def agree(mean: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Where policy and expert are near enough to one another for the filter ``"agreement"``, bool
-    (b,).
-    """
+    """Return where policy and expert are near enough for the filter ``"agreement"``, bool (b,)."""
     return (mean - actions).square().mean(dim=1) < NEAR**2
 
 
-def value_loss(
-    values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, loss: Loss
+def max_clipped_value_loss(
+    values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range: float
 ) -> th.Tensor:
-    """The critic's loss, a scalar, of (b,) each: V(s) now, V(s) when the rollout was flown, and Ĝ
-    of Eq. 3.11.
+    """Return the critic's loss by Eq. 3.8, a scalar: the larger of clipped and unclipped error.
 
-    Clipped by ``clip_range_vf``, it is SB3's. With ``max_clipped_value`` it is Eq. 3.8, the larger
-    of the clipped and the unclipped error, so that leaving the clip range is never rewarded.
+    So leaving the clip range is never rewarded.
+
+    :param values: V(s) now, (b,).
+    :param old_values: V(s) when the rollout was flown, (b,).
+    :param returns: Ĝ of Eq. 3.11, (b,).
     """
-    if math.isinf(loss.clip_range_vf):
-        return F.mse_loss(returns, values)
-    clipped = old_values + (values - old_values).clamp(-loss.clip_range_vf, loss.clip_range_vf)
-    if not loss.max_clipped_value:
-        return F.mse_loss(returns, clipped)
+    clipped = old_values + th.clamp(values - old_values, -clip_range, clip_range)
     return th.max((values - returns).square(), (clipped - returns).square()).mean()
 
 
 def l2_loss(parameters: list[th.nn.Parameter]) -> th.Tensor:
-    """½ Σ w² over the weight matrices of actor and critic (Eq. 2.25), a scalar; biases and log_std
-    are left out.
+    """Return ½ Σ w² over the weight matrices of actor and critic (Eq. 2.25), a scalar.
+
+    Biases and log_std take no part.
     """
-    return (
-        0.5 * th.stack([weights.square().sum() for weights in parameters if weights.ndim > 1]).sum()
-    )
+    sums = [weights.square().sum() for weights in parameters if weights.ndim > 1]
+    return 0.5 * th.stack(sums).sum()
 
 
 @compiled
 def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, terms):
-    """Of ``count`` rows of a mini-batch from ``first`` on: adds to the gradient by the means and by
-    log_std, and to the terms.
+    """Add an actor's loss over ``count`` rows of a mini-batch, from ``first`` on, to the terms.
+
+    Its gradient is added to ``g`` by the means and to ``g_log_std`` by log_std.
 
     :param mean: (a, ROWS), and so is ``g``.
     """
-    n, a = len(index), len(log_std)
-    flown = targets.shape[1] - a - 2  # the first of the policy term's columns
+    n = len(index)
+    a = len(log_std)
+    # The first column of the policy term.
+    flown = targets.shape[1] - a - 2
     for i in range(count):
         target = targets[index[first + i]]
         if loss.bc_coef != 0.0:
@@ -184,7 +204,8 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
             terms[POLICY] -= min(advantage * ratio, advantage * bounded)
             terms[KL] += ratio - 1.0 - change
             terms[CLIPPED] += abs(ratio - 1.0) > loss.clip_range
-            if not advantage * ratio > advantage * bounded:  # NaN, too, goes on
+            # Written so that NaN passes, too.
+            if not advantage * ratio > advantage * bounded:
                 slope = -loss.policy_coef / n * advantage * ratio
                 for k in range(a):
                     z = (np.float64(target[flown + k]) - mean[k, i]) * math.exp(-log_std[k])
@@ -194,8 +215,9 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
 
 @compiled
 def auxiliary_loss(hidden, index, first, count, targets, loss, a, g, terms):
-    """As :func:`actor_loss`, for a hidden layer (width, ROWS), whose first units are to say what
-    follows the action.
+    """Add the auxiliary loss, as :func:`actor_loss` does.
+
+    The first units of a hidden layer (width, ROWS) should predict the targets behind the action.
     """
     k = targets.shape[1] - a
     for i in range(count):
@@ -210,17 +232,22 @@ def auxiliary_loss(hidden, index, first, count, targets, loss, a, g, terms):
 
 @compiled
 def critic_loss(value, index, first, count, targets, loss, g, terms):
-    """As :func:`actor_loss`, for values (1, ROWS)."""
+    """Add a critic's loss for values (1, ROWS), as :func:`actor_loss` does."""
     n = len(index)
     for i in range(count):
         target = targets[index[first + i]]
-        old, goal, now = np.float64(target[0]), np.float64(target[1]), np.float64(value[0, i])
+        old = np.float64(target[0])
+        goal = np.float64(target[1])
+        now = np.float64(value[0, i])
         bounded = old + min(max(now - old, -loss.clip_range_vf), loss.clip_range_vf)
-        error, clipped = now - goal, bounded - goal
+        error = now - goal
+        clipped = bounded - goal
         inside = 1.0 if abs(now - old) <= loss.clip_range_vf else 0.0
         if loss.max_clipped_value and not clipped * clipped > error * error:
-            clipped, inside = error, 1.0
+            clipped = error
+            inside = 1.0
         if not math.isfinite(loss.clip_range_vf):
-            clipped, inside = error, 1.0
+            clipped = error
+            inside = 1.0
         terms[VALUE] += clipped * clipped
         g[0, i] += float32(loss.vf_coef / n * 2.0 * clipped * inside)

@@ -1,0 +1,23 @@
+"""The type of everything that can be an expert."""
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeAlias
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_quad.base.arrays import Float32Array
+from sb3_quad.simulation.state import QuadcopterState
+
+
+class StateExpert(Protocol):
+    """An expert that sees the true state, such as ``PIDExpert``."""
+
+    def actions(self, state: QuadcopterState, /) -> Float32Array:
+        """Return actions in [-1, 1], (n, 4), for the true state of n vehicles."""
+
+
+ExpertLike: TypeAlias = StateExpert | BaseAlgorithm | Callable[[Any], Any] | str
+"""An expert on the true state, an SB3 model, or a function from observations to actions.
+
+Or a name as :func:`~sb3_quad.controllers.resolve.resolve_expert` takes it, such as ``"pid"``.
+"""
