@@ -13,7 +13,7 @@ G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 
 # The yaw gain is this many times larger where the external torque is known. An error in the moment
 # that compensates it then makes a smaller yaw rate.
-_PRIVILEGED_YAW = 4.0
+PRIVILEGED_YAW = 4.0
 # Command lags, s, from which on the factors of ``late`` begin to act and act fully.
 _LATE_FROM = 0.085
 _LATE_TO = 0.125
@@ -138,7 +138,7 @@ class TrueConstants:
         self._control_step = vehicle.control_step
         derived = gains_by_authority(vehicle.parameters()[:, None], vehicle.control_step)
         self._scale = gains.values()[:, None] / derived
-        self._scale[G.yaw_rate] *= _PRIVILEGED_YAW
+        self._scale[G.yaw_rate] *= PRIVILEGED_YAW
         self._late = np.array([[late.get(name, 1.0)] for name in GAIN_NAMES])
         self._seen = np.empty((0, 0))
 
