@@ -132,7 +132,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
-    | `task` | by id | a name, a :class:`~sb3_quad.simulation.tasks.Task`, or a mixture `{name: weight}` |
+    | `task` | by id | a name such as `"thesis_recovery"`, a :class:`~sb3_quad.simulation.tasks.Task`, or a mixture `{name: weight}` |
     | `task_kwargs` | `None` | fields of the task to override |
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.vehicles.vehicle.Vehicle` |
     | `rotor_layout` | `None` | a vehicle whose order of the rotors is kept: body axes and rotors of `vehicle` turn to it |

@@ -23,10 +23,11 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, network, policy
-from sb3_quad.export.check import Reference, physical_features
+from sb3_quad.export.check import Reference
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
 from sb3_quad.export.network import StatefulNetwork, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
+from sb3_quad.simulation.kernel import physical_features
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 

@@ -16,8 +16,8 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.export.check import physical_features
 from sb3_quad.export.policy import export_policy
+from sb3_quad.simulation.kernel import physical_features
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM, CRAZYFLIE = load_vehicle("itm"), load_vehicle("crazyflie")

@@ -14,7 +14,8 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.frames import ObservationSettings
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.kernel import physical_features
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, turn_features
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import Task
@@ -56,14 +57,7 @@ class Reference(NamedTuple):
     @property
     def turned_features(self) -> FloatArray:
         """(18, 18), from features in the vehicle's own body frame to those that the policy knows."""
-        matrix, axes = np.eye(OBSERVATION_SIZE), self.turn.axes
-        for group, block in (
-            ("rotation", np.kron(axes, np.eye(3))),
-            ("velocity", axes),
-            ("body_rates", axes),
-        ):
-            matrix[GROUPS[group], GROUPS[group]] = block
-        return matrix
+        return turn_features(self.turn)
 
     @property
     def own_mean(self) -> FloatArray:
@@ -170,13 +164,3 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
         difference = f"differs from the trained one by {comparison.error:.3g}, {allowed:.3g} is allowed ({by})"
         raise ExportError(f"the exported policy {difference}; nothing was written")
     return comparison
-
-
-def physical_features(state: QuadcopterState) -> Float32Array:
-    """The features of the true state, (n, 18), as :data:`~sb3_quad.simulation.observation.FEATURES`
-    lists them.
-    """
-    to_body = state.rotation.transpose(0, 2, 1)
-    velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
-    parts = (state.position - state.target, to_body.reshape(-1, 9), velocity, state.body_rates)
-    return np.concatenate(parts, axis=1).astype(np.float32)

@@ -29,7 +29,7 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.tasks import TASKS
+from sb3_quad.simulation.tasks import TASK_NAMES
 from sb3_quad.training.algorithms import (
     constructor_parameters,
     get_algorithm,
@@ -224,7 +224,7 @@ class TrainingConfig(Frozen):
     def _known_tasks(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if value and info.data["env_id"] not in ENVIRONMENTS:
             raise ConfigError(f"{info.data['env_id']} has no tasks; leave it out")
-        return tuple(_one_of(TASKS, name, info) for name in value)
+        return tuple(_one_of(TASK_NAMES, name, info) for name in value)
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
