@@ -140,7 +140,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
-    | `task` | by id | a name, a `Task`, or a mixture `{name: weight}` |
+    | `task` | by id | a name such as `"thesis_recovery"`, a `Task`, or a mixture `{name: weight}` |
     | `task_kwargs` | `None` | fields of the task to override |
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a `Vehicle` |
     | `rotor_layout` | `None` | the vehicle whose axes and rotor order the agent knows |

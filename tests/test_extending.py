@@ -26,6 +26,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
 from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.export.policy import export_policy
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import FEATURE_NAMES
 from sb3_quad.simulation.settings import FlightSettings
@@ -67,6 +68,9 @@ found["command"] = main(["vehicles"])
 worlds = {"mass": [0.7, 1.3], "force": [0, 3], "gusts": {"std": 1.0}, "delay": [1, 3]}
 env = QuadcopterVecEnv(70, task="recovery_and_tracking", randomize=worlds, history=[0, 1], last_action=True)
 model = DAgger("MlpPolicy", env, expert=GeometricExpert(), n_steps=20, batch_size=600, n_epochs=2, seed=0).learn(2 * 70 * 20)
+model.save("extended")
+exported = export_policy("extended.zip", "torchscript", n_observations=2000)
+found["exported"] = len(exported.content) > 0
 found["weights"] = hashlib.sha256(b"".join(part.numpy().tobytes() for part in model.policy.state_dict().values())).hexdigest()
 print(json.dumps(found))
 """
@@ -141,5 +145,6 @@ def test_the_extended_package_flies_as_pybullet_does(extended):
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["state"] < 1e-9 and found["reward"] < 1e-9 and found["term"] < 1e-12
     assert found["feature"] < 1e-6 and found["observation"] < 1e-6  # float32
+    assert found["exported"]
     assert found["size"] == 22 and found["expert"] < 1e-6 and found["command"] == 0
     assert "trainer_quad: 1.2 kg" in done.stdout

@@ -12,7 +12,14 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.kernel import physical_features
+from sb3_quad.simulation.observation import (
+    DEFAULT_STD,
+    FEATURE_NAMES,
+    GROUPS,
+    OBSERVATION_SIZE,
+    turn_features,
+)
 from sb3_quad.simulation.random import EPISODE, STEP, philox
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import (
@@ -23,8 +30,9 @@ from sb3_quad.simulation.state import (
     TARGET,
     VELOCITY,
     QuadcopterState,
+    at_rest,
 )
-from sb3_quad.simulation.tasks import SCORED, TASK, T, Task, resolve_tasks
+from sb3_quad.simulation.tasks import SCORED, TASK, T, Task, in_words, resolve_tasks
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
@@ -116,8 +124,39 @@ def test_features_in_their_order():
         axis=1,
     )
     np.testing.assert_allclose(observations(rows, 0.0), expected / DEFAULT_STD, atol=1e-6)
+    np.testing.assert_allclose(physical_features(state), expected, rtol=1e-6, atol=1e-6)
     assert len(FEATURE_NAMES) == OBSERVATION_SIZE == 18
     assert FEATURE_NAMES[GROUPS["body_rates"]] == ("body_rate_x", "body_rate_y", "body_rate_z")
+
+
+def test_features_at_rest_at_the_target():
+    headings = np.array([0.0, 0.5, -3.0])
+    state = at_rest(headings, ITM.hover_rotor_speed)
+    features = physical_features(state)
+    cosine, sine, zero, one = np.cos(headings), np.sin(headings), np.zeros(3), np.ones(3)
+    rotation = [cosine, sine, zero, -sine, cosine, zero, zero, zero, one]
+    np.testing.assert_allclose(features[:, GROUPS["rotation"]], np.transpose(rotation), atol=1e-6)
+    for group in ("position", "velocity", "body_rates"):
+        assert not features[:, GROUPS[group]].any()
+    np.testing.assert_array_equal(state.rotor_speeds, np.full((3, 4), ITM.hover_rotor_speed))
+
+
+@pytest.mark.parametrize("name", ["hummingbird", "crazyflie"])
+def test_turned_features_are_those_of_the_turned_vehicle(name):
+    """A body whose axes are turned about z sees the same flight in its own axes."""
+    turn = load_vehicle(name).turn_to(ITM)
+    state = QuadcopterState(start(50, "recovery_and_tracking", seed=2).state)
+    turned = state.copy()
+    angle = -turn.angle / 2.0
+    w, x, y, z = state.array[QUATERNION]
+    c, s = math.cos(angle), math.sin(angle)
+    turned.array[QUATERNION] = (w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s)
+    turned.array[BODY_RATES] = turn.axes @ state.array[BODY_RATES]
+    matrix = turn_features(turn)
+    np.testing.assert_allclose(
+        physical_features(state) @ matrix.T, physical_features(turned), atol=1e-5
+    )
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(OBSERVATION_SIZE), atol=1e-12)
 
 
 def test_additive_noise_does_not_vanish_at_the_target():
@@ -302,10 +341,53 @@ def test_task_specifications():
     assert parameters.shape == (2, sum(TASK.values()))
 
 
+def test_a_named_mixture_is_the_mixture_written_out():
+    named = QuadcopterVecEnv(480, task="thesis_recovery", seed=0)
+    written_out = QuadcopterVecEnv(
+        480,
+        task={"state_recovery": 0.6, "far_tracking": 0.4},
+        task_kwargs={"precision_cost": 0.03, "nearest_target": 0.0},
+        max_episode_steps=500,
+        seed=0,
+    )
+    np.testing.assert_array_equal(named.reset(), written_out.reset())
+    rng = np.random.default_rng(0)
+    ended = 0
+    for _ in range(520):
+        actions = rng.uniform(-0.1, 0.1, (480, 4)).astype(np.float32)
+        for ours, theirs in zip(
+            named.step(actions)[:3], written_out.step(actions)[:3], strict=True
+        ):
+            np.testing.assert_array_equal(ours, theirs)
+        ended += int(named.batch.outcome["length"].max() == 500)
+    assert ended > 0
+    for name, array in named.batch.snapshot().items():
+        np.testing.assert_array_equal(array, written_out.batch.snapshot()[name])
+
+
+def test_a_named_mixture_gives_way_to_what_the_user_gives():
+    parameters, weights = resolve_tasks(
+        "thesis_recovery", {"nearest_target": 5.0, "target_distance": 9.0}
+    )
+    assert weights.tolist() == [0.6, 1.0]
+    assert parameters[:, T.nearest_target].tolist() == [5.0, 5.0]
+    assert parameters[:, T.precision_cost].tolist() == [0.03, 0.03]
+    assert FlightSettings(task="thesis_recovery").max_episode_steps == 500
+    assert FlightSettings(task="thesis_recovery", max_episode_steps=70).max_episode_steps == 70
+    changed = FlightSettings(vehicle="crazyflie").with_changes(task="thesis_recovery")
+    assert changed.max_episode_steps == 500
+    kept = FlightSettings(max_episode_steps=70).with_changes(task="thesis_recovery")
+    assert kept.max_episode_steps == 70
+    words = in_words("thesis_recovery")
+    assert words == "thesis_recovery (60% state_recovery, 40% far_tracking)"
+
+
 @pytest.mark.parametrize(
     ("task", "kwargs", "says"),
     [
         ("hover", {}, "unknown task 'hover'"),
+        ("thesis_recover", {}, "did you mean 'thesis_recovery'"),
+        ({"thesis_recovery": 1.0}, {}, "unknown task 'thesis_recovery'"),
         ({}, {}, "names no task"),
         ({"target_tracking": -1.0}, {}, "weights"),
         ("target_tracking", {"target_distanc": 1}, "did you mean 'target_distance'"),

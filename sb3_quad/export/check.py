@@ -9,7 +9,7 @@ import numpy.typing as npt
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
-from sb3_quad.base.errors import ConfigError, ExportError
+from sb3_quad.base.errors import ExportError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
@@ -18,9 +18,9 @@ from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.observation import (
     DEFAULT_MEAN,
     DEFAULT_STD,
-    FEATURES,
     GROUPS,
     OBSERVATION_SIZE,
+    turn_features,
 )
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
@@ -37,7 +37,6 @@ WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "bo
 # Here the position integral is at work from the first step on.
 NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
 ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
-PER_ROTOR = ("0", "1", "2", "3")  # the parts of a feature that has one number for each rotor
 
 
 class Reference(NamedTuple):
@@ -60,33 +59,8 @@ class Reference(NamedTuple):
 
     @property
     def turned_features(self) -> FloatArray:
-        """(OBSERVATION_SIZE, OBSERVATION_SIZE), from features in the vehicle's own body frame to
-        those that the policy knows.
-
-        :raises ConfigError: the layouts differ, and nobody knows how a feature turns with them.
-        """
-        matrix = np.eye(OBSERVATION_SIZE)
-        if self.turn == Turn():
-            return matrix
-        axes = self.turn.axes
-        blocks = {
-            "position": np.eye(3),  # in the world frame
-            "rotation": np.kron(axes, np.eye(3)),
-            "velocity": axes,
-            "body_rates": axes,
-        }
-        # Every feature needs a rule: a missing one must not turn into a wrong file.
-        for feature in FEATURES:
-            block = blocks.get(feature.name)
-            if block is None and feature.parts == PER_ROTOR:
-                block = np.eye(4)[[*self.turn.order]]
-            if block is None:
-                raise ConfigError(
-                    f"the feature {feature.name} has no rule for other rotor layouts; "
-                    "export for a vehicle in the layout of the training"
-                )
-            matrix[GROUPS[feature.name], GROUPS[feature.name]] = block
-        return matrix
+        """(18, 18), from features in the vehicle's own body frame to those that the policy knows."""
+        return turn_features(self.turn)
 
     @property
     def own_mean(self) -> FloatArray:

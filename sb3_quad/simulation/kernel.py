@@ -25,7 +25,6 @@ from sb3_quad.simulation.observation import (
     NORMALS,
     OBSERVATION_SIZE,
     WORDS,
-    features,
     observe,
 )
 from sb3_quad.simulation.physics import (
@@ -54,7 +53,6 @@ from sb3_quad.simulation.state import (
     WRENCH,
     WRENCH_SIZE,
     P,
-    QuadcopterState,
     W,
     X,
 )
@@ -338,28 +336,6 @@ def write_body(state, position, quaternion, velocity, rates):
         state[X.quaternion + 1 + axis, 0] = quaternion[axis]
         state[X.velocity + axis, 0] = velocity[axis]
         state[X.body_rates + axis, 0] = body_rates[axis]
-
-
-def physical_features(state: QuadcopterState) -> Float32Array:
-    """Return the features of a true state, in their units and without noise, float32
-    (n, OBSERVATION_SIZE), in the order of :data:`~sb3_quad.simulation.observation.FEATURES`.
-    """
-    out = np.empty((state.n, OBSERVATION_SIZE), np.float32)
-    _write_features(np.ascontiguousarray(state.array), out)
-    return out
-
-
-@compiled
-def _write_features(state, out):
-    blocks = _new_block()
-    for first in range(0, len(out), LANES):
-        b = blocks[0]
-        count = min(LANES, len(out) - first)
-        _load_rows(state, first, count, b.state)
-        features(b)
-        for lane in range(count):
-            for k in range(OBSERVATION_SIZE):
-                out[first + lane, k] = b.feature[k, lane]
 
 
 @compiled

@@ -1,16 +1,22 @@
-"""What a control step is worth (Eqs. 4.5-4.9). The coefficients are fields of
+"""The reward of a control step (Eqs. 4.5-4.9). Its coefficients are fields of
 :class:`~sb3_quad.simulation.tasks.Task`.
 """
 
 import math
 
 from sb3_quad.simulation.compiled import LANES, compiled
+from sb3_quad.simulation.physics import vector
 from sb3_quad.simulation.tasks import S
+
+
+@compiled(inline="always")
+def _length(x, y, z):
+    return math.sqrt(x * x + y * y + z * z)
 
 
 @compiled(fastmath=True)
 def _tilt(sine2, cosine2):
-    """arccos(R33) from the squared sine and cosine of its half (their sum is 1), to 1e-15 and
+    """Return arccos(R33) from the squared sine and cosine of its half (their sum is 1), to 1e-15 and
     without a library call.
 
     With the smaller as the sine of an angle up to π/4, its halved tangent is at most 0.4142; the
@@ -32,41 +38,40 @@ def _tilt(sine2, cosine2):
 
 @compiled
 def succeeds(b, lane):
-    """Whether a flight that ends now ends close enough to its target, and level enough."""
-    q, scored = b.quaternion, b.scored
-    r33 = 1.0 - 2.0 * (q[1, lane] * q[1, lane] + q[2, lane] * q[2, lane])
-    return b.distance[lane] <= scored[S.success_distance, lane] and r33 >= math.cos(
-        scored[S.success_tilt, lane]
-    )
+    """Return whether a flight that ends now is close enough to its target, and level enough."""
+    qx, qy = b.quaternion[1, lane], b.quaternion[2, lane]
+    level = 1.0 - 2.0 * (qx * qx + qy * qy) >= math.cos(b.scored[S.success_tilt, lane])
+    return level and b.distance[lane] <= b.scored[S.success_distance, lane]
 
 
 @compiled(fastmath=True)
 def score(b):
-    """``b.reward`` and ``b.distance`` |r - r_T| (m) of a loaded block, on the true state at the end
-    of a control step.
+    """Write ``b.reward`` and ``b.distance``, |r - r_T| in m, of a loaded block.
 
-    The reward is -0.003 |r - r_T| - 0.002 arccos(R33) - 0.0005 |ω| (Eqs. 4.5-4.7), less 15 for
+    It reads the true state at the end of a control step. The reward is -0.003 |r - r_T| - 0.002 arccos(R33) - 0.0005 |ω| (Eqs. 4.5-4.7), less 15 for
     touching the ground (Eq. 4.8) and 15 for leaving the range (Eq. 4.9), with the coefficients of
     the row's task. A ``precision_cost``, which the thesis does not have, is steep in the last
     metre, where Eq. 4.5 is not.
     """
-    x, target, q, w, cost = b.position, b.target, b.quaternion, b.body_rates, b.scored
+    cost = b.scored
     for lane in range(LANES):
-        ex, ey, ez = (
-            x[0, lane] - target[0, lane],
-            x[1, lane] - target[1, lane],
-            x[2, lane] - target[2, lane],
+        x, y, z = vector(b.position, lane)
+        target_x, target_y, target_z = vector(b.target, lane)
+        distance = _length(x - target_x, y - target_y, z - target_z)
+        wx, wy, wz = vector(b.body_rates, lane)
+        rates = _length(wx, wy, wz)
+        qw, qx, qy, qz = (
+            b.quaternion[0, lane],
+            b.quaternion[1, lane],
+            b.quaternion[2, lane],
+            b.quaternion[3, lane],
         )
-        wx, wy, wz = w[0, lane], w[1, lane], w[2, lane]
-        distance = math.sqrt(ex * ex + ey * ey + ez * ez)
-        rates = math.sqrt(wx * wx + wy * wy + wz * wz)
-        qw, qx, qy, qz = q[0, lane], q[1, lane], q[2, lane], q[3, lane]
         tilt = _tilt(qx * qx + qy * qy, qw * qw + qz * qz)
+        near = distance / (distance + cost[S.precision_range, lane])
         reward = -cost[S.position_cost, lane] * distance - cost[S.tilt_cost, lane] * tilt
-        reward -= (
-            cost[S.precision_cost, lane] * distance / (distance + cost[S.precision_range, lane])
-        )
+        reward -= cost[S.precision_cost, lane] * near
         reward -= cost[S.body_rates_cost, lane] * rates
-        reward -= cost[S.collision_cost, lane] if x[2, lane] <= b.radius[lane] else 0.0
+        reward -= cost[S.collision_cost, lane] if z <= b.radius[lane] else 0.0
         reward -= cost[S.out_of_range_cost, lane] if distance > cost[S.max_distance, lane] else 0.0
-        b.reward[lane], b.distance[lane] = reward, distance
+        b.reward[lane] = reward
+        b.distance[lane] = distance

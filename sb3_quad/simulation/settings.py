@@ -1,7 +1,9 @@
-"""How quadcopters fly: every keyword of the environments, declared once; training writes them into
-every zip.
+"""How quadcopters fly: every keyword of the environments, declared once.
+
+Training writes them into every zip.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,31 +15,34 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.randomization import Randomization
-from sb3_quad.simulation.tasks import resolve_tasks
+from sb3_quad.simulation.tasks import find_mixture, resolve_tasks
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
-ENDLESS = 2**62 - 1  # the most control steps an episode can have
+# The most control steps that an episode can have
+ENDLESS = 2**62 - 1
 Steps = Annotated[int, Field(gt=0, le=ENDLESS)]
 AsList = BeforeValidator(
     lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 )
 Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
-KEY = "flight_settings"  # of a model, and so of the JSON in its zip
+# The attribute of a model, and so the key of the JSON in its zip
+KEY = "flight_settings"
 Level = Annotated[float, Field(ge=0, le=100)]
 
 
 class Noise(Frozen):
-    """Standard deviations of a feature x with scale σ (Eq. 3.16): √((relative x)² + (additive σ)²).
+    """Observation noise: a feature x with scale σ (Eq. 3.16) gets the sum of two independent normal
+    disturbances, with the standard deviation √((relative x)² + (additive σ)²).
 
-    That is the sum of two independent normal disturbances; one number for short is ``relative``.
+    A number alone is ``relative``.
     """
 
     relative: Level = Field(
-        default=0.0, description="in shares of the feature itself, 0.05 in the thesis"
+        default=0.0, description="as a fraction of the feature's value (thesis: 0.05)"
     )
     additive: Level = Field(
-        default=0.0, description="in shares of σ, the same wherever the vehicle is"
+        default=0.0, description="as a fraction of σ, the same wherever the vehicle is"
     )
 
 
@@ -45,46 +50,59 @@ NoiseLevel = Level | list[Level] | Noise
 
 
 class FlightSettings(ObservationSettings):
-    """Keywords of the quadcopter environments, ``env_kwargs`` in YAML; ``dict`` gives them.
+    """Keywords of the quadcopter environments, ``env_kwargs`` in YAML. ``dict`` returns them.
 
-    Where a value may differ by row, row i of n environments has the i-th; fewer vehicles or steps
-    than rows repeat.
+    Where a value may differ by row, give a list: row i of n environments has the i-th value. If you
+    give fewer vehicles or steps than rows, they repeat.
     """
 
     task: Any = Field(
-        default="target_tracking", description="name, Task, or mixture {name: weight}"
+        default="target_tracking",
+        description="name of a task or mixture, Task, or mixture {name: weight}",
     )
     task_kwargs: dict[str, Any] | None = Field(
         default=None, description="fields of the task to override"
     )
     vehicle: Any = Field(
         default="itm",
-        description="name, path or Vehicle; or a list of them, whose time steps agree",
+        description="name, path or Vehicle; or a list of them with the same time steps",
     )
     rotor_layout: str | Path | Vehicle | None = Field(
-        default=None, description="name, path or Vehicle whose order of the rotors the agent knows"
+        default=None,
+        description="name, path or Vehicle to whose axes and rotor order the vehicle is turned",
     )
     noise: Annotated[NoiseLevel, AsList] = Field(
         default=0.05,
-        description="relative standard deviation of the observation noise, Noise, or a number for each row",
+        description="relative standard deviation of the observation noise, one for all rows or"
+        " one for each; or fields of Noise",
     )
     observation_mean: Scaling = Field(
-        default=None, description="μ of Eq. 3.16, (18,) or (n, 18); None: zero"
+        default=None, description="μ of Eq. 3.16, (18,) or (n, 18), in units; None: zero"
     )
     observation_std: Scaling = Field(
-        default=None, description="σ of Eq. 3.16, (18,) or (n, 18); None: Table A.2"
+        default=None, description="σ of Eq. 3.16, (18,) or (n, 18), in units; None: Table A.2"
     )
     vehicles: VehicleDistribution | None = Field(
         default=None,
-        description="fields of VehicleDistribution, or {distribution: name}: each episode has a vehicle of it",
+        description="fields of VehicleDistribution, or {distribution: name}; each episode samples"
+        " a vehicle from it",
     )
     randomize: Randomization | None = Field(
-        default=None, description="fields of Randomization: what differs by episode"
+        default=None, description="fields of Randomization: dynamics that differ by episode"
     )
     max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = Field(
         default=MAX_EPISODE_STEPS,
-        description="control steps after which an episode is truncated; or a list of them",
+        description="control steps after which an episode is truncated, for all rows or for each",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _steps_of_mixture(cls, data: Any) -> Any:
+        """A named mixture brings its episode length, unless one is given."""
+        mixture = find_mixture(data.get("task")) if isinstance(data, Mapping) else None
+        if mixture is None:
+            return data
+        return {"max_episode_steps": mixture.max_episode_steps, **data}
 
     @model_validator(mode="after")
     def _known_task(self) -> "FlightSettings":
@@ -93,20 +111,20 @@ class FlightSettings(ObservationSettings):
 
     @property
     def longest_episode(self) -> int:
-        """Control steps of an episode, or of the longest where rows differ."""
+        """Control steps of an episode; of the longest where rows differ."""
         steps = self.max_episode_steps
         return max(steps) if isinstance(steps, list) else steps
 
     @property
     def observation(self) -> ObservationSettings:
-        """What an observation is made of, alone."""
+        """The settings of the observation alone."""
         return ObservationSettings(
             **{name: getattr(self, name) for name in ObservationSettings.model_fields}
         )
 
     def in_any_task(self) -> dict[str, Any]:
-        """The settings that are not left at their defaults and do not belong to a task: vehicles,
-        noise, observation.
+        """Return the settings that were given and do not belong to a task: vehicles, noise,
+        observation.
         """
         others = ("task", "task_kwargs", "max_episode_steps", "randomize")
         return {
@@ -117,39 +135,38 @@ class FlightSettings(ObservationSettings):
 
     @property
     def observed(self) -> dict[str, Any]:
-        """What goes with an agent wherever it flies: scaling and frames of its observations, and
-        its rotors' order.
+        """The settings that an agent needs wherever it flies: scaling and frames of its
+        observations, and the order of its rotors.
         """
-        scaling = {
-            "observation_mean": self.observation_mean,
-            "observation_std": self.observation_std,
-        }
-        return {
-            **scaling,
-            **self.model_dump(
-                mode="json", include={*ObservationSettings.model_fields, "rotor_layout"}
-            ),
-        }
+        scaling = {"observation_mean", "observation_std"}
+        return self.model_dump(
+            mode="json", include={*ObservationSettings.model_fields, "rotor_layout", *scaling}
+        )
 
     @property
     def layout(self) -> Vehicle:
-        """The vehicle whose axes and order of the rotors an agent with these settings knows."""
+        """The vehicle whose axes and rotor order an agent with these settings knows."""
         return first_vehicle(self.vehicle if self.rotor_layout is None else self.rotor_layout)
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
-        """The same with some fields changed; a ``vehicle`` replaces ``vehicles``.
+        """Return the same settings with some fields changed; a ``vehicle`` replaces ``vehicles``.
 
         :raises ConfigError: an unknown field, or a value that does not fit.
         """
-        own = {**dict(self), "vehicles": None} if "vehicle" in changes else dict(self)
+        own = dict(self)
+        if "vehicle" in changes:
+            own["vehicles"] = None
+        if "max_episode_steps" not in self.model_fields_set:
+            # A mixture among the changes brings its own.
+            del own["max_episode_steps"]
         return validate(FlightSettings, {**own, **changes}, "env_kwargs")
 
     def write_into(self, model: Any) -> None:
-        """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with
-        the vehicle's parameters.
+        """Write these settings into an SB3 model: ``model.flight_settings``, plain JSON with the
+        parameters of the vehicle, of several the first.
 
-        Its zips hold them from then on, and ``load`` of Stable-Baselines3 carries them along, also
-        without this package. Of several vehicles it is the first.
+        From then on its zips hold them, and ``load`` of Stable-Baselines3 keeps them, even without
+        this package.
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
@@ -163,10 +180,10 @@ class FlightSettings(ObservationSettings):
 
 
 def known_layout(model: Any) -> Vehicle | None:
-    """The layout that a model knows, by what :meth:`FlightSettings.write_into` wrote; None: it
-    holds nothing of that kind.
+    """Return the layout that a model knows, as :meth:`FlightSettings.write_into` wrote it; None if
+    the model holds no settings.
 
-    :raises ConfigError: what it holds does not fit.
+    :raises ConfigError: the settings that it holds do not fit.
     """
     own = getattr(model, KEY, None)
     if not isinstance(own, dict):
@@ -179,14 +196,18 @@ def known_layout(model: Any) -> Vehicle | None:
 
 
 def levels(noise: Any) -> tuple[FloatArray, FloatArray]:
-    """The relative and the additive level of a valid ``NoiseLevel``, () or (rows,) each."""
-    relative, additive = (
-        (noise.relative, noise.additive) if isinstance(noise, Noise) else (noise, 0.0)
-    )
-    return np.asarray(relative, np.float64), np.asarray(additive)
+    """Return the relative level, () or (rows,), and the additive level, (), of a valid
+    ``NoiseLevel``.
+    """
+    if isinstance(noise, Noise):
+        return np.asarray(noise.relative), np.asarray(noise.additive)
+    return np.asarray(noise, np.float64), np.zeros(())
 
 
 def in_words(noise: Any) -> str:
-    """Such as ``5 %``, or ``5 % and 2 % of σ``; of several rows the mean."""
-    relative, additive = (100 * level.mean() for level in levels(noise))
-    return f"{relative:g} %" + (f" and {additive:g} % of σ" if additive else "")
+    """Return noise such as ``5 %``, or ``5 % and 2 % of σ``; the mean where rows differ."""
+    relative, additive = levels(noise)
+    text = f"{100 * relative.mean():g} %"
+    if additive:
+        text += f" and {100 * additive.mean():g} % of σ"
+    return text

@@ -1,4 +1,4 @@
-"""The true state of n quadcopters, the wrench that acts on them, and how both lie in memory.
+"""The true state of n quadcopters, the wrench that acts on them, and their layout in memory.
 
 One float64 array of shape ``(STATE_SIZE, n)`` holds n vehicles, a quantity per row and a vehicle
 per column, so that compiled loops over vehicles run over neighbouring numbers. The order of the
@@ -23,9 +23,11 @@ from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 
 def first_rows(sizes: Mapping[str, int]) -> Any:
-    """The first row of each quantity, by its name, where ``sizes`` are how many rows each takes.
+    """Return the first row of each quantity, by its name.
 
-    Compiled code reads the numbers as constants, and none is counted by hand.
+    Compiled code reads these numbers as constants, and none is counted by hand.
+
+    :param sizes: number of rows of each quantity.
 
     >>> first_rows({"position": 3, "quaternion": 4})
     Rows(position=0, quaternion=3)
@@ -36,11 +38,9 @@ def first_rows(sizes: Mapping[str, int]) -> Any:
 
 
 def row_slices(sizes: Mapping[str, int]) -> dict[str, slice]:
-    """The rows of each quantity, by its name."""
-    return {
-        name: slice(start, start + sizes[name])
-        for name, start in first_rows(sizes)._asdict().items()
-    }
+    """Return the rows of each quantity, by its name."""
+    starts = first_rows(sizes)._asdict()
+    return {name: slice(start, start + sizes[name]) for name, start in starts.items()}
 
 
 STATE = {
@@ -61,21 +61,22 @@ WRENCH_SIZE = sum(WRENCH.values())
 FORCE_WORLD, FORCE_BODY, TORQUE_WORLD, TORQUE_BODY = row_slices(WRENCH).values()
 W = first_rows(WRENCH)
 
-P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))  # of a vehicle's parameters
+# The rows of a vehicle's parameters
+P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class QuadcopterState:
-    """Read access to the true state of n vehicles; what an expert is given.
+    """Read access to the true state of n vehicles, which experts act on.
 
     :param array: float64 of shape ``(STATE_SIZE, n)``, its rows in the order of :data:`STATE`. The
-        properties are views of it with one vehicle per row, so they show later changes: copy what
-        must last.
+        properties are views of it with one vehicle per row, so they show later changes: copy
+        whatever must last.
     :param vehicles: the true parameters of the vehicles, float64 ``(len(PARAMETER_NAMES), n)``,
-        their rows in the order of :data:`~sb3_quad.vehicles.vehicle.PARAMETER_NAMES`; None:
-        unknown.
-    :param wrench: what pushes them, float64 ``(WRENCH_SIZE, n)``, its rows in the order of
-        :data:`WRENCH`; None: unknown.
+        their rows in the order of :data:`~sb3_quad.vehicles.vehicle.PARAMETER_NAMES`; None if they
+        are unknown.
+    :param wrench: the external forces and torques, float64 ``(WRENCH_SIZE, n)``, its rows in the
+        order of :data:`WRENCH`; None if they are unknown.
     """
 
     array: FloatArray
@@ -129,49 +130,69 @@ class QuadcopterState:
         return np.asarray(np.sqrt(np.einsum("in,in->n", error, error)))
 
     def copy(self) -> "QuadcopterState":
-        """A state of its own memory, unaffected by later flight."""
-        return self._each(np.copy)
+        """Return a state with its own memory, unaffected by later flight."""
+        return self._apply(np.copy)
 
     def rows(self, rows: slice) -> "QuadcopterState":
-        """Some of the vehicles, views."""
-        return self._each(lambda part: part[:, rows])
+        """Return some of the vehicles, as views."""
+        return self._apply(lambda array: array[:, rows])
 
-    def _each(self, change: Callable[[FloatArray], FloatArray]) -> "QuadcopterState":
-        vehicles, wrench = (
-            None if part is None else change(part) for part in (self.vehicles, self.wrench)
+    def _apply(self, change: Callable[[FloatArray], FloatArray]) -> "QuadcopterState":
+        return QuadcopterState(
+            change(self.array),
+            None if self.vehicles is None else change(self.vehicles),
+            None if self.wrench is None else change(self.wrench),
         )
-        return QuadcopterState(change(self.array), vehicles, wrench)
 
     @staticmethod
     def concatenate(states: Sequence["QuadcopterState"]) -> "QuadcopterState":
-        """Several states as one batch, in order; what one of them does not know is unknown."""
-
-        def joined(parts: list[FloatArray | None]) -> FloatArray | None:
-            known = [part for part in parts if part is not None]
-            return np.concatenate(known, axis=1) if len(known) == len(states) else None
-
-        array = np.concatenate([state.array for state in states], axis=1)
+        """Return several states as one batch, in order. Vehicles or wrench are unknown if one of
+        the states does not know them.
+        """
         return QuadcopterState(
-            array,
-            joined([each.vehicles for each in states]),
-            joined([each.wrench for each in states]),
+            np.concatenate([state.array for state in states], axis=1),
+            _concatenate_known([state.vehicles for state in states]),
+            _concatenate_known([state.wrench for state in states]),
         )
 
 
+def _concatenate_known(arrays: Sequence[FloatArray | None]) -> FloatArray | None:
+    known = [array for array in arrays if array is not None]
+    return np.concatenate(known, axis=1) if len(known) == len(arrays) else None
+
+
+def at_rest(headings: FloatArray, rotor_speed: float = 0.0) -> QuadcopterState:
+    """Return the state of vehicles that are level and at rest at their targets.
+
+    :param headings: ψ of each vehicle, rad, (n,); positive from x to y.
+    :param rotor_speed: of every rotor, rad/s, such as ``vehicle.hover_rotor_speed``.
+    """
+    array = np.zeros((STATE_SIZE, len(headings)))
+    array[X.quaternion] = np.cos(headings / 2.0)
+    array[X.quaternion + 3] = np.sin(headings / 2.0)
+    array[ROTOR_SPEEDS] = rotor_speed
+    return QuadcopterState(array)
+
+
 def rotation_matrices(quaternions: FloatArray) -> FloatArray:
-    """Rotation matrices R, body to world, (n, 3, 3), of unit quaternions (n, 4), (w, x, y, z)."""
+    """Return rotation matrices R, body to world, (n, 3, 3).
+
+    :param quaternions: unit quaternions (w, x, y, z), (n, 4).
+    """
     return np.moveaxis(np.array(rotation_rows.py_func(*quaternions.T)), -1, 0)
 
 
 def drag_forces(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> FloatArray:
-    """Drag of n vehicles, (3, n), world frame, N: -R diag(d) Rᵀ (v - wind) (Faessler, Franchi and
-    Scaramuzza, RA-L 2018).
+    """Return the drag of n vehicles, (3, n), world frame, N.
+
+    It is -R diag(d) Rᵀ (v - wind) (Faessler, Franchi and Scaramuzza, RA-L 2018).
 
     :param state: (STATE_SIZE, n).
     :param vehicles: parameters, (len(PARAMETER_NAMES), n).
     :param wind: velocity of the air, (3, n), world frame, m/s.
     """
-    rotation, airspeed = rotation_matrices(state[QUATERNION].T), state[VELOCITY] - wind
+    rotation = rotation_matrices(state[QUATERNION].T)
+    airspeed = state[VELOCITY] - wind
     in_body = vehicles[P.drag_x : P.drag_z + 1] * np.einsum("nji,jn->in", rotation, airspeed)
     return np.asarray(-np.einsum("nij,jn->in", rotation, in_body))
 
@@ -179,7 +200,7 @@ def drag_forces(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> Fl
 def make_wrench(
     force: FloatArray, torque: FloatArray, force_frame: str = "world", torque_frame: str = "body"
 ) -> FloatArray:
-    """The wrench of n vehicles, (WRENCH_SIZE, n).
+    """Return the wrench of n vehicles, (WRENCH_SIZE, n).
 
     :param force: (n, 3), N; ``torque`` (n, 3), N m; both at the centre of mass.
     :param force_frame: ``"world"`` or ``"body"``, the axes of ``force``; ``torque_frame`` those of

@@ -1,11 +1,12 @@
-"""The tasks (thesis 4.2): where an episode starts, what a control step is worth and when the
-episode is over.
+"""The tasks (thesis 4.2): where an episode starts, how its control steps are rewarded, and when it
+is over.
 
 A task is data. :mod:`.sampling` begins episodes by it, :mod:`.reward` scores their control steps.
+:data:`TASKS` and :data:`MIXTURES` hold those that have a name.
 """
 
-from collections.abc import Mapping
-from typing import Annotated, Any, TypeAlias
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from pydantic import Field, PositiveFloat, field_validator, model_validator
@@ -33,7 +34,8 @@ class Task(Frozen):
         default=(0.0, 0.0, 15.0), description="r0, world frame, m"
     )
     target_distance: Length = Field(
-        default=0.0, description="|r_T - r0|, m, at most max_distance; 0: r0 itself"
+        default=0.0,
+        description="|r_T - r0|, m, at most max_distance; 0 puts the target at r0",
     )
     nearest_target: Length | None = Field(
         default=None,
@@ -41,7 +43,7 @@ class Task(Frozen):
     )
     target_clearance: Length = Field(
         default=0.25,
-        description="no target is closer to the ground than the collision body plus this, m",
+        description="least height of a target above the ground, beyond the collision radius, m",
     )
     random_attitude: bool = Field(
         default=False, description="start attitude uniform on SO(3), else level"
@@ -50,26 +52,31 @@ class Task(Frozen):
         default=0.0, description="standard deviation of v at the start, per axis, m/s"
     )
     body_rates_std: Speed = Field(
-        default=0.0, description="of the body rates at the start, per axis, rad/s"
+        default=0.0,
+        description="standard deviation of the body rates at the start, per axis, rad/s",
     )
     hit_rates_std: Speed = Field(
-        default=0.0, description="of what a hit adds to them, per axis, rad/s"
+        default=0.0,
+        description="standard deviation of the body rates that a hit adds at the start, per axis,"
+        " rad/s",
     )
     max_distance: PositiveLength = Field(
-        default=30.0, description="farther from the target ends, m"
+        default=30.0,
+        description="distance from the target beyond which the episode terminates, m",
     )
     success_distance: PositiveLength = Field(
-        default=0.1, description="a flight succeeds that ends this near its target, m"
+        default=0.1, description="greatest final distance from the target of a success, m"
     )
     success_tilt: PositiveFloat = Field(
-        default=np.pi, description="and is tilted by no more than this, rad"
+        default=np.pi, description="greatest final tilt of a success, rad"
     )
     position_cost: Cost = Field(default=0.003, description="per m and control step (Eq. 4.5)")
     precision_cost: Cost = Field(
-        default=0.0, description="per step, times d / (d + precision_range)"
+        default=0.0,
+        description="per control step, times d / (d + precision_range) of the distance d",
     )
     precision_range: PositiveLength = Field(
-        default=0.3, description="the distance at which half of it is due, m"
+        default=0.3, description="distance at which half of precision_cost is due, m"
     )
     tilt_cost: Cost = Field(default=0.002, description="per rad and control step (Eq. 4.6)")
     body_rates_cost: Cost = Field(
@@ -87,20 +94,22 @@ class Task(Frozen):
 
     @model_validator(mode="after")
     def _nearest_first(self) -> "Task":
-        if self.nearest_target is not None and self.nearest_target > self.target_distance:
+        target, nearest, most = self.target_distance, self.nearest_target, self.max_distance
+        if nearest is not None and nearest > target:
+            raise ValueError(f"nearest_target {nearest} exceeds target_distance {target}")
+        if target > most:
             raise ValueError(
-                f"nearest_target {self.nearest_target} exceeds target_distance {self.target_distance}"
+                f"target_distance {target:g} exceeds max_distance {most:g}:"
+                " every episode would end at once"
             )
-        if self.target_distance > self.max_distance:
-            beyond = f"target_distance {self.target_distance:g} exceeds max_distance {self.max_distance:g}"
-            raise ValueError(f"{beyond}: every episode would end at once")
         return self
 
     def parameters(self) -> FloatArray:
-        """What compiled code needs, in the order of :data:`TASK`, shape (columns,)."""
-        nearest = self.target_distance if self.nearest_target is None else self.nearest_target
-        values = {**{name: getattr(self, name) for name in TASK}, "nearest_target": nearest}
-        return np.hstack(list(values.values())).astype(np.float64)
+        """Return the numbers for compiled code, in the order of :data:`TASK`, shape (columns,)."""
+        values = dict(self)
+        if self.nearest_target is None:
+            values["nearest_target"] = self.target_distance
+        return np.hstack([values[name] for name in TASK]).astype(np.float64)
 
 
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
@@ -110,11 +119,10 @@ SCORED = list(TASK)[list(TASK).index("max_distance") :]
 """The fields that every control step needs: all from ``max_distance`` on, a number each."""
 S = first_rows(dict.fromkeys(SCORED, 1))
 
-RECOVERED = {
-    "success_distance": 0.25,
-    "success_tilt": np.radians(10.0),
-}  # of tasks whose target is their start
-_THROWN_AWAY: Any = {  # from its target, which is somewhere else
+RECOVERED = {"success_distance": 0.25, "success_tilt": np.radians(10.0)}
+"""The success of tasks whose target is their start."""
+# Random attitude, velocity and body rates, at a random distance from the target.
+_THROWN_AWAY: Any = {
     "target_distance": 25.0,
     "nearest_target": 0.0,
     "random_attitude": True,
@@ -131,48 +139,90 @@ TASKS: Mapping[str, Task] = {
         **RECOVERED,
     ),
     "recovery_and_tracking": Task(name="recovery_and_tracking", **_THROWN_AWAY),
-    "after_hit": Task(
-        name="after_hit", **_THROWN_AWAY, hit_rates_std=25.0
-    ),  # on its way when something hits it
+    # Something hits the vehicle on its way to the target.
+    "after_hit": Task(name="after_hit", **_THROWN_AWAY, hit_rates_std=25.0),
     "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
 }
+
+
+class Mixture(NamedTuple):
+    """A mixture of tasks that has a name.
+
+    :param weights: of each task, by its name. Their order decides which random number gives which
+        task.
+    :param task_kwargs: fields of :class:`Task` to override in each; the user's own come after them.
+    :param max_episode_steps: control steps of an episode, unless the user says how many.
+    """
+
+    weights: Mapping[str, float]
+    task_kwargs: Mapping[str, Any]
+    max_episode_steps: int
+
+
+MIXTURES: Mapping[str, Mixture] = {
+    # Training with a reward that is steep near the target, and targets up to 25 m away.
+    "thesis_recovery": Mixture(
+        weights={"state_recovery": 0.6, "far_tracking": 0.4},
+        task_kwargs={"precision_cost": 0.03, "nearest_target": 0.0},
+        max_episode_steps=500,
+    ),
+}
+TASK_NAMES = (*TASKS, *MIXTURES)
 TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 
 
+def find_mixture(task: Any) -> Mixture | None:
+    """Return the mixture of that name; None if ``task`` is anything else."""
+    return MIXTURES.get(task) if isinstance(task, str) else None
+
+
 def in_words(task: TaskSpec) -> str:
-    """A task as it is called; a mixture such as ``80% target_tracking, 20% state_recovery``."""
-    if not isinstance(task, Mapping):
-        return task.name if isinstance(task, Task) else task
-    shares = resolve_tasks(task)[1]
-    return ", ".join(
-        f"{share:.0%} {name}"
-        for name, share in zip(task, np.diff(shares, prepend=0.0), strict=True)
-    )
+    """Return the name of a task, or the shares of a mixture.
+
+    >>> in_words({"target_tracking": 4, "state_recovery": 1})
+    '80% target_tracking, 20% state_recovery'
+    """
+    mixture = find_mixture(task)
+    if mixture is not None:
+        return f"{task} ({in_words(mixture.weights)})"
+    if isinstance(task, Task):
+        return task.name
+    if isinstance(task, str):
+        return task
+    shares = np.diff(resolve_tasks(task)[1], prepend=0.0)
+    return ", ".join(f"{share:.0%} {name}" for name, share in zip(task, shares, strict=True))
 
 
 def resolve_tasks(
     task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """The K tasks of a name, a :class:`Task` or a mixture ``{name: weight}``: parameters (K,
-    columns), see :data:`TASK`, and cumulative weights (K,), the last one 1.
+    """Return the parameters and the cumulative weights of K tasks.
 
+    :param task: a name, a :class:`Task`, or a mixture ``{name: weight}``.
     :param task_kwargs: fields of :class:`Task` to override, in every task of a mixture.
+    :return: parameters (K, columns), see :data:`TASK`; cumulative weights (K,), the last one 1.
     :raises ConfigError: an unknown name or field, or a value or weight out of range.
     """
-    weights = list(task.items()) if isinstance(task, Mapping) else [(task, 1.0)]
+    overrides = dict(task_kwargs or {})
+    mixture = find_mixture(task)
+    if mixture is not None:
+        weights: Mapping[Any, Any] = mixture.weights
+        overrides = {**mixture.task_kwargs, **overrides}
+    elif isinstance(task, Mapping):
+        weights = task
+    else:
+        parameters = _resolve(task, TASK_NAMES, overrides).parameters()
+        return parameters[None], np.ones(1)
     if not weights:
         raise ConfigError(
             "task: the mixture names no task; give at least one, such as {'target_tracking': 1.0}"
         )
-    parameters = np.stack(
-        [_resolve(entry, dict(task_kwargs or {})).parameters() for entry, _ in weights]
-    )
+    parameters = np.stack([_resolve(name, TASKS, overrides).parameters() for name in weights])
+    given = list(weights.values())
     try:
-        shares = np.array([float(share) for _, share in weights])
+        shares = np.array([float(share) for share in given])
     except (TypeError, ValueError):
-        raise ConfigError(
-            f"task: the weights {[share for _, share in weights]} must be numbers"
-        ) from None
+        raise ConfigError(f"task: the weights {given} must be numbers") from None
     if not np.isfinite(shares).all() or (shares < 0).any() or shares.sum() <= 0:
         raise ConfigError(
             f"task: the weights {shares.tolist()} must be finite, not negative and not all zero"
@@ -182,11 +232,9 @@ def resolve_tasks(
     return parameters, cumulative
 
 
-def _resolve(entry: Any, overrides: dict[str, Any]) -> Task:
-    if isinstance(entry, Task):
-        task = entry
-    elif isinstance(entry, str) and entry in TASKS:
-        task = TASKS[entry]
-    else:
-        raise ConfigError(unknown("task", entry, TASKS))
-    return validate(Task, {**task.model_dump(), **overrides}, "task_kwargs")
+def _resolve(task: Any, names: Collection[str], overrides: dict[str, Any]) -> Task:
+    if isinstance(task, str) and task in TASKS:
+        task = TASKS[task]
+    if not isinstance(task, Task):
+        raise ConfigError(unknown("task", task, names))
+    return validate(Task, {**dict(task), **overrides}, "task_kwargs")

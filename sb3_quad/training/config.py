@@ -29,7 +29,7 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.tasks import TASKS, in_words
+from sb3_quad.simulation.tasks import TASK_NAMES, in_words
 from sb3_quad.training.algorithms import (
     check,
     constructor_parameters,
@@ -216,7 +216,7 @@ class TrainingConfig(Frozen):
     def _known_tasks(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if value and info.data["env_id"] not in ENVIRONMENTS:
             raise ConfigError(f"{info.data['env_id']} has no tasks; remove eval_tasks")
-        return tuple(_one_of(TASKS, name, info) for name in value)
+        return tuple(_one_of(TASK_NAMES, name, info) for name in value)
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
