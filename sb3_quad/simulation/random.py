@@ -1,5 +1,5 @@
-"""Counter-based random numbers: a stream per row, so that neither threads nor neighbours change
-what a row gets.
+"""Counter-based random numbers: a stream per row, so that neither threads nor neighbouring rows
+change the numbers of a row.
 
 Every number is Philox4x32 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011)
 of a key and a counter: the key names the row, the counter is ``(block, step, episode, purpose)``.
@@ -24,28 +24,27 @@ from numba import float32, int32, uint32, uint64
 from sb3_quad.simulation.compiled import LANES, compiled
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
-OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DISTRIBUTION, WIND = range(
-    7
-)  # purposes: the last word of the counter
+# Purposes: the last word of the counter
+OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND = range(7)
 ROUNDS = 10
 _MASK, _SHIFT = uint64(0xFFFFFFFF), uint64(32)
-_SQRT_HALF_BITS = 0x3F3504F3  # of sqrt(1/2)
+# The bits of sqrt(1/2) in float32
+_SQRT_HALF_BITS = 0x3F3504F3
 _LN2 = float32(math.log(2.0))
 _TO_UNIT = float32(2.0**-31)
 _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 
 
 def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
-    """Streams before their first episode, shape (4, n), from n seeds; None: the operating system's
-    entropy.
+    """Return streams before their first episode, shape (4, n), from n seeds.
 
-    A key is the first number of the generator that Gymnasium makes of the seed.
+    None as a seed takes the operating system's entropy. A key is the first number of the generator that Gymnasium makes of the seed.
     """
-    generators = [seeding.np_random(None if seed is None else int(seed))[0] for seed in seeds]
-    keys = np.array(
-        [generator.integers(2**64, dtype=np.uint64) for generator in generators], dtype=np.uint64
-    )
-    streams = np.zeros((4, keys.size), dtype=np.uint32)
+    streams = np.zeros((4, len(seeds)), dtype=np.uint32)
+    keys = np.empty(len(seeds), dtype=np.uint64)
+    for row, seed in enumerate(seeds):
+        generator, _ = seeding.np_random(None if seed is None else int(seed))
+        keys[row] = generator.integers(2**64, dtype=np.uint64)
     streams[KEY_LO] = keys & np.uint64(0xFFFFFFFF)
     streams[KEY_HI] = keys >> np.uint64(32)
     return streams
@@ -62,7 +61,7 @@ def _round(c0, c1, c2, c3, k0, k1):
 
 @compiled
 def philox(c0, c1, c2, c3, k0, k1):
-    """Philox4x32-10: four uint32 from a counter of four and a key of two."""
+    """Return four uint32 of Philox4x32-10 from a counter of four and a key of two."""
     c0, c1, c2, c3, k0, k1 = uint64(c0), uint64(c1), uint64(c2), uint64(c3), uint64(k0), uint64(k1)
     for _ in range(ROUNDS):
         c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
@@ -79,38 +78,43 @@ def _words(streams, row, block, purpose):
 
 @compiled
 def uniforms(streams, row, blocks, purpose):
-    """Doubles uniform on (0, 1), of 53 bits each, two per block: shape (2 blocks,)."""
+    """Return doubles uniform on (0, 1), of 53 bits each, two per block: shape (2 blocks,)."""
     numbers = np.empty(2 * blocks)
     for block in range(blocks):
         w0, w1, w2, w3 = _words(streams, row, block, purpose)
-        numbers[2 * block] = (((uint64(w0) << _SHIFT | uint64(w1)) >> uint64(11)) + 0.5) * 2.0**-53
-        numbers[2 * block + 1] = (
-            ((uint64(w2) << _SHIFT | uint64(w3)) >> uint64(11)) + 0.5
-        ) * 2.0**-53
+        numbers[2 * block] = _to_uniform(w0, w1)
+        numbers[2 * block + 1] = _to_uniform(w2, w3)
     return numbers
 
 
 @compiled
+def _to_uniform(high, low):
+    return (((uint64(high) << _SHIFT | uint64(low)) >> uint64(11)) + 0.5) * 2.0**-53
+
+
+@compiled
 def random_words(b):
-    """``b.word``: random words of every lane, a multiple of 4, from the lane's key and counter."""
+    """Write ``b.word``: random words of every lane, a multiple of 4, from its key and counter."""
     word, stream = b.word, b.stream
     for block in range(word.shape[0] // 4):
         for lane in range(LANES):
             w0, w1, w2, w3 = _words(stream, lane, block, OBSERVATION_NOISE)
-            word[4 * block, lane], word[4 * block + 1, lane] = w0, w1
-            word[4 * block + 2, lane], word[4 * block + 3, lane] = w2, w3
+            word[4 * block, lane] = w0
+            word[4 * block + 1, lane] = w1
+            word[4 * block + 2, lane] = w2
+            word[4 * block + 3, lane] = w3
 
 
 @compiled
 def gust_words(word, stream):
-    """Two random words of every lane to ``word``, (2, LANES), for the gusts of the wind."""
+    """Write two random words of every lane to ``word``, (2, LANES), for the gusts of the wind."""
     for lane in range(LANES):
         word[0, lane], word[1, lane], _, _ = _words(stream, lane, 0, WIND)
 
 
 @compiled
 def _log(x):
-    """ln x of a positive float32: the exponent, and a polynomial on [sqrt(1/2), sqrt(2))."""
+    """Return ln x of a positive float32: the exponent, and a polynomial on [√½, √2)."""
     bits = np.float32(x).view(np.int32)
     exponent = int32(int32(bits - int32(_SQRT_HALF_BITS)) >> int32(23))
     m = np.int32(bits - int32(exponent << int32(23))).view(np.float32) - float32(1.0)
@@ -125,8 +129,8 @@ def _log(x):
 
 @compiled(fastmath=True)
 def standard_normals(b):
-    """``b.noise``: standard normals of every lane, an even number, from the first of its
-    ``b.word``, two from two.
+    """Write ``b.noise``: standard normals of every lane, two from each pair of its first words
+    (Box-Muller).
     """
     word, noise = b.word, b.noise
     for pair in range(noise.shape[0] // 2):

@@ -10,7 +10,7 @@ from sb3_quad.simulation.random import (
     EPISODE,
     EPISODE_START,
     GUST,
-    PUSH,
+    DISTURBANCE,
     STEP,
     VEHICLE,
     WIND,
@@ -125,7 +125,7 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
             vehicles[k, i] = base[k, min(i, base.shape[1] - 1)]
         sample_from_distribution(i, streams, distribution, vehicles)
     # Forces in weights are those of the vehicle before it is randomised.
-    column, u = min(i, vehicles.shape[1] - 1), uniforms(streams, i, 4, PUSH)
+    column, u = min(i, vehicles.shape[1] - 1), uniforms(streams, i, 4, DISTURBANCE)
     is_disturbed, weight = (
         u[0] < table[R.wrench_share],
         vehicles[P.mass, column] * vehicles[P.gravity, column],
