@@ -124,17 +124,18 @@ targets = QuadcopterVecEnv(240, "target_tracking", seed=seed)
 imitation = DAgger("MlpPolicy", targets, expert=expert, seed=seed, device="cpu")
 imitation.learn(arguments.imitation_timesteps)
 
-# The reward is much like what the expert does: clone everywhere, and explore little. The LQR takes
-# more than 5 s to its target, so episodes last their full 15 s.
+# The reward is much like what the expert does: clone everywhere and strongly, and explore little.
+# The LQR takes more than 5 s to its target, so episodes last their full 15 s.
 env = EnergyCost(QuadcopterVecEnv(480, "target_tracking", seed=seed))
 agent = PPOBC(
     "MlpPolicy",
     env,
     learning_rate=LinearSchedule(3e-4, 1.5e-5, 1.0),
+    gamma=0.99,
     policy_kwargs={"log_std_init": -2.6},
     expert=expert,
     initial_policy=imitation,
-    bc_coef=1.0,
+    bc_coef=5.0,
     bc_loss="huber",
     bc_filter="none",
     seed=seed,
