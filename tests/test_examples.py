@@ -91,6 +91,21 @@ def test_imitation_then_stage_two_then_stock_sb3(run, tmp_path):
     assert "m from the target after 15 s" in run("load_in_plain_sb3.py", "ppo_bc.zip")
 
 
+@pytest.mark.slow
+def test_a_cloned_lqr_gets_better_by_a_reward_of_energy(run):
+    output = run("energy_reward.py")
+    rewards = dict(
+        re.findall(r"^(\w+): mean reward (-[\d.]+), survival 100.0%$", output, re.MULTILINE)
+    )
+    assert float(rewards["PPOBC"]) > max(float(rewards["LQR"]), float(rewards["DAgger"])) + 0.3
+    assert float(re.search(r"error ([\d.]+) m", output).group(1)) < 0.1
+
+
+def test_energy_reward_runs_with_short_trainings(run):
+    output = run("energy_reward.py", *SHORT, "--imitation-timesteps", "100")
+    assert re.findall(r"^(\w+): mean reward -", output, re.MULTILINE) == ["LQR", "DAgger", "PPOBC"]
+
+
 @pytest.mark.parametrize("name", ["own_expert.py", "own_vehicle.py"])
 def test_own_experts_and_vehicles_recover(run, name):
     output = run(name, *SHORT)

@@ -191,7 +191,10 @@ def actor_and_critic_parameters(policy: Any) -> tuple[list[Any], list[Any]]:
     actor: list[Any] = []
     critic: list[Any] = []
     for name, parameter in policy.named_parameters():
-        (critic if name.startswith(_CRITIC) else actor).append(parameter)
+        if name.startswith(_CRITIC):
+            critic.append(parameter)
+        else:
+            actor.append(parameter)
     return actor, critic
 
 

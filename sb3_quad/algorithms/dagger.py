@@ -242,11 +242,13 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             if self._aux_layer < 1:
                 raise ConfigError(f"aux_coef {self.aux_coef:g}: needs at least two hidden layers")
         dtype = self.rollout_buffer.observations.dtype
+        if np.issubdtype(dtype, np.floating):
+            dtype = np.dtype(np.float32)
         self.dataset = AggregatedDataset(
             self.dataset_capacity or rollout,
             self.rollout_buffer.obs_shape,
             action_dim,
-            np.float32 if np.issubdtype(dtype, np.floating) else dtype,
+            dtype,
         )
 
     def set_expert(self, expert: ExpertLike | None) -> None:
@@ -311,7 +313,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         There is no state to save: after a resume they are the same again.
         """
-        seed = self._entropy if self.seed is None else self.seed
+        seed = self.seed
+        if seed is None:
+            seed = self._entropy
         return np.random.default_rng([seed, purpose, self._n_updates])
 
     def collect_rollouts(
@@ -388,7 +392,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         # + Add the labels to the dataset.
         if self.dataset_capacity == 0:
             self.dataset.clear()
-        targets = np.concatenate([labels, aux_targets], axis=2) if aux_targets else labels
+        targets = labels
+        if aux_targets:
+            targets = np.concatenate([labels, aux_targets], axis=2)
         self.dataset.add(flown, targets.reshape(len(flown), -1))
         self._n_rollouts += 1
 

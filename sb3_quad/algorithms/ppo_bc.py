@@ -403,15 +403,19 @@ class PPOBC(ExpertMixin, PPO):
         buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
         bc_coef = buffer.bc_coef
         warming_up = self._n_rollouts_trained < self.critic_warmup
-        ent_coef = 0.0 if warming_up else self.ent_coef
-        l2_coef = 0.0 if warming_up else self.l2_coef
+        ent_coef = self.ent_coef
+        l2_coef = self.l2_coef
+        if warming_up:
+            ent_coef = l2_coef = 0.0
         actor_parameters, _ = actor_and_critic_parameters(self.policy)
 
         # + Compiled code computes the same gradients in less time, to rounding. Without additions
         # PyTorch does it, as in PPO, bit for bit.
         own_value_loss = clip_range_vf is not None and self.max_clipped_value
         adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
-        network = network_of(self.policy) if adds else self.policy
+        network: Any = self.policy
+        if adds:
+            network = network_of(self.policy)
         compiled_loss = Loss(
             policy_coef=1.0,
             clip_range=clip_range,
