@@ -466,10 +466,8 @@ def _load_wrench(b, first, count, wrench, gust, wind, wind_gust):
     """Load wrench and wind of a block, and add their gusts."""
     _load_rows(wrench, first, count, b.wrench)
     _load_rows(wind, first, count, b.wind)
-    if gust.shape[1] > 0:
-        add_gusts(b.force_world, gust, first, count)
-    if wind_gust.shape[1] > 0:
-        add_gusts(b.wind, wind_gust, first, count)
+    add_gusts(b.force_world, gust, first, count)
+    add_gusts(b.wind, wind_gust, first, count)
 
 
 @compiled(inline="always")
