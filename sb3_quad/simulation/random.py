@@ -38,7 +38,8 @@ _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     """Return streams before their first episode, shape (4, n), from n seeds.
 
-    None as a seed takes the operating system's entropy. A key is the first number of the generator that Gymnasium makes of the seed.
+    A key is the first number of the generator that Gymnasium makes of the seed. With None it comes
+    from the operating system's entropy.
     """
     streams = np.zeros((4, len(seeds)), dtype=np.uint32)
     keys = np.empty(len(seeds), dtype=np.uint64)

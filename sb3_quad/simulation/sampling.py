@@ -63,40 +63,41 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
         k += 1
     task_index[i] = k
     task = tasks[k]
-    column = min(i, vehicles.shape[1] - 1)
+    s = state[:, i]
+    vehicle = vehicles[:, min(i, vehicles.shape[1] - 1)]
 
     # A uniform direction has a uniform height (Archimedes), which is cut where the target would lie
     # too close to the ground.
     nearest = task[T.nearest_target]
     distance = nearest + (task[T.target_distance] - nearest) * u[12]
-    ground = vehicles[P.collision_radius, column] + task[T.target_clearance]
+    ground = vehicle[P.collision_radius] + task[T.target_clearance]
     lowest = -1.0
     if distance > 0.0:
         lowest = min(max(-1.0, (ground - task[T.start_position + 2]) / distance), 1.0)
     offset = _spherical(distance, lowest + (1.0 - lowest) * u[1], TURN * u[2])
     for axis in range(3):
-        state[X.position + axis, i] = task[T.start_position + axis]
-        state[X.target + axis, i] = state[X.position + axis, i] + offset[axis]
+        s[X.position + axis] = task[T.start_position + axis]
+        s[X.target + axis] = s[X.position + axis] + offset[axis]
 
-    state[X.quaternion, i] = 1.0
+    s[X.quaternion] = 1.0
     for axis in range(3):
-        state[X.quaternion + 1 + axis, i] = 0.0
+        s[X.quaternion + 1 + axis] = 0.0
     if task[T.random_attitude] != 0.0:
         # Uniform on SO(3) (Shoemake)
         a, b = math.sqrt(1.0 - u[3]), math.sqrt(u[3])
-        state[X.quaternion, i] = b * math.cos(TURN * u[5])
-        state[X.quaternion + 1, i] = a * math.sin(TURN * u[4])
-        state[X.quaternion + 2, i] = a * math.cos(TURN * u[4])
-        state[X.quaternion + 3, i] = b * math.sin(TURN * u[5])
+        s[X.quaternion] = b * math.cos(TURN * u[5])
+        s[X.quaternion + 1] = a * math.sin(TURN * u[4])
+        s[X.quaternion + 2] = a * math.cos(TURN * u[4])
+        s[X.quaternion + 3] = b * math.sin(TURN * u[5])
 
     spin = math.hypot(task[T.body_rates_std], task[T.hit_rates_std])
     for axis in range(3):
         velocity, rate = _normals(task[T.velocity_std], spin, u, 6 + 2 * axis)
-        state[X.velocity + axis, i] = velocity
-        state[X.body_rates + axis, i] = rate
-    hover = math.sqrt(vehicles[P.hover_thrust, column] / vehicles[P.thrust_coefficient, column])
+        s[X.velocity + axis] = velocity
+        s[X.body_rates + axis] = rate
+    hover = math.sqrt(vehicle[P.hover_thrust] / vehicle[P.thrust_coefficient])
     for rotor in range(4):
-        state[X.rotor_speeds + rotor, i] = hover
+        s[X.rotor_speeds + rotor] = hover
         for late in range(queue.shape[0]):
             queue[late, rotor, i] = hover
 
@@ -136,8 +137,8 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
         sample_from_distribution(i, streams, distribution, vehicles)
 
     # Forces in weights are those of the vehicle before it is randomized.
-    column = min(i, vehicles.shape[1] - 1)
-    weight = vehicles[P.mass, column] * vehicles[P.gravity, column]
+    vehicle = vehicles[:, min(i, vehicles.shape[1] - 1)]
+    weight = vehicle[P.mass] * vehicle[P.gravity]
     u = uniforms(streams, i, 4, DISTURBANCE)
     is_disturbed = u[0] < table[R.wrench_share]
     if table[R.force + 2] != FIXED or table[R.torque + 2] != FIXED:
@@ -148,7 +149,7 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
             in_body = table[R.force + V.in_body] != 0.0
             rows = W.force_body if in_body else W.force_world
             _write_vector(table, R.force, size, u[2], u[3], wrench, rows, i)
-            size = _magnitude(table, R.torque, u[4], weight * arm_length(column, vehicles))
+            size = _magnitude(table, R.torque, u[4], weight * arm_length(vehicle))
             in_body = table[R.torque + V.in_body] != 0.0
             rows = W.torque_body if in_body else W.torque_world
             _write_vector(table, R.torque, size, u[5], u[6], wrench, rows, i)
@@ -199,35 +200,36 @@ def _randomize_vehicle(i, streams, table, vehicles):
     u = uniforms(streams, i, 7, VEHICLE)
     if u[0] >= table[R.share]:
         return
-    nominal_mass = vehicles[P.mass, i]
+    v = vehicles[:, i]
+    nominal_mass = v[P.mass]
     mass = between(table, R.mass, u[1], 1.0)
-    vehicles[P.mass, i] *= mass
-    vehicles[P.hover_thrust, i] *= mass
+    v[P.mass] *= mass
+    v[P.hover_thrust] *= mass
     for axis in range(3):
-        vehicles[P.ixx + axis, i] *= between(table, R.inertia, u[2 + axis], 1.0)
-        vehicles[P.drag_x + axis, i] += nominal_mass * between(table, R.drag, u[13], 0.0)
+        v[P.ixx + axis] *= between(table, R.inertia, u[2 + axis], 1.0)
+        v[P.drag_x + axis] += nominal_mass * between(table, R.drag, u[13], 0.0)
     # No body has one moment larger than the other two together.
     for axis in range(3):
-        others = vehicles[P.ixx + (axis + 1) % 3, i] + vehicles[P.ixx + (axis + 2) % 3, i]
-        vehicles[P.ixx + axis, i] = min(vehicles[P.ixx + axis, i], others)
+        others = v[P.ixx + (axis + 1) % 3] + v[P.ixx + (axis + 2) % 3]
+        v[P.ixx + axis] = min(v[P.ixx + axis], others)
 
     motor_gain = between(table, R.motor_gain, u[5], 1.0)
-    vehicles[P.motor_gain_up, i] *= motor_gain * between(table, R.motor_gain_up, u[11], 1.0)
-    vehicles[P.motor_gain_down, i] *= motor_gain * between(table, R.motor_gain_down, u[12], 1.0)
+    v[P.motor_gain_up] *= motor_gain * between(table, R.motor_gain_up, u[11], 1.0)
+    v[P.motor_gain_down] *= motor_gain * between(table, R.motor_gain_down, u[12], 1.0)
     thrust = between(table, R.thrust, u[6], 1.0)
-    vehicles[P.thrust_middle, i] *= thrust
-    vehicles[P.thrust_half_range, i] *= thrust
+    v[P.thrust_middle] *= thrust
+    v[P.thrust_half_range] *= thrust
 
     # The arms are measured from the centre of mass: roll arms are y of the rotors, pitch arms -x.
     arm = between(table, R.arm, u[7], 1.0)
     x = between(table, R.center_of_mass, u[8], 0.0)
     y = between(table, R.center_of_mass, u[9], 0.0)
     for rotor in range(4):
-        vehicles[P.roll_arm_0 + rotor, i] = arm * vehicles[P.roll_arm_0 + rotor, i] - y
-        vehicles[P.pitch_arm_0 + rotor, i] = arm * vehicles[P.pitch_arm_0 + rotor, i] + x
+        v[P.roll_arm_0 + rotor] = arm * v[P.roll_arm_0 + rotor] - y
+        v[P.pitch_arm_0 + rotor] = arm * v[P.pitch_arm_0 + rotor] + x
     if table[R.delay + 2] != FIXED:
         delay = math.floor(between(table, R.delay, u[10], 0.0))
-        vehicles[P.delay, i] = min(delay, table[R.delay + 1] - 1.0)
+        v[P.delay] = min(delay, table[R.delay + 1] - 1.0)
 
 
 @compiled

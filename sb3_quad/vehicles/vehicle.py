@@ -20,7 +20,7 @@ from sb3_quad.vehicles.layout import Turn, find_turn
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 MAX_SUBSTEPS = 1000  # physics steps in a control step
-# Published moments of inertia are inaccurate: the largest may be this much of the sum of the others.
+# Published moments of inertia are inaccurate: the largest may be this much of the other two's sum.
 INACCURACY = 1.05
 MAX_PHYSICS_STEP = 0.0025  # s, up to which the compiled rotation is exact
 PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -97,7 +97,7 @@ class Vehicle(Frozen):
     )
     drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
         default=(0.0, 0.0, 0.0),
-        description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)",
+        description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler 2018)",
     )
     gravity: PositiveFloat = Field(default=9.81, description="g, m/s^2")
     thrust_limits: Limits = Field(
@@ -374,7 +374,7 @@ class Vehicle(Frozen):
 
     @property
     def hover_action(self) -> float:
-        """The action of each rotor in hover; 0 where hover is in the middle of the thrust limits."""
+        """Action of each rotor in hover; 0 if hover is in the middle of the thrust limits."""
         return float(self.thrust_to_action(np.array(self.hover_thrust)))
 
     @property
