@@ -376,15 +376,15 @@ def test_a_reserve_is_for_a_privileged_expert_and_not_negative(privileged, reser
         ({"delay": [0, 0.5]}, "whole control steps"),
         ({"force": {"magnitude": [-1, 1]}}, "greater than or equal to 0"),
         ({"force": {"magnitude": [0, 1], "direction": [0, 0, 0]}}, "must not be zero"),
-        ({"wind": {"magnitude": 1, "frame": "body"}}, "leave out unit and frame"),
-        ({"wind_gusts": {"std": 1, "unit": "weight"}}, "leave out unit and frame"),
+        ({"wind": {"magnitude": 1, "frame": "body"}}, "remove unit and frame"),
+        ({"wind_gusts": {"std": 1, "unit": "weight"}}, "remove unit and frame"),
         (
             {"center_of_mass": {"low": -1, "high": 1, "distribution": "log_uniform"}},
             "greater than 0",
         ),
         (
             {"center_of_mass": {"low": -0.01, "high": 0.01, "distribution": "uniform_cube_root"}},
-            "not negative",
+            "must not be negative",
         ),
         ("mass", "randomize"),
         ({"vehicles": {"distribution": "rapter"}}, "vehicle distribution 'rapter'"),

@@ -318,7 +318,7 @@ def test_a_layout_that_cannot_be_had_is_refused() -> None:
     long = ITM.model_copy(
         update={"rotor_positions": ((0.3, 0.05), (0.3, -0.05), (-0.3, -0.05), (-0.3, 0.05))}
     )
-    with pytest.raises(ConfigError, match="no turn brings the rotors"):
+    with pytest.raises(ConfigError, match="no yaw rotation and renumbering maps the rotors"):
         long.in_layout_of(ITM)
 
 

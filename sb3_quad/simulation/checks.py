@@ -1,4 +1,5 @@
-"""Checks of what users hand to an environment; every message names the thing and what is allowed.
+"""Checks of a user's arguments to an environment. Every message names the argument and the values
+that are allowed.
 
 :raises ConfigError: by every function.
 """
@@ -17,8 +18,8 @@ MAX_SIZE = 2048  # of a picture, pixels
 
 
 def per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
-    """``value`` of shape (size,) or (rows, size) as (size, rows); with no size, () or (rows,) as
-    (1, rows).
+    """Return ``value`` of shape (size,) or (rows, size) as (size, rows); without a size, () or
+    (rows,) as (1, rows).
     """
     try:
         array = np.asarray(value, dtype=np.float64)
@@ -35,7 +36,7 @@ def per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
 
 
 def whole_number(name: str, value: Any, least: int, most: int, unit: str = "") -> int:
-    """``value``, a whole number of ``least`` to ``most``."""
+    """Return ``value``, a whole number of ``least`` to ``most``."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or not least <= value <= most:
         raise ConfigError(f"{name} {value!r}: must be a whole number of {least} to {most}{unit}")
@@ -43,7 +44,7 @@ def whole_number(name: str, value: Any, least: int, most: int, unit: str = "") -
 
 
 def repeated(name: str, values: Sequence[Any], n: int) -> list[Any]:
-    """The values of n rows: row i has the i-th, and fewer values than rows repeat."""
+    """Return the values of n rows: row i has the i-th, and fewer values than rows repeat."""
     if not 0 < len(values) <= n:
         raise ConfigError(
             f"{name}: {len(values)} values for {n} environments; give from one to as many"
@@ -54,15 +55,16 @@ def repeated(name: str, values: Sequence[Any], n: int) -> list[Any]:
 def load_vehicles(
     sources: Sequence[Any], layout: str | Path | Vehicle | None = None
 ) -> list[Vehicle]:
-    """Vehicles whose time steps agree, with rotors in the layout of another vehicle if one is
+    """Return vehicles with the same time steps, in the layout of another vehicle if one is
     named.
     """
-    vehicles = [load_vehicle(each) for each in sources]
+    vehicles = [load_vehicle(source) for source in sources]
     if layout is not None:
         wanted = load_vehicle(layout)
-        vehicles = [each.in_layout_of(wanted) for each in vehicles]
-    for row, each in enumerate(vehicles):
-        if (each.physics_step, each.substeps) != (vehicles[0].physics_step, vehicles[0].substeps):
+        vehicles = [vehicle.in_layout_of(wanted) for vehicle in vehicles]
+    steps = (vehicles[0].physics_step, vehicles[0].substeps)
+    for row, vehicle in enumerate(vehicles):
+        if (vehicle.physics_step, vehicle.substeps) != steps:
             raise ConfigError(
                 f"vehicle of row {row}: physics_step and control_step must be those of row 0"
             )
@@ -70,6 +72,6 @@ def load_vehicles(
 
 
 def check_size(width: int, height: int) -> None:
-    """Refuse what is no size of a picture, in pixels."""
+    """Check the size of a picture, in pixels."""
     for name, value in (("render_width", width), ("render_height", height)):
         whole_number(name, value, 16, MAX_SIZE, " pixels")

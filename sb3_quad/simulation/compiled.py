@@ -16,30 +16,30 @@ from numba.extending import intrinsic
 
 from sb3_quad.base.process import print_once
 
-# Rows of a block; a multiple of every vector width, small enough for a block to stay in the first
+# Rows of a block: a multiple of every vector width, and few enough for a block to stay in the first
 # cache
 LANES = 64
 _COMPILED_IN = ("simulation", "vehicles", "experts", "algorithms/networks")
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """``numba.njit`` that releases the GIL, with a cache that notices a change in any module of
-    ``_COMPILED_IN``.
+    """Compile with ``numba.njit`` without the GIL, and keep the result in a cache that notices a
+    change in any module of ``_COMPILED_IN``.
 
-    Numba itself looks only at the file of the function, but code called from other files is
-    compiled in, too. Every call is inlined. Otherwise a cached and a freshly compiled copy may
-    round differently under ``fastmath``.
+    Numba itself looks only at the file of the function, but the code of functions from other files
+    is compiled in. Every call is inlined: otherwise a cached and a freshly compiled copy may round
+    differently under ``fastmath``.
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
     dispatcher = numba.njit(error_model="numpy", nogil=True, forceinline=True, **options)(function)
     try:
         dispatcher.enable_caching()
-    except (
-        RuntimeError
-    ):  # neither the package's folder nor the user's folder for caches can be written
+    except RuntimeError:
+        # Neither the package's folder nor the user's folder for caches can be written.
         print_once(
-            "compiled code cannot be kept and is made at every start, in about 15 s; set NUMBA_CACHE_DIR to a folder"
+            "compiled code cannot be cached and is compiled at every start, in about 15 s;"
+            " set NUMBA_CACHE_DIR to a folder"
         )
     else:
         dispatcher._cache._cache_file._source_stamp = _source_stamp()
@@ -48,8 +48,9 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 @functools.cache
 def _source_stamp() -> str:
-    """A digest of the sources; the same in a copy of the package elsewhere."""
-    package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
+    """Return a digest of the sources. It is the same for a copy of the package elsewhere."""
+    package = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
     for folder in _COMPILED_IN:
         for path in sorted((package / folder).glob("*.py")):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -65,13 +66,15 @@ class _Notice(event.Listener):
 
 
 def compile_notice() -> Any:
-    """Around a call that may compile: one line on stderr says so."""
+    """Return a context for a call that may compile, which then prints a line on stderr."""
     return event.install_listener("numba:compile", _Notice())
 
 
 @intrinsic
 def atomic_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Add to one number of an int64 array that other threads change, too; the number before."""
+    """Add to a number of an int64 array that other threads change as well; return the number
+    before.
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -83,4 +86,4 @@ def atomic_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 # The operating system's function that ends a thread's turn.
 _YIELD = "SwitchToThread" if sys.platform == "win32" else "sched_yield"
 give_way = types.ExternalFunction(_YIELD, types.int32())
-"""Let another thread have this core; found by its name wherever the code was compiled."""
+"""Yield the core. It is resolved by its symbol name, so cached code works in any process."""

@@ -1,9 +1,9 @@
-"""What a policy sees beside the present features: the last action, earlier frames, and the integral
-of the position error.
+"""The parts of an observation besides the present features: the last action, earlier frames, and
+the integral of the position error.
 
 A frame is the scaled features of a control step, with ``last_action`` followed by the action that
-led there. An observation is the frames of some ages, one after the other. The compiled functions
-keep the frames of a row and make observations of them.
+led there. An observation is the frames of several ages, one after the other. The compiled functions
+keep the frames of a row and build observations from them.
 """
 
 from typing import Any
@@ -19,13 +19,13 @@ MAX_AGE = 1000  # control steps
 
 
 class PositionIntegral(Frozen):
-    """s += ``gain`` e dt where e is shorter than ``distance`` and v than ``speed``; each component
-    stays within ±``limit``.
+    """An integral s of the position error e, the observed position relative to the target.
 
-    e is the observed position relative to the target, v the observed velocity; s is zero at an
-    episode's start. The policy sees e + s in place of e, also in earlier frames. It flies to where
-    e + s is zero, so that neither a constant force nor a bias of its own leaves an error. It need
-    not have been trained with the integral.
+    s += ``gain`` e dt in each control step in which |e| is less than ``distance`` and the observed
+    speed less than ``speed``. Each component stays within ±``limit``, and s is zero when an episode
+    starts. The policy sees e + s in place of e, also in earlier frames. It flies to where e + s is
+    zero, so neither a constant force nor a bias of the policy leaves a steady error. A policy that
+    was trained without the integral can fly with it.
     """
 
     gain: PositiveFloat = Field(default=0.5, le=100, description="1/s")
@@ -34,23 +34,27 @@ class PositionIntegral(Frozen):
     limit: PositiveFloat = Field(default=3.0, le=1e3, description="m")
 
     def numbers(self, control_step: float) -> list[float]:
-        """What :func:`integrate_position` reads: gain dt, distance², speed², limit."""
+        """Return gain dt, distance², speed² and limit, which :func:`integrate_position` reads.
+
+        :param control_step: dt, s.
+        """
         return [self.gain * control_step, self.distance**2, self.speed**2, self.limit]
 
 
 class ObservationSettings(Frozen):
-    """What an observation is made of; the default is the 18 features alone."""
+    """The content of an observation; by default the 18 features alone."""
 
     last_action: bool = Field(
         default=False,
-        description="whether a frame ends with the action before it, clipped to [-1, 1]",
+        description="whether a frame ends with the action that led to it, clipped to [-1, 1]",
     )
     history: tuple[int, ...] | None = Field(
         default=None,
-        description="ages of the frames, control steps, such as [0, 1, 2, 4]; zeros before the episode began",
+        description="ages of the frames, control steps, such as [0, 1, 2, 4]; frames from before"
+        " the episode are zeros",
     )
     position_integral: PositionIntegral | None = Field(
-        default=None, description="see PositionIntegral; {} for its defaults"
+        default=None, description="fields of PositionIntegral; {} for its defaults"
     )
 
     @field_validator("history", mode="before")
@@ -63,9 +67,10 @@ class ObservationSettings(Frozen):
     @field_validator("history")
     @classmethod
     def _rises(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        if value is not None and (
-            not value or value[0] != 0 or list(value) != sorted(set(value)) or value[-1] > MAX_AGE
-        ):
+        if value is None:
+            return None
+        rises = list(value) == sorted(set(value))
+        if not value or not rises or value[0] != 0 or value[-1] > MAX_AGE:
             raise ValueError(
                 f"{list(value)}: must rise from 0, the present frame, to at most {MAX_AGE}"
             )
@@ -94,8 +99,9 @@ class ObservationSettings(Frozen):
 
 @compiled
 def store_action(i, step, action, frames):
-    """Keep the action (4,) that led row i to control step ``step``, in place; ``frames`` as in
-    :func:`observe_frames`.
+    """Keep the action (4,) that led row i to control step ``step``, in place.
+
+    :param frames: see :func:`observe_frames`.
     """
     slot = step % frames.shape[1]
     for k in range(frames.shape[2] - OBSERVATION_SIZE):
@@ -118,20 +124,22 @@ def integrate_position(i, feature, lane, mean, inverse_std, numbers, integral):
 
     :param numbers: float64 (4,), :meth:`PositionIntegral.numbers`.
     """
-    error2 = speed2 = 0.0
+    gain_dt, distance2, speed2, limit = numbers[0], numbers[1], numbers[2], numbers[3]
+    e2 = v2 = 0.0
     for axis in range(3):
-        k, m = F.position + axis, F.velocity + axis
-        e = feature[k, lane] / inverse_std[k, lane] + mean[k, lane]
-        v = feature[m, lane] / inverse_std[m, lane] + mean[m, lane]
-        error2 += e * e
-        speed2 += v * v
-    if error2 < numbers[1] and speed2 < numbers[2]:
+        e = _unscaled(F.position + axis, feature, lane, mean, inverse_std)
+        v = _unscaled(F.velocity + axis, feature, lane, mean, inverse_std)
+        e2 += e * e
+        v2 += v * v
+    if e2 < distance2 and v2 < speed2:
         for axis in range(3):
-            k = F.position + axis
-            e = feature[k, lane] / inverse_std[k, lane] + mean[k, lane]
-            integral[axis, i] = min(
-                max(integral[axis, i] + numbers[0] * e, -numbers[3]), numbers[3]
-            )
+            e = _unscaled(F.position + axis, feature, lane, mean, inverse_std)
+            integral[axis, i] = min(max(integral[axis, i] + gain_dt * e, -limit), limit)
+
+
+@compiled(inline="always")
+def _unscaled(k, feature, lane, mean, inverse_std):
+    return feature[k, lane] / inverse_std[k, lane] + mean[k, lane]
 
 
 @compiled
@@ -139,10 +147,9 @@ def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, 
     """Keep row i's present frame and write its observation, in place.
 
     :param step: control steps since the episode began.
-    :param feature: scaled features, float32 (OBSERVATION_SIZE, lanes), of which ``lane`` is the
-        row's.
+    :param feature: scaled features, float32 (OBSERVATION_SIZE, lanes); row i is in ``lane``.
     :param integral: float64 (3, n), or (0, n) without.
-    :param ages: int64, of the observed frames, control steps.
+    :param ages: int64, ages of the observed frames, control steps.
     :param frames: float32 (n, depth, frame_size), the frames of the latest control steps, step s in
         slot s % depth.
     :param out: float32 (n, size).

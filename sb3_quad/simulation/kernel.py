@@ -120,7 +120,7 @@ def _add_alias(fields: Any, whole: str, part: str, row: int, shape: Any = ()) ->
     fields[part] = np.dtype(("f8", (*np.empty(shape).shape, LANES))), place
 
 
-def _block_type() -> np.dtype[Any]:
+def _block_type() -> Any:
     """Return the type of a block.
 
     Fields alias: block.velocity is a view of some rows of block.state, so that the state is loaded
@@ -197,8 +197,8 @@ def step(
     outcome, last_observations,
     physics_step, substeps, own_delays, autoreset,
 ):  # fmt: skip
-    """Compute a control step of all rows, of which this thread takes as many as others leave it;
-    see :func:`.threads.share_out`.
+    """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
+    :func:`.threads.share_out`.
 
     The arrays are flat arguments: with them in a named tuple numba took twice as long to compile,
     and each block a tenth longer. The parts of a step are functions that numba inlines
@@ -442,10 +442,8 @@ def _load_wrench(b, first, count, wrench, gust, wind, wind_gust):
     """Load wrench and wind of a block, and add their gusts."""
     _load_rows(wrench, first, count, b.wrench)
     _load_rows(wind, first, count, b.wind)
-    if gust.shape[1] > 0:
-        add_gusts(b.force_world, gust, first, count)
-    if wind_gust.shape[1] > 0:
-        add_gusts(b.wind, wind_gust, first, count)
+    add_gusts(b.force_world, gust, first, count)
+    add_gusts(b.wind, wind_gust, first, count)
 
 
 @compiled(inline="always")

@@ -38,7 +38,8 @@ _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     """Return streams before their first episode, shape (4, n), from n seeds.
 
-    None as a seed takes the operating system's entropy. A key is the first number of the generator that Gymnasium makes of the seed.
+    A key is the first number of the generator that Gymnasium makes of the seed. With None it comes
+    from the operating system's entropy.
     """
     streams = np.zeros((4, len(seeds)), dtype=np.uint32)
     keys = np.empty(len(seeds), dtype=np.uint64)
@@ -154,9 +155,10 @@ def standard_normals(b):
             second = cosine if odd else sine
             first_sign = int32((quadrant ^ (quadrant >> int32(1))) & int32(1)) << int32(31)
             second_sign = int32(quadrant >> int32(1)) << int32(31)
-            noise[2 * pair, lane] = radius * np.int32(
-                np.float32(first).view(np.int32) ^ first_sign
-            ).view(np.float32)
-            noise[2 * pair + 1, lane] = radius * np.int32(
-                np.float32(second).view(np.int32) ^ second_sign
-            ).view(np.float32)
+            noise[2 * pair, lane] = radius * _flip_sign(first, first_sign)
+            noise[2 * pair + 1, lane] = radius * _flip_sign(second, second_sign)
+
+
+@compiled(inline="always")
+def _flip_sign(x, sign_bit):
+    return np.int32(np.float32(x).view(np.int32) ^ sign_bit).view(np.float32)

@@ -16,8 +16,7 @@ def _length(x, y, z):
 
 @compiled(fastmath=True)
 def _tilt(sine2, cosine2):
-    """Return arccos(R33) from the squared sine and cosine of its half (their sum is 1), to 1e-15 and
-    without a library call.
+    """Return arccos(R33) from the squared sine and cosine of its half, to 1e-15.
 
     With the smaller as the sine of an angle up to π/4, its halved tangent is at most 0.4142; the
     arctangent up to there is Cephes' rational approximation. The arccosine itself would lose half
@@ -48,10 +47,10 @@ def succeeds(b, lane):
 def score(b):
     """Write ``b.reward`` and ``b.distance``, |r - r_T| in m, of a loaded block.
 
-    It reads the true state at the end of a control step. The reward is -0.003 |r - r_T| - 0.002 arccos(R33) - 0.0005 |ω| (Eqs. 4.5-4.7), less 15 for
-    touching the ground (Eq. 4.8) and 15 for leaving the range (Eq. 4.9), with the coefficients of
-    the row's task. A ``precision_cost``, which the thesis does not have, is steep in the last
-    metre, where Eq. 4.5 is not.
+    It reads the true state at the end of a control step. The reward is -0.003 |r - r_T| - 0.002
+    arccos(R33) - 0.0005 |ω| (Eqs. 4.5-4.7), less 15 for touching the ground (Eq. 4.8) and 15 for
+    leaving the range (Eq. 4.9), with the coefficients of the row's task. A ``precision_cost``,
+    which the thesis does not have, is steep in the last metre, where Eq. 4.5 is not.
     """
     cost = b.scored
     for lane in range(LANES):

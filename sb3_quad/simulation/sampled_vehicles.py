@@ -13,25 +13,24 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 def sample_vehicles(
     vehicles: Any, n: int, seed: int = 0, vehicle: str | Vehicle = "itm"
 ) -> list[Vehicle]:
-    """n vehicles of a distribution, such as ``sample_vehicles("raptor", 1000)``.
+    """Return n vehicles of a distribution, such as ``sample_vehicles("raptor", 1000)``.
 
     :param vehicles: a name, a path, a
         :class:`~sb3_quad.simulation.vehicle_distribution.VehicleDistribution` or its fields.
     :param seed: vehicle i is that of the first episode of row i in environments of this seed.
-    :param vehicle: the base vehicle, which says what the distribution does not.
+    :param vehicle: the base vehicle, for what the distribution does not set.
     :raises ConfigError: an unknown name or field, or a value that does not fit; or some of them
         could not fly.
     """
-    base, distribution = load_vehicle(vehicle), validate(VehicleDistribution, vehicles, "vehicles")
+    base = load_vehicle(vehicle)
+    distribution = validate(VehicleDistribution, vehicles, "vehicles")
     batch = QuadcopterBatch(n, FlightSettings(vehicles=distribution, vehicle=base), seed)
     batch.reset()
-    found = []
+    sampled = []
     for number, column in enumerate(batch.vehicles.T):
-        hover, middle, half = (
-            column[P.hover_thrust],
-            column[P.thrust_middle],
-            column[P.thrust_half_range],
-        )
+        hover = column[P.hover_thrust]
+        middle = column[P.thrust_middle]
+        half = column[P.thrust_half_range]
         roll, pitch = column[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4)
         changes = {
             "name": f"sampled_{seed}_{number}",
@@ -47,5 +46,5 @@ def sample_vehicles(
             "thrust_limits": ((middle - half) / hover, (middle + half) / hover),
             "collision_radius": column[P.collision_radius],
         }
-        found.append(base.model_copy(update=changes))
-    return found
+        sampled.append(base.model_copy(update=changes))
+    return sampled

@@ -1,8 +1,8 @@
 """Threads that share a compiled function's work in chunks.
 
-Whoever comes takes the next chunk: a thread that is late, or never comes, costs time but changes
-nothing. Numba's own pools do not suit: one spins between calls and fights torch for the cores, and
-forbids fork.
+Every thread takes the next free chunk: a thread that comes late, or not at all, costs time but
+changes nothing. Numba's own pools do not suit: one spins between calls and competes with torch for
+the cores, and forbids fork.
 """
 
 import os
@@ -15,22 +15,20 @@ import numpy as np
 
 from sb3_quad.simulation.compiled import atomic_add, compiled, give_way
 
-LEFT, DONE, LATE, CONTROL = (
-    0,
-    16,
-    32,
-    48,
-)  # places in a control array, each on a cache line of its own, and its size
-# Looks at a chunk that another thread still has, before that gets the core: some 30 microseconds
+# Places in a control array, each on a cache line of its own, and its size
+LEFT, DONE, LATE, CONTROL = 0, 16, 32, 48
+# Looks at a chunk that another thread still has, before that thread gets the core: about 30 µs
 SPIN = 20_000
-PATIENCE = 5_000  # looks after that, with which the call counts as late: longer than a chunk takes
-REST = 100  # calls without other threads after a late one: their core is busy with something else
+# Looks after that, with which the call counts as late: longer than a chunk takes
+PATIENCE = 5_000
+# Calls without other threads after a late one: something else keeps their core busy.
+REST = 100
 
 
 @compiled
 def finish(control, chunks):
-    """Wait for the chunks that other threads still have, and note in ``control[LATE]`` whether one
-    has lost its core.
+    """Wait for the chunks that other threads still have. ``control[LATE]`` says whether one has
+    lost its core.
     """
     looks = 0
     while atomic_add(control, DONE, 0) < chunks:
@@ -41,7 +39,7 @@ def finish(control, chunks):
 
 
 class _Pool:
-    """Threads that sleep until there is a call to take chunks of."""
+    """Threads that sleep until there is a call whose chunks they can take."""
 
     def __init__(self) -> None:
         self.begun = self.resting = 0
@@ -51,23 +49,25 @@ class _Pool:
         while True:
             function, arguments = self.calls.get()
             function(*arguments)
-            del function, arguments  # nothing stays alive while this thread sleeps
+            # Nothing stays alive while this thread sleeps.
+            del function, arguments
 
 
 _pool = _Pool()
 
 
 def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> Any:
-    """``function(control, True, *arguments)``, while up to so many threads call it with False; what
-    it returns here.
+    """Return ``function(control, True, *arguments)``, while up to ``helpers`` threads call it with
+    False.
 
-    :param function: a compiled one. With True it sets ``control[LEFT]`` to the number of chunks
-        first, and at its end calls :func:`finish`. In all threads it takes chunks by
+    :param function: a compiled function. With True it sets ``control[LEFT]`` to the number of
+        chunks first, and calls :func:`finish` last. In all threads it takes chunks by
         ``atomic_add(control, LEFT, -1)`` and counts those done in ``control[DONE]``. It is one
-        call, since an interrupt, which Python sees to between two calls, must leave nothing half
+        call, because Python handles an interrupt between two calls, and nothing may be left half
         done.
     """
-    pool, control = _pool, np.zeros(CONTROL, np.int64)
+    pool = _pool
+    control = np.zeros(CONTROL, np.int64)
     if helpers < 1:
         return function(control, True, *arguments)
     if pool.resting > 0:
@@ -86,7 +86,8 @@ def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> An
 
 def _renew() -> None:
     global _pool
-    _pool = _Pool()  # a forked child has no threads but the one that forked
+    # A forked child has only the thread that forked.
+    _pool = _Pool()
 
 
 if hasattr(os, "register_at_fork"):

@@ -92,8 +92,8 @@ class VehicleDistribution(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, data: Any) -> Any:
-        """``distribution`` is a name, or the path of a YAML file; the other keys replace its ranges.
-        A name or path alone means the same.
+        """Read ``distribution``, a name or the path of a YAML file, whose ranges the other keys
+        replace. A name or path alone means the same.
         """
         if isinstance(data, (str, Path)):
             data = {"distribution": data}
@@ -158,52 +158,56 @@ def sample_from_distribution(i, streams, table, vehicles):
         return
     u = uniforms(streams, i, 5, DISTRIBUTION)
     mass = between(table, D.mass, u[0], 1.0)
-    mass_ratio = mass / vehicles[P.mass, i]
+    v = vehicles[:, i]
+    mass_ratio = mass / v[P.mass]
     most = between(table, D.thrust_to_weight, u[1], 1.0)
     least = between(table, D.least_thrust, u[5], 0.0)
-    hover = mass * vehicles[P.gravity, i] / 4.0
+    hover = mass * v[P.gravity] / 4.0
 
     # Drag first, since that of the base vehicle grows with the mass.
     for axis in range(3):
-        nominal = vehicles[P.drag_x + axis, i] * mass_ratio / mass
-        vehicles[P.drag_x + axis, i] = mass * between(table, D.drag, u[9], nominal)
-    vehicles[P.mass, i] = mass
-    vehicles[P.hover_thrust, i] = hover
-    vehicles[P.thrust_middle, i] = hover * (most + least) / 2.0
-    vehicles[P.thrust_half_range, i] = hover * (most - least) / 2.0
+        nominal = v[P.drag_x + axis] * mass_ratio / mass
+        v[P.drag_x + axis] = mass * between(table, D.drag, u[9], nominal)
+    v[P.mass] = mass
+    v[P.hover_thrust] = hover
+    v[P.thrust_middle] = hover * (most + least) / 2.0
+    v[P.thrust_half_range] = hover * (most - least) / 2.0
     # The rotors turn as fast as those of the base vehicle.
-    vehicles[P.thrust_coefficient, i] *= mass_ratio
+    v[P.thrust_coefficient] *= mass_ratio
     slow = between(table, D.motor_time_constant, u[3], 1.0)
-    vehicles[P.exact_motors, i] = 1.0
-    vehicles[P.motor_gain_up, i] = 1.0 / slow
-    vehicles[P.motor_gain_down, i] = 1.0 / between(table, D.motor_time_constant_down, u[8], slow)
+    v[P.exact_motors] = 1.0
+    v[P.motor_gain_up] = 1.0 / slow
+    v[P.motor_gain_down] = 1.0 / between(table, D.motor_time_constant_down, u[8], slow)
 
     # Size and arms, of a standard normal from two uniforms (Box-Muller).
     normal = math.sqrt(-2.0 * math.log(u[6])) * math.cos(2.0 * math.pi * u[7])
     x = table[D.size_deviation] * (normal - 1.0)
     size = mass_ratio ** (1.0 / 3.0) * (1.0 + x if x >= 0.0 else 1.0 / (1.0 - x))
-    vehicles[P.collision_radius, i] *= size
+    v[P.collision_radius] *= size
     ratio = between(table, D.moment_thrust_ratio, u[4], 1.0)
     for rotor in range(4):
-        vehicles[P.roll_arm_0 + rotor, i] *= size
-        vehicles[P.pitch_arm_0 + rotor, i] *= size
-        vehicles[P.yaw_arm_0 + rotor, i] = math.copysign(ratio, vehicles[P.yaw_arm_0 + rotor, i])
+        v[P.roll_arm_0 + rotor] *= size
+        v[P.pitch_arm_0 + rotor] *= size
+        v[P.yaw_arm_0 + rotor] = math.copysign(ratio, v[P.yaw_arm_0 + rotor])
 
     # Inertia: the ratios of its axes, then its size by Ixx.
     for axis in range(3):
         if table[D.inertia_ratios] != 0.0:
-            vehicles[P.ixx + axis, i] = table[D.inertia_ratios + axis]
-    torque = arm_length(i, vehicles) * hover * most
-    factor = torque / between(table, D.torque_to_inertia, u[2], 1.0) / vehicles[P.ixx, i]
+            v[P.ixx + axis] = table[D.inertia_ratios + axis]
+    torque = arm_length(v) * hover * most
+    factor = torque / between(table, D.torque_to_inertia, u[2], 1.0) / v[P.ixx]
     for axis in range(3):
-        vehicles[P.ixx + axis, i] *= factor
+        v[P.ixx + axis] *= factor
 
 
 @compiled
-def arm_length(column, vehicles):
-    """Return the distance of the outermost rotor from the centre of mass, m."""
+def arm_length(vehicle):
+    """Return the distance of the outermost rotor from the centre of mass, m.
+
+    :param vehicle: float64 (len(PARAMETER_NAMES),).
+    """
     longest = 0.0
     for rotor in range(4):
-        x, y = vehicles[P.pitch_arm_0 + rotor, column], vehicles[P.roll_arm_0 + rotor, column]
+        x, y = vehicle[P.pitch_arm_0 + rotor], vehicle[P.roll_arm_0 + rotor]
         longest = max(longest, math.sqrt(x * x + y * y))
     return longest

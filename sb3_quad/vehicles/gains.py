@@ -1,6 +1,4 @@
-"""The gains of the geometric expert as a vehicle's YAML holds them, and how well the expert flies
-with them.
-"""
+"""The gains of the geometric expert in a vehicle's YAML, and the results of flights with them."""
 
 from typing import Any
 
@@ -51,15 +49,17 @@ class GeometricGains(Frozen):
     )
     yaw_rate: PositiveFloat = Field(description="angular deceleration per yaw rate, 1/s")
     descent_deceleration: PositiveFloat = Field(
-        description="the same from above: less, so that an agent that imitates it imprecisely does not overshoot, m/s²"
+        description="vertical deceleration planned from above, m/s²; less, so that an agent that"
+        " imitates the expert imprecisely does not overshoot"
     )
     measured: dict[str, Any] | None = Field(
         default=None,
-        description="what these gains reached, as ``measure_expert`` in examples/tune_expert.py gives it",
+        description="results of flights with these gains, from ``measure_expert`` in"
+        " examples/tune_expert.py",
     )
 
     def values(self) -> FloatArray:
-        """The gains alone, in the order of the fields."""
+        """Return the gains alone, in the order of the fields."""
         return np.array([getattr(self, name) for name in GAIN_NAMES])
 
 

@@ -1,5 +1,5 @@
-"""Vehicles: the validated parameters of one quadcopter, their derived values, and the YAML files
-that hold them.
+"""Vehicles: the validated parameters of a quadcopter, the values derived from them, and the YAML
+files that hold them.
 """
 
 import math
@@ -20,55 +20,61 @@ from sb3_quad.vehicles.layout import Turn, find_turn
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 MAX_SUBSTEPS = 1000  # physics steps in a control step
-INACCURACY = (
-    1.05  # of published moments of inertia: what the largest may be by the sum of the other two
-)
-MAX_PHYSICS_STEP = 0.0025  # s, for which the compiled rotation is exact
+# Published moments of inertia are inaccurate: the largest may be this much of the other two's sum.
+INACCURACY = 1.05
+MAX_PHYSICS_STEP = 0.0025  # s, up to which the compiled rotation is exact
 PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
-# What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of
-# an array (parameters, n).
 PARAMETER_NAMES = (
-    *(
-        "mass",
-        "ixx",
-        "iyy",
-        "izz",
-        "thrust_coefficient",
-        "motor_gain_up",
-        "motor_gain_down",
-        "exact_motors",
-    ),
-    *("gravity", "drag_x", "drag_y", "drag_z"),
-    *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius", "delay"),
+    "mass",
+    "ixx",
+    "iyy",
+    "izz",
+    "thrust_coefficient",
+    "motor_gain_up",
+    "motor_gain_down",
+    "exact_motors",
+    "gravity",
+    "drag_x",
+    "drag_y",
+    "drag_z",
+    "hover_thrust",
+    "thrust_middle",
+    "thrust_half_range",
+    "collision_radius",
+    "delay",
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
 )
-NAME = (
-    r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
-)
+"""The numbers of :meth:`Vehicle.parameters`, and the rows of an array (parameters, n) of n
+vehicles.
+"""
+# A name becomes a part of file names, and of the text in reports and exported files.
+NAME = r"^[^/\\<>\p{C}]{1,100}$"
 Limits = tuple[NonNegativeFloat, PositiveFloat]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
-_FOUND = ("geometric_gains", "time_optimal")  # for a vehicle
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
+# Results of searches for one vehicle; another with other parameters does not have them.
+_FOUND = ("geometric_gains", "time_optimal")
 
 
 class Vehicle(Frozen):
-    """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that
-    follow from them.
+    """The parameters of a quadcopter (specification table; thesis 4.1.1) and the values derived
+    from them.
 
-    The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover
-    thrusts, ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. These become
-    ``thrust_limits``, which a copy with another mass keeps, and are None. ``motor_gain`` stands for
-    ``motor_gain_up`` and ``motor_gain_down`` where both are the same.
+    You may give the limits of the rotors as they are published: ``rotor_thrust_limits`` in N or
+    ``rotor_speed_limits`` in rad/s, in place of ``thrust_limits`` in hover thrusts. They become
+    ``thrust_limits``, which a copy with another mass keeps, and are None afterwards. ``motor_gain``
+    sets both ``motor_gain_up`` and ``motor_gain_down``.
 
-    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises
-    :class:`ConfigError` through :func:`load_vehicle`, pydantic's ``ValidationError`` when built
-    directly.
+    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` returns another vehicle, also validated.
+    :func:`load_vehicle` raises :class:`ConfigError` for values that do not fit, the constructor
+    pydantic's ``ValidationError``.
     """
 
     name: str = Field(
         pattern=NAME,
-        description="what the vehicle is called; up to 100 characters, none of / \\ < > or control",
+        description="name of the vehicle: up to 100 characters, without / \\ < > and control"
+        " characters",
     )
     mass: PositiveFloat = Field(description="m, kg")
     inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
@@ -86,11 +92,12 @@ class Vehicle(Frozen):
     motor_gain_down: PositiveFloat = Field(description="k_m of a rotor that slows down, 1/s")
     motor_integration: Literal["euler", "exact"] = Field(
         default="euler",
-        description="euler: Eq. 4.1 as printed, thrust of the new speed; exact: the speed's exponential, thrust of its middle",
+        description="euler: Eq. 4.1 as printed, thrust of the new speed; exact: the exponential"
+        " solution, thrust of the step's middle",
     )
     drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
         default=(0.0, 0.0, 0.0),
-        description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)",
+        description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler 2018)",
     )
     gravity: PositiveFloat = Field(default=9.81, description="g, m/s^2")
     thrust_limits: Limits = Field(
@@ -98,10 +105,10 @@ class Vehicle(Frozen):
         description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)",
     )
     rotor_thrust_limits: Limits | None = Field(
-        default=None, exclude=True, description="the same in N"
+        default=None, exclude=True, description="least and greatest rotor thrust, N"
     )
     rotor_speed_limits: Limits | None = Field(
-        default=None, exclude=True, description="the same as rotor speeds, rad/s"
+        default=None, exclude=True, description="least and greatest rotor speed, rad/s"
     )
     physics_step: PositiveFloat = Field(
         default=0.0025, le=MAX_PHYSICS_STEP, description="s; at most 0.0025"
@@ -117,55 +124,55 @@ class Vehicle(Frozen):
     )
     geometric_gains: GeometricGains | None = Field(
         default=None,
-        description="gains of the geometric expert, found for this vehicle; without them it derives its own",
+        description="gains of the geometric expert that were tuned for this vehicle; without them"
+        " the expert derives its own",
     )
     time_optimal: dict[PositiveFloat, PositiveFloat] | None = Field(
         default=None,
-        description="by distance, m: least time from hover to rest within 0.1 m of a target, s (examples/time_optimal.py)",
+        description="least time from hover to rest within 0.1 m of a target, s, by its distance, m"
+        " (examples/time_optimal.py)",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _same_motor_gains(cls, data: Any) -> Any:
-        """``motor_gain`` as ``motor_gain_up`` and ``motor_gain_down``."""
+        """Replace ``motor_gain`` by ``motor_gain_up`` and ``motor_gain_down``."""
         if not isinstance(data, Mapping) or "motor_gain" not in data:
             return data
         if data.keys() & MOTOR_GAINS:
             raise ValueError("motor_gain: give it, or motor_gain_up and motor_gain_down")
-        others = {key: value for key, value in data.items() if key != "motor_gain"}
-        return {**others, **dict.fromkeys(MOTOR_GAINS, data["motor_gain"])}
+        changed = dict(data)
+        return {**dict.fromkeys(MOTOR_GAINS, changed.pop("motor_gain")), **changed}
 
     @model_validator(mode="after")
     def _limits_as_published(self) -> "Vehicle":
-        """``rotor_thrust_limits`` or ``rotor_speed_limits`` as ``thrust_limits`` (F = kF ω²)."""
-        given = [
-            name
-            for name in LIMITS
-            if name in self.model_fields_set and getattr(self, name) is not None
-        ]
+        """Replace ``rotor_thrust_limits`` or ``rotor_speed_limits`` by ``thrust_limits``."""
+        given = [name for name in self.model_fields_set & {*LIMITS} if getattr(self, name)]
         if len(given) != 1:
-            raise ValueError(f"{' and '.join(given or LIMITS)}: give exactly one of them")
-        low, high = getattr(self, given[0])
-        if given[0] != "thrust_limits":
-            if low >= high:
-                raise ValueError(f"{given[0]} [{low:g}, {high:g}]: must rise")
-            if given[0] == "rotor_speed_limits":
-                low, high = self.thrust_coefficient * low**2, self.thrust_coefficient * high**2
-            own = {
-                "thrust_limits": (low / self.hover_thrust, high / self.hover_thrust),
-                given[0]: None,
-            }
-            for name, value in own.items():
-                object.__setattr__(self, name, value)
+            names = [name for name in LIMITS if not given or name in given]
+            raise ValueError(f"{' and '.join(names)}: give exactly one of them")
+        (name,) = given
+        if name == "thrust_limits":
+            return self
+        low, high = getattr(self, name)
+        if low >= high:
+            raise ValueError(f"{name} [{low:g}, {high:g}]: must rise")
+        if name == "rotor_speed_limits":
+            # F = kF ω² (Eq. 2.4)
+            low, high = self.thrust_coefficient * low**2, self.thrust_coefficient * high**2
+        hover = self.hover_thrust
+        # The model is frozen for everybody else.
+        object.__setattr__(self, "thrust_limits", (low / hover, high / hover))
+        object.__setattr__(self, name, None)
         return self
 
     @model_validator(mode="after")
     def _consistent(self) -> "Vehicle":
         low, high = self.thrust_limits
         if not low < 1.0 < high:
-            limits = f"thrust_limits [{low:.4g}, {high:.4g}] for a mass of {self.mass:g} kg"
             raise CannotHover(
-                f"{limits}: hover (1.0) must lie between them, or it cannot hover; is the mass in kg?"
+                f"thrust_limits [{low:.4g}, {high:.4g}] for a mass of {self.mass:g} kg:"
+                " hover (1.0) must lie between them, or it cannot hover; is the mass in kg?"
             )
         if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
             raise ValueError(
@@ -176,47 +183,51 @@ class Vehicle(Frozen):
         substeps = self.control_step / self.physics_step
         if abs(substeps - round(substeps)) > 1e-9 or not 1 <= round(substeps) <= MAX_SUBSTEPS:
             raise ValueError(
-                f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step},"
-                f" at most {MAX_SUBSTEPS} times"
+                f"control_step {self.control_step}: must be a whole multiple of physics_step"
+                f" {self.physics_step}, at most {MAX_SUBSTEPS} times"
             )
         gain = max(self.motor_gain_up, self.motor_gain_down)
         if gain * self.physics_step > 1.0:
             raise ValueError(
-                f"motor_gain {gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)"
+                f"motor_gain {gain}: times physics_step it may not exceed 1, or Eq. 4.1 overshoots"
             )
         mixer = self.mixer
         if abs(np.linalg.det(mixer)) < 1e-12:
             raise ValueError(
-                "rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently"
+                "rotor_positions: these rotors cannot give thrust, roll, pitch and yaw"
+                " independently"
             )
         if not np.allclose(mixer[1:].sum(axis=1), 0.0, atol=1e-9):
             raise ValueError(
-                "rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)"
+                "rotor_positions: equal thrusts must give no moment (rotors symmetrical about the"
+                " centre of mass)"
             )
         return self
 
     def model_copy(
         self, *, update: Mapping[str, Any] | None = None, deep: bool = False
     ) -> "Vehicle":
-        """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated.
+        """Return another vehicle that differs in ``update``; unlike pydantic's own method, this
+        validates it.
 
-        ``geometric_gains`` and ``time_optimal`` were found for this vehicle: one that differs in
-        more than its name and its gains has none, unless ``update`` brings some.
+        ``geometric_gains`` and ``time_optimal`` were found for this vehicle. A copy that differs in
+        more than its name and its gains does not have them, unless ``update`` brings some.
         """
         changes = dict(update or {})
+        own = self.model_dump()
         if changes.keys() - {"name", "geometric_gains"}:
-            changes = {**dict.fromkeys(_FOUND), **changes}
-        replaced = {*MOTOR_GAINS} if "motor_gain" in changes else set()
-        own = self.model_dump(
-            exclude=replaced | {"thrust_limits"} if changes.keys() & {*LIMITS} else replaced
-        )
+            own.update(dict.fromkeys(_FOUND))
+        # An update may state these in another way.
+        if "motor_gain" in changes:
+            del own["motor_gain_up"], own["motor_gain_down"]
+        if changes.keys() & {*LIMITS}:
+            del own["thrust_limits"]
         return Vehicle.model_validate({**own, **changes})
 
     def turn_to(self, other: "Vehicle") -> Turn:
-        """The turn of the body axes, and the order of the rotors, by which each is where ``other``
-        has it.
+        """Return the yaw rotation and renumbering that map each rotor onto one of ``other``.
 
-        :raises ConfigError: there is none.
+        :raises ConfigError: no turn does.
         """
         turn = find_turn(
             self.rotor_positions,
@@ -226,20 +237,21 @@ class Vehicle(Frozen):
         )
         if turn is None:
             raise ConfigError(
-                f"rotor_layout: no turn brings the rotors of {self.name} to where those of {other.name} are, directions "
-                "included; an agent flies only vehicles whose rotors are where it knows them, once turned and renumbered"
+                "rotor_layout: rotor layouts are incompatible: no yaw rotation and renumbering maps"
+                f" the rotors of {self.name} (position and spin direction) onto those of"
+                f" {other.name}"
             )
         return turn
 
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
-        """The same vehicle, its body axes turned about z and its rotors renumbered: each is where
-        ``other`` has it.
+        """Return the same vehicle in the layout of another: its body axes are turned about z and
+        its rotors renumbered until each is where ``other`` has it.
 
-        A policy knows one order of the rotors. So it can fly vehicles that number theirs in another
-        way, or whose rotors form a plus instead of an X.
+        A policy knows one order of the rotors. In its layout it can also fly vehicles that number
+        their rotors in another way, or whose rotors form a plus instead of an X.
 
-        :raises ConfigError: no turn brings its rotors there; or it would turn axes of different
-            moments of inertia, off which there are products of inertia.
+        :raises ConfigError: no turn maps the rotors; or it turns axes of different moments of
+            inertia, which would give products of inertia.
         """
         turn = self.turn_to(other)
         if turn == Turn():
@@ -247,24 +259,31 @@ class Vehicle(Frozen):
         cosine, sine = math.cos(turn.angle), math.sin(turn.angle)
         for name, (x, y, _) in (("Ixx and Iyy", self.inertia), ("drag in x and in y", self.drag)):
             if abs((x - y) * sine * cosine) > 0.02 * min(x, y):
-                turned = f"{self.name} has to be turned by {math.degrees(turn.angle):.0f}° to the layout of {other.name}"
-                raise ConfigError(f"rotor_layout: {turned}, but its {name} differ")
-        positions = (np.array(self.rotor_positions) @ turn.axes[:2, :2].T)[[*turn.order]]
-        changes = {
-            **{
-                name: (x * cosine**2 + y * sine**2, x * sine**2 + y * cosine**2, z)
-                for name, (x, y, z) in (("inertia", self.inertia), ("drag", self.drag))
-            },
+                raise ConfigError(
+                    f"rotor_layout: {self.name} has to be turned by"
+                    f" {math.degrees(turn.angle):.0f}° to the layout of {other.name},"
+                    f" but its {name} differ"
+                )
+
+        def turned(values: tuple[float, float, float]) -> tuple[float, float, float]:
+            x, y, z = values
+            return x * cosine**2 + y * sine**2, x * sine**2 + y * cosine**2, z
+
+        positions = np.array(self.rotor_positions)[list(turn.order)] @ turn.axes[:2, :2].T
+        changes: dict[str, Any] = {
+            "inertia": turned(self.inertia),
+            "drag": turned(self.drag),
             "rotor_positions": tuple(map(tuple, positions.tolist())),
             "rotor_directions": other.rotor_directions,
-            **{name: getattr(self, name) for name in _FOUND},
         }
-        return self.model_copy(update=changes)
+        return self.model_copy(update={**changes, **{name: getattr(self, name) for name in _FOUND}})
 
     def flies_as(self, other: "Vehicle") -> bool:
-        """Whether both have the same parameters; names and an expert's gains do not matter."""
-        ours, theirs = (each.model_dump(exclude={"name", *_FOUND}) for each in (self, other))
-        return ours == theirs
+        """Return whether both have the same parameters; names and an expert's gains do not
+        matter.
+        """
+        ignored = {"name", *_FOUND}
+        return self.model_dump(exclude=ignored) == other.model_dump(exclude=ignored)
 
     @property
     def mixer(self) -> FloatArray:
@@ -306,8 +325,8 @@ class Vehicle(Frozen):
 
     @property
     def command_lag(self) -> float:
-        """τ, from a command to its thrust, s: delay, half the control step it is held for, and the
-        motors' time constant.
+        """Time τ from a command to its thrust, s: delay, half the control step that the command is
+        held for, and the motors' time constant.
         """
         return (self.delay + 0.5) * self.control_step + self.motor_time_constant
 
@@ -318,30 +337,35 @@ class Vehicle(Frozen):
 
     @property
     def greatest_moments(self) -> FloatArray:
-        """(3,), N m, about roll, pitch and yaw; the other axes and the thrust left to themselves."""
-        low, high = (
-            self.thrust_range
-        )  # equal thrusts give no moment: what counts is how far each can go from the middle
+        """Greatest moments about roll, pitch and yaw, (3,), N m, each by itself."""
+        # Equal thrusts give no moment, so each thrust counts by its distance from the middle.
+        low, high = self.thrust_range
         return np.asarray(np.abs(self.mixer[1:]).sum(axis=1) * (high - low) / 2)
 
     @property
     def gyration_ratios(self) -> FloatArray:
-        """(3,), radii of gyration √(I/m) by the arm length; above 1 the mass would lie beyond the
-        rotors.
+        """Radii of gyration √(I/m) divided by the arm length, (3,). Above 1 the mass would lie
+        beyond the rotors.
         """
         return np.asarray(np.sqrt(np.array(self.inertia) / self.mass) / self.arm_length)
 
     @property
     def largest_moment(self) -> float:
-        """The largest moment of inertia by the sum of the other two; of a rigid body at most 1."""
+        """Largest moment of inertia divided by the sum of the other two; at most 1 for a rigid
+        body.
+        """
         return max(self.inertia) / (sum(self.inertia) - max(self.inertia))
 
     @property
     def inertia_fault(self) -> str:
         """Why no rigid body has this inertia; empty where one can."""
         excess = self.largest_moment - 1.0
-        fault = f"no rigid body has one moment larger than the other two together, here by {100 * excess:.2g} %"
-        return fault if excess > 1e-9 else ""
+        if excess <= 1e-9:
+            return ""
+        return (
+            "no rigid body has one moment larger than the other two together,"
+            f" here by {100 * excess:.2g} %"
+        )
 
     @property
     def hover_rotor_speed(self) -> float:
@@ -350,7 +374,7 @@ class Vehicle(Frozen):
 
     @property
     def hover_action(self) -> float:
-        """The action of each rotor in hover; 0 where hover is in the middle of the thrust limits."""
+        """Action of each rotor in hover; 0 if hover is in the middle of the thrust limits."""
         return float(self.thrust_to_action(np.array(self.hover_thrust)))
 
     @property
@@ -371,34 +395,34 @@ class Vehicle(Frozen):
         return (high + low) / 2 + (high - low) / 2 * np.clip(action, -1.0, 1.0)
 
     def parameters(self) -> FloatArray:
-        """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of
-        ``PARAMETER_NAMES``.
-        """
+        """Return the numbers for compiled code, shape (len(PARAMETER_NAMES),), in that order."""
         low, high = self.thrust_range
-        motors = self.motor_gain_up, self.motor_gain_down, self.motor_integration == "exact"
-        head = (
-            self.mass,
-            *self.inertia,
-            self.thrust_coefficient,
-            *motors,
-            self.gravity,
-            *self.drag,
+        return np.array(
+            [
+                self.mass,
+                *self.inertia,
+                self.thrust_coefficient,
+                self.motor_gain_up,
+                self.motor_gain_down,
+                self.motor_integration == "exact",
+                self.gravity,
+                *self.drag,
+                self.hover_thrust,
+                (high + low) / 2,
+                (high - low) / 2,
+                self.collision_radius,
+                self.delay,
+                *self.mixer[1:].ravel(),
+            ],
+            dtype=np.float64,
         )
-        tail = (
-            self.hover_thrust,
-            (high + low) / 2,
-            (high - low) / 2,
-            self.collision_radius,
-            self.delay,
-        )
-        return np.array([*head, *tail, *self.mixer[1:].ravel()], dtype=np.float64)
 
 
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
-    """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
+    """Return a vehicle by its name (``"itm"``) or the path of a YAML file; a vehicle as it is.
 
-    An inertia of a user's file that no rigid body has, but within ``INACCURACY``, is said once on
-    stderr.
+    It warns on stderr where a user's file has an inertia that no rigid body has, but within
+    ``INACCURACY``.
 
     :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown,
@@ -410,15 +434,17 @@ def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
     vehicle = validate(Vehicle, data, where)
     if vehicle.inertia_fault and VEHICLES.is_path(source):
         print_once(
-            f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; it is flown as it is"
+            f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault};"
+            " it is flown as it is"
         )
     return vehicle
 
 
 def first_vehicle(given: Any, layout: str | Path | Vehicle | None = None) -> Vehicle:
-    """As :func:`load_vehicle`; of a list of vehicles, as ``env_kwargs`` may have one, the first.
+    """Return a vehicle like :func:`load_vehicle`; of a list, as ``env_kwargs`` may have one, the
+    first.
 
-    :param layout: the vehicle in whose layout it is flown, as of ``rotor_layout``; None: its own.
+    :param layout: the vehicle in whose layout it is flown, as in ``rotor_layout``; None: its own.
     """
     if isinstance(given, (list, tuple)):
         if not given:
