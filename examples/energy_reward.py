@@ -10,9 +10,10 @@ rotor. A wrapper takes it off, and nothing else changes.
 import argparse
 
 import numpy as np
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from sb3_quad import DAgger, QuadcopterVecEnv, fly
+from sb3_quad import PPOBC, DAgger, QuadcopterVecEnv, fly
 from sb3_quad.experts.protocol import Expert
 
 ENERGY_COST = 0.003  # per control step in hover, as much as a distance of 1 m
@@ -147,6 +148,6 @@ if arguments.timesteps > 100_000:
 for name, controller in (("LQR", expert), ("DAgger", imitation), ("PPOBC", agent)):
     reward, survival = mean_reward(controller)
     print(f"{name}: mean reward {reward:.2f}, survival {survival:.1%}")
-flights = fly(agent, "target_tracking", n_episodes=240, seed=1_000_000)
+flights = fly(agent, "target_tracking", n_flights=240, seed=1_000_000)
 print(f"PPOBC: median final error {np.median(flights.final_error):.3f} m")
 agent.save("energy")

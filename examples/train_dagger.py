@@ -32,6 +32,7 @@ for task in ("state_recovery", "target_tracking"):
     for name, controller in (("expert", PIDExpert()), ("agent", model)):
         flights = fly(controller, task, n_flights=480, seed=1_000_000)
         print(
-            f"{name}, {task}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}"
+            f"{name}, {task}: success {flights.success.mean():.1%},"
+            f" survival {flights.survival.mean():.1%}"
         )
 print(f"saved to {arguments.output}")

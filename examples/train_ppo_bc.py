@@ -58,6 +58,7 @@ model.save(arguments.output)
 for task in ("state_recovery", "target_tracking"):
     flights = fly(model, task, n_flights=480, seed=1_000_000)
     print(
-        f"agent, {task}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}"
+        f"agent, {task}: success {flights.success.mean():.1%},"
+        f" survival {flights.survival.mean():.1%}"
     )
 print(f"saved to {arguments.output}")

@@ -32,7 +32,8 @@ from sb3_quad.simulation.observation import FEATURE_NAMES
 from sb3_quad.simulation.settings import FlightSettings
 
 def batch(**task_kwargs):
-    how = FlightSettings(task="upright_fall", task_kwargs=task_kwargs, vehicle="trainer_quad", noise=0.0)
+    given = {"task_kwargs": task_kwargs, "vehicle": "trainer_quad", "noise": 0.0}
+    how = FlightSettings(task="upright_fall", **given)
     made = QuadcopterBatch(2, how, seed=5, autoreset=False)
     made.reset()
     return made
@@ -66,12 +67,15 @@ found["expert"] = float(np.abs(expert.predict(observations)[0] - expert.vehicle.
 found["command"] = main(["vehicles"])
 
 worlds = {"mass": [0.7, 1.3], "force": [0, 3], "gusts": {"std": 1.0}, "delay": [1, 3]}
-env = QuadcopterVecEnv(70, task="recovery_and_tracking", randomize=worlds, history=[0, 1], last_action=True)
-model = DAgger("MlpPolicy", env, expert=GeometricExpert(), n_steps=20, batch_size=600, n_epochs=2, seed=0).learn(2 * 70 * 20)
+given = {"randomize": worlds, "history": [0, 1], "last_action": True}
+env = QuadcopterVecEnv(70, task="recovery_and_tracking", **given)
+sizes = {"n_steps": 20, "batch_size": 600, "n_epochs": 2}
+model = DAgger("MlpPolicy", env, expert=GeometricExpert(), seed=0, **sizes).learn(2 * 70 * 20)
 model.save("extended")
 exported = export_policy("extended.zip", "torchscript", n_observations=2000)
 found["exported"] = len(exported.content) > 0
-found["weights"] = hashlib.sha256(b"".join(part.numpy().tobytes() for part in model.policy.state_dict().values())).hexdigest()
+weights = b"".join(part.numpy().tobytes() for part in model.policy.state_dict().values())
+found["weights"] = hashlib.sha256(weights).hexdigest()
 print(json.dumps(found))
 """
 

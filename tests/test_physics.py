@@ -19,7 +19,8 @@ from sb3_quad.simulation.state import (
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 URDF = """<robot name="body"><link name="base"><inertial><mass value="{m!r}"/>
-<inertia ixx="{i[0]!r}" iyy="{i[1]!r}" izz="{i[2]!r}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+<inertia ixx="{i[0]!r}" iyy="{i[1]!r}" izz="{i[2]!r}"
+ ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
 ITM = load_vehicle("itm")
 
 

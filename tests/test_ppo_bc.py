@@ -204,7 +204,7 @@ def test_schedule_of_the_cloning_weight_follows_progress(tmp_path):
 
 @pytest.mark.parametrize(("start", "weight"), [(0.0, 1.0), (1.0, 0.0)])
 def test_a_rollout_is_labelled_exactly_if_its_update_clones(start, weight):
-    """Also where a schedule changes between the rollout's begin and its end, when the update comes."""
+    """Also where a schedule changes between the rollout's beginning and its end."""
     model = PPOBC(
         "MlpPolicy",
         "Pendulum-v1",
@@ -351,7 +351,7 @@ def test_learn_takes_sb3s_arguments_by_position(algorithm, given, tmp_path):
     seen = []
 
     def callback(local, _):
-        seen.append(local["log_interval"] if "log_interval" in local else None)
+        seen.append(local.get("log_interval"))
         return len(seen) < 3
 
     assert model.learn(200, callback, 4, "run", True, False) is model

@@ -344,7 +344,7 @@ def test_the_privileged_expert_flies_as_the_others_where_nothing_is_random():
         batch.step(plain.actions(state))
 
 
-def test_the_cautious_expert_falls_less_fast_where_the_rotors_lift_hardly_more_than_weight_and_push():
+def test_the_cautious_expert_falls_less_fast_where_rotors_lift_hardly_more_than_the_load():
     randomize = {"mass": [1.2, 1.25], "force": {"magnitude": [2, 4], "direction": [0, 0, -1]}}
     descent, survival = {}, {}
     for expert in (privileged_geometric(), privileged_cautious()):

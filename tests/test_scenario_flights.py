@@ -47,7 +47,8 @@ class OnObservations:
 
 MIXED = (
     "start: {attitude: {tilt: 70}, velocity: {magnitude: 2}, body_rates: {std: 2}},"
-    "target: {waypoints: [[0, 0, 16], [1, 0, 17], [0, 2, 16]], radius: 1.0}, duration: 5, episodes: 4,"
+    "target: {waypoints: [[0, 0, 16], [1, 0, 17], [0, 2, 16]], radius: 1.0}, "
+    "duration: 5, episodes: 4,"
     "vehicle_changes: {mass: 1.1, inertia: [1.2, 0.9, 1], motor_gain: 0.8, delay: 2},"
     "wrenches: [{start: 1, duration: 0.5, force: {magnitude: 5}, force_frame: body},"
     "{start: 1.2, duration: 0.1, force: [3, 0, 0], torque: [0.1, 0, 0.2], torque_frame: world}]"
@@ -63,7 +64,10 @@ SIDE_HIT = (
 )
 
 
-GUSTS = "target: {distance: 3}, duration: 3, episodes: 3, randomize: {mass: [0.9, 1.1], gusts: {std: 2, time_constant: 0.5}}"
+GUSTS = (
+    "target: {distance: 3}, duration: 3, episodes: 3, "
+    "randomize: {mass: [0.9, 1.1], gusts: {std: 2, time_constant: 0.5}}"
+)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +149,8 @@ def test_an_impulse_is_force_times_time(factor):
 
 def test_waypoints_are_flown_one_after_the_other():
     course = scenario(
-        "target: {waypoints: [[0, 0, 17], [2, 0, 17], [2, 2, 16]], radius: 0.4}, duration: 20, episodes: 3"
+        "target: {waypoints: [[0, 0, 17], [2, 0, 17], [2, 2, 16]], radius: 0.4}, "
+        "duration: 20, episodes: 3"
     )
     flights, log = fly_scenario(PIDExpert(), course, recorded=3)
     assert (np.diff(flights.waypoint_times, axis=1) > 0).all()

@@ -156,7 +156,8 @@ def test_wrenches_in_weights_grow_with_the_vehicle_and_change_no_others(name):
     vehicle = load_vehicle(name)
     push = "{force: [0, 0, -0.5], torque: [2, 0, 0], unit: weight}"
     each = scenario(
-        f"vehicle: {name}, vehicle_changes: {{mass: 1.2}}, wrenches: [{push}, {{start: 1, force: [1, 0, 0]}}]"
+        f"vehicle: {name}, vehicle_changes: {{mass: 1.2}}, "
+        f"wrenches: [{push}, {{start: 1, force: [1, 0, 0]}}]"
     )
     first, second = sample_plan(each, [0]).wrenches.values()
     weight = vehicle.mass * vehicle.gravity  # of the vehicle as its controller knows it
@@ -166,7 +167,8 @@ def test_wrenches_in_weights_grow_with_the_vehicle_and_change_no_others(name):
     )
     np.testing.assert_allclose([first[0], (second - first)[0]], both.T, atol=1e-12)
     varied = suite(
-        "wrenches: [{force: {magnitude: 0}, unit: weight}], vary: {wrenches.0.force.magnitude: [0, 1]}"
+        "wrenches: [{force: {magnitude: 0}, unit: weight}], "
+        "vary: {wrenches.0.force.magnitude: [0, 1]}"
     )
     assert axis_label("wrenches.0.force.magnitude", varied.scenarios[1]) == "force (weights)"
 
@@ -195,7 +197,10 @@ def test_what_is_random_in_a_scenario_is_part_of_it_and_changes_no_others():
     rate=st.floats(0, 50),
 )
 def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
-    entry = f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, body_rates: {{magnitude: {rate}}}}}"
+    entry = (
+        f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, "
+        f"body_rates: {{magnitude: {rate}}}}}"
+    )
     sampled, again = (sample_plan(scenario(entry), range(seed, seed + 3)).start for _ in range(2))
     state = np.zeros((20, 3))
     state[3:7] = sampled["quaternion"].T

@@ -1,4 +1,4 @@
-"""Value-based stages as runs: from an imitation, interrupted and resumed, tuned, trimmed, exported."""
+"""Value-based stages as runs: from an imitation, resumed, tuned, corrected and exported."""
 
 import signal
 

@@ -59,7 +59,7 @@ class Reference(NamedTuple):
 
     @property
     def turned_features(self) -> FloatArray:
-        """(18, 18), from features in the vehicle's own body frame to those that the policy knows."""
+        """(18, 18), from features in the vehicle's own body frame to those the policy knows."""
         return turn_features(self.turn)
 
     @property
