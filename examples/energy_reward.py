@@ -85,14 +85,15 @@ class EnergyCost(VecEnvWrapper):
 
 def mean_reward(controller, n_flights=240, seed=1_000_000):
     """The mean reward of fresh flights, with the energy, and the share of flights that survive."""
-    env = EnergyCost(QuadcopterVecEnv(n_flights, "target_tracking", seed=seed))
+    quadcopters = QuadcopterVecEnv(n_flights, "target_tracking", seed=seed)
+    env = EnergyCost(quadcopters)
     observations = env.reset()
     flying = np.ones(n_flights, dtype=bool)
     rewards = np.zeros(n_flights)
     survived = 0
     while flying.any():
         if hasattr(controller, "actions"):
-            actions = controller.actions(env.unwrapped.true_state())
+            actions = controller.actions(quadcopters.true_state())
         else:
             actions, _ = controller.predict(observations, deterministic=True)
         observations, step_rewards, dones, infos = env.step(actions)

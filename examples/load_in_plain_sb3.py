@@ -152,6 +152,6 @@ if __name__ == "__main__":
                 quadcopter.body_rates,
                 action,
             )
-            action, _ = model.predict(observed, deterministic=True)
+            action, _state = model.predict(observed, deterministic=True)
             quadcopter.step(action)
         print(f"{path}: {np.linalg.norm(quadcopter.position):.3f} m from the target after 15 s")

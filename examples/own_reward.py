@@ -28,7 +28,8 @@ class CalmActions(VecEnvWrapper):
 
     def reset(self):
         """Begin a new episode in every row; hover is the action before."""
-        self.last = np.zeros((self.num_envs, *self.action_space.shape), dtype=np.float32)
+        shape = self.action_space.shape or ()
+        self.last = np.zeros((self.num_envs, *shape), dtype=np.float32)
         return self.venv.reset()
 
     def step_async(self, actions):

@@ -305,15 +305,15 @@ def test_bad_actions_raise(env: QuadcopterEnv, action: Any, message: str) -> Non
         ),
         (lambda env: QuadcopterEnv(task="target_trackin"), "did you mean 'target_tracking'"),
         (
-            lambda env: QuadcopterEnv(noize=0),
+            lambda env: QuadcopterEnv(noize=0),  # type: ignore[call-arg]
             "QuadcopterEnv: unknown keyword 'noize': did you mean 'noise'",
         ),
         (
-            lambda env: QuadcopterEnv(rendermode="human"),
+            lambda env: QuadcopterEnv(rendermode="human"),  # type: ignore[call-arg]
             "QuadcopterEnv: .* 'rendermode': did you mean 'render_mode'",
         ),
         (
-            lambda env: QuadcopterVecEnv(1, nthreads=1),
+            lambda env: QuadcopterVecEnv(1, nthreads=1),  # type: ignore[call-arg]
             "QuadcopterVecEnv: .* 'nthreads': did you mean 'n_threads'",
         ),
         (lambda env: QuadcopterEnv(vehicle="itn"), "did you mean 'itm'"),

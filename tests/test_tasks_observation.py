@@ -12,7 +12,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.kernel import physical_features
 from sb3_quad.simulation.observation import (
     DEFAULT_STD,
     FEATURE_NAMES,
@@ -30,7 +29,6 @@ from sb3_quad.simulation.state import (
     TARGET,
     VELOCITY,
     QuadcopterState,
-    at_rest,
 )
 from sb3_quad.simulation.tasks import SCORED, TASK, T, Task, in_words, resolve_tasks
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -124,21 +122,15 @@ def test_features_in_their_order():
         axis=1,
     )
     np.testing.assert_allclose(observations(rows, 0.0), expected / DEFAULT_STD, atol=1e-6)
-    np.testing.assert_allclose(physical_features(state), expected, rtol=1e-6, atol=1e-6)
     assert len(FEATURE_NAMES) == OBSERVATION_SIZE == 18
     assert FEATURE_NAMES[GROUPS["body_rates"]] == ("body_rate_x", "body_rate_y", "body_rate_z")
 
 
-def test_features_at_rest_at_the_target():
-    headings = np.array([0.0, 0.5, -3.0])
-    state = at_rest(headings, ITM.hover_rotor_speed)
-    features = physical_features(state)
-    cosine, sine, zero, one = np.cos(headings), np.sin(headings), np.zeros(3), np.ones(3)
-    rotation = [cosine, sine, zero, -sine, cosine, zero, zero, zero, one]
-    np.testing.assert_allclose(features[:, GROUPS["rotation"]], np.transpose(rotation), atol=1e-6)
-    for group in ("position", "velocity", "body_rates"):
-        assert not features[:, GROUPS[group]].any()
-    np.testing.assert_array_equal(state.rotor_speeds, np.full((3, 4), ITM.hover_rotor_speed))
+def features_of(state):
+    """The features of a state in their units, without noise, (n, 18)."""
+    batch = QuadcopterBatch(state.n, FlightSettings(noise=0.0))
+    batch.state[:] = state.array
+    return batch.observe() * DEFAULT_STD
 
 
 @pytest.mark.parametrize("name", ["hummingbird", "crazyflie"])
@@ -153,9 +145,7 @@ def test_turned_features_are_those_of_the_turned_vehicle(name):
     turned.array[QUATERNION] = (w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s)
     turned.array[BODY_RATES] = turn.axes @ state.array[BODY_RATES]
     matrix = turn_features(turn)
-    np.testing.assert_allclose(
-        physical_features(state) @ matrix.T, physical_features(turned), atol=1e-5
-    )
+    np.testing.assert_allclose(features_of(state) @ matrix.T, features_of(turned), atol=1e-5)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(OBSERVATION_SIZE), atol=1e-12)
 
 

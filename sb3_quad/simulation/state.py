@@ -161,19 +161,6 @@ def _concatenate_known(arrays: Sequence[FloatArray | None]) -> FloatArray | None
     return np.concatenate(known, axis=1) if len(known) == len(arrays) else None
 
 
-def at_rest(headings: FloatArray, rotor_speed: float = 0.0) -> QuadcopterState:
-    """Return the state of vehicles that are level and at rest at their targets.
-
-    :param headings: ψ of each vehicle, rad, (n,); positive from x to y.
-    :param rotor_speed: of every rotor, rad/s, such as ``vehicle.hover_rotor_speed``.
-    """
-    array = np.zeros((STATE_SIZE, len(headings)))
-    array[X.quaternion] = np.cos(headings / 2.0)
-    array[X.quaternion + 3] = np.sin(headings / 2.0)
-    array[ROTOR_SPEEDS] = rotor_speed
-    return QuadcopterState(array)
-
-
 def rotation_matrices(quaternions: FloatArray) -> FloatArray:
     """Return rotation matrices R, body to world, (n, 3, 3).
 
