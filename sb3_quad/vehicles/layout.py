@@ -1,10 +1,7 @@
-"""Layouts: the order of a vehicle's rotors and its body axes, and how those of one vehicle become
-those of another.
-"""
+"""Layouts: a vehicle's order of rotors and body axes, and how one layout becomes another."""
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,28 +9,26 @@ import numpy.typing as npt
 
 from sb3_quad.base.arrays import FloatArray
 
-TOLERANCE = math.radians(
-    20.0
-)  # by which rotors in the same place may differ, seen from the centre of mass
-_SLACK = math.radians(
-    1.0
-)  # of angles that are taken for equal, since published positions are rounded
+# Rotors in the same place may differ by this angle, seen from the centre of mass.
+TOLERANCE = math.radians(20.0)
+# Angles that differ by less are equal, since published positions are rounded.
+_SLACK = math.radians(1.0)
+_EIGHTH = math.pi / 4
 
 
 class Turn(NamedTuple):
-    """From a vehicle's own axes and rotors to those of a layout.
-
-    :param angle: of the body axes about z, rad: a vector of the body is turned by it.
-    :param order: rotor k of the layout is the vehicle's rotor ``order[k]``.
-    """
+    """From a vehicle's own axes and rotors to those of a layout."""
 
     angle: float = 0.0
+    """Angle by which the vectors of the body turn about z, rad."""
     order: tuple[int, ...] = (0, 1, 2, 3)
+    """Rotor k of the layout is the vehicle's rotor ``order[k]``."""
 
     @property
     def axes(self) -> FloatArray:
-        """(3, 3), from the own body frame to the layout's."""
-        cosine, sine = math.cos(self.angle), math.sin(self.angle)
+        """Rotation from the own body frame to the layout's, (3, 3)."""
+        cosine = math.cos(self.angle)
+        sine = math.sin(self.angle)
         return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
     @property
@@ -44,31 +39,33 @@ class Turn(NamedTuple):
 
 def find_turn(
     ours: npt.ArrayLike,
-    our_directions: Sequence[int],
+    our_directions: tuple[int, ...],
     theirs: npt.ArrayLike,
-    their_directions: Sequence[int],
+    their_directions: tuple[int, ...],
 ) -> Turn | None:
-    """The turn that brings rotors to where others are, each to one with the same sign of its yaw
-    moment; None: there is none.
+    """Return the turn that brings rotors to where others are; None: there is none.
 
-    Of turns that fit equally well it is the smallest.
+    Each comes to one with the same sign of its yaw moment. Of turns that fit equally well it is the
+    smallest.
 
     :param ours: x, y of each rotor, (4, 2), m; ``theirs`` likewise.
     """
-    places, goals = (np.asarray(each) @ (1.0, 1.0j) for each in (ours, theirs))
-    found: list[tuple[float, Turn]] = []
+    # Places in the plane as complex numbers: a turn is a factor.
+    places = np.asarray(ours) @ (1.0, 1.0j)
+    goals = np.asarray(theirs) @ (1.0, 1.0j)
+    fits: dict[Turn, float] = {}
     for order in itertools.permutations(range(4)):
-        if [our_directions[k] for k in order] != [*their_directions]:
+        if tuple(our_directions[k] for k in order) != their_directions:
             continue
-        apart = np.exp(1j * np.angle(goals * places[[*order]].conj()))
-        angle = float(np.angle(apart.sum()))
-        misfit = float(np.abs(np.angle(apart * np.exp(-1j * angle))).max())
-        eighth = round(angle / (math.pi / 4)) * (math.pi / 4)
-        found.append((misfit, Turn(eighth if abs(angle - eighth) < _SLACK else angle, order)))
-    least = min(misfit for misfit, _ in found)
-    fitting = [turn for misfit, turn in found if misfit < least + _SLACK]
-    return (
-        min(fitting, key=lambda turn: (round(abs(turn.angle), 6), -turn.angle))
-        if least < TOLERANCE
-        else None
-    )
+        between = np.exp(1j * np.angle(goals * places[list(order)].conj()))
+        angle = float(np.angle(between.sum()))
+        misfit = np.abs(np.angle(between * np.exp(-1j * angle))).max()
+        eighth = round(angle / _EIGHTH) * _EIGHTH
+        if abs(angle - eighth) < _SLACK:
+            angle = eighth
+        fits[Turn(angle, order)] = float(misfit)
+    least = min(fits.values())
+    if least >= TOLERANCE:
+        return None
+    fitting = [turn for turn, misfit in fits.items() if misfit < least + _SLACK]
+    return min(fitting, key=lambda turn: (round(abs(turn.angle), 6), -turn.angle))
