@@ -77,14 +77,11 @@ class GeometricExpert(Expert):
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
         late = late or {}
-        if reserve < 0.0 or (reserve and not privileged):
+        is_valid = privileged and reserve >= 0.0 and late.keys() <= set(GAIN_NAMES)
+        if (reserve or late) and not is_valid:
             raise ConfigError(
-                f"reserve {reserve:g}: must not be negative, and needs privileged=True"
-            )
-        if late and (not privileged or late.keys() - set(GAIN_NAMES)):
-            raise ConfigError(
-                f"late {', '.join(late)}: must be among {', '.join(GAIN_NAMES)}, "
-                "and needs privileged=True"
+                f"reserve {reserve:g}, late {', '.join(late)}: they need privileged=True, "
+                f"a reserve of at least 0, and names among {', '.join(GAIN_NAMES)}"
             )
         self.reserve = reserve
         self.gains = gains or self.vehicle.geometric_gains or derived_gains(self.vehicle)

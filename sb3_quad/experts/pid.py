@@ -45,10 +45,15 @@ class PIDExpert(Expert):
         observation_std: npt.ArrayLike | None = None,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
-        gains = {"kp": kp, "ki": ki, "kd": kd, "damping": damping}
-        gains["natural_frequency"] = natural_frequency
+        gains = {
+            "kp": kp,
+            "ki": ki,
+            "kd": kd,
+            "natural_frequency": natural_frequency,
+            "damping": damping,
+        }
         for name, value in gains.items():
-            if not (math.isfinite(value) and value >= 0):
+            if not 0.0 <= value < math.inf:
                 raise ConfigError(
                     f"PIDExpert: {name} is {value}, must be a finite number of at least 0"
                 )
