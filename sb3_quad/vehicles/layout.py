@@ -2,12 +2,15 @@
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sb3_quad.vehicles.vehicle import Vehicle
 
 # Rotors in the same place may differ by this angle, seen from the centre of mass.
 TOLERANCE = math.radians(20.0)
@@ -37,25 +40,20 @@ class Turn(NamedTuple):
         return [self.order.index(k) for k in range(4)]
 
 
-def find_turn(
-    ours: npt.ArrayLike,
-    our_directions: tuple[int, ...],
-    theirs: npt.ArrayLike,
-    their_directions: tuple[int, ...],
-) -> Turn | None:
-    """Return the turn that brings rotors to where others are; None: there is none.
+def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
+    """Return the turn that brings the rotors of a vehicle to where those of another are.
 
     Each comes to one with the same sign of its yaw moment. Of turns that fit equally well it is the
     smallest.
 
-    :param ours: x, y of each rotor, (4, 2), m; ``theirs`` likewise.
+    :raises ConfigError: there is none.
     """
     # Places in the plane as complex numbers: a turn is a factor.
-    places = np.asarray(ours) @ (1.0, 1.0j)
-    goals = np.asarray(theirs) @ (1.0, 1.0j)
+    places = np.array(own.rotor_positions) @ (1.0, 1.0j)
+    goals = np.array(other.rotor_positions) @ (1.0, 1.0j)
     fits: dict[Turn, float] = {}
     for order in itertools.permutations(range(4)):
-        if tuple(our_directions[k] for k in order) != their_directions:
+        if tuple(own.rotor_directions[k] for k in order) != other.rotor_directions:
             continue
         between = np.exp(1j * np.angle(goals * places[list(order)].conj()))
         angle = float(np.angle(between.sum()))
@@ -66,6 +64,10 @@ def find_turn(
         fits[Turn(angle, order)] = float(misfit)
     least = min(fits.values())
     if least >= TOLERANCE:
-        return None
+        raise ConfigError(
+            f"rotor_layout: no turn brings the rotors of {own.name} to where those of "
+            f"{other.name} are, directions included; an agent flies only vehicles whose "
+            "rotors are where it knows them, once turned and renumbered"
+        )
     fitting = [turn for turn, misfit in fits.items() if misfit < least + _SLACK]
     return min(fitting, key=lambda turn: (round(abs(turn.angle), 6), -turn.angle))

@@ -209,7 +209,7 @@ class Vehicle(Frozen, use_attribute_docstrings=True):
         if changes.keys() - {"name", "geometric_gains"}:
             changes = {**dict.fromkeys(_FOUND), **changes}
         # What the changes give in another form.
-        replaced = set()
+        replaced: set[str] = set()
         if "motor_gain" in changes:
             replaced.update(MOTOR_GAINS)
         if not changes.keys().isdisjoint(LIMITS):
@@ -221,19 +221,7 @@ class Vehicle(Frozen, use_attribute_docstrings=True):
 
         :raises ConfigError: there is none.
         """
-        turn = find_turn(
-            self.rotor_positions,
-            self.rotor_directions,
-            other.rotor_positions,
-            other.rotor_directions,
-        )
-        if turn is None:
-            raise ConfigError(
-                f"rotor_layout: no turn brings the rotors of {self.name} to where those of "
-                f"{other.name} are, directions included; an agent flies only vehicles whose "
-                "rotors are where it knows them, once turned and renumbered"
-            )
-        return turn
+        return find_turn(self, other)
 
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
         """Return this vehicle with axes turned about z, and rotors in the order of ``other``.
