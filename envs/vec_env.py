@@ -150,11 +150,14 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the given rows, one value per row."""
         rows = self.batch.rows(indices)
-        # Attributes of rows differ by row; all others belong to the environment.
         if attr_name == "vehicle":
-            return [self.batch.vehicle_list[row] for row in rows]
-        value = getattr(self, attr_name)
-        return [value[row] if attr_name in _OF_ROWS else value for row in rows]
+            values = self.batch.vehicle_list
+        elif attr_name in _OF_ROWS:
+            values = getattr(self, attr_name)
+        else:
+            # It belongs to the environment, not to a row.
+            return [getattr(self, attr_name)] * rows.size
+        return [values[row] for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set ``target``, ``wind`` or ``noise`` of the given rows."""
