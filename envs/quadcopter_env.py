@@ -323,15 +323,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         """
         return np.asarray(self.batch.observe()[0])
 
-    @property
-    def wrench(self) -> FloatArray:
-        """The external wrench that was set or sampled, without gusts, (12,); a live view.
-
-        Force in the world frame, force in the body frame, torque in the world frame, torque in the
-        body frame; N and N m.
-        """
-        return self.batch.wrench[:, 0]
-
     def _by_row(self, columns: FloatArray) -> FloatArray:
         return np.asarray(super()._by_row(columns)[0])
 

@@ -16,9 +16,10 @@ from sb3_quad.simulation.state import (
     VELOCITY,
     QuadcopterState,
 )
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 Actions = Float32Array
+Scaling = npt.ArrayLike | None
 Floats = npt.NDArray[np.floating]
 
 
@@ -41,9 +42,9 @@ class Expert(ABC):
 
     def __init__(
         self,
-        vehicle: str | Vehicle = "itm",
-        observation_mean: npt.ArrayLike | None = None,
-        observation_std: npt.ArrayLike | None = None,
+        vehicle: VehicleSource = "itm",
+        observation_mean: Scaling = None,
+        observation_std: Scaling = None,
     ) -> None:
         self.vehicle = load_vehicle(vehicle)
         if observation_mean is None:
