@@ -13,7 +13,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts import geometric
+from sb3_quad.experts import geometric_gains
 from sb3_quad.experts.geometric import GeometricExpert, privileged_cautious, privileged_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
@@ -318,7 +318,7 @@ def test_the_privileged_expert_stays_where_the_other_is_pushed_away(task):
         batch = batch_of(240, task=task, randomize=randomize, autoreset=False)
         for _ in range(1000):
             batch.step(expert.actions(batch.true_state()))
-        errors[expert._privileged is not None] = np.median(batch.outcome["distance"])
+        errors[expert._true is not None] = np.median(batch.outcome["distance"])
     assert errors[True] < 0.01 < 0.1 < errors[False]
 
 
@@ -335,7 +335,9 @@ def test_the_privileged_expert_flies_as_the_others_where_nothing_is_random():
         privileged_geometric(),
     )
     plain = GeometricExpert(
-        gains=gains.model_copy(update={"yaw_rate": geometric._PRIVILEGED_YAW * gains.yaw_rate})
+        gains=gains.model_copy(
+            update={"yaw_rate": geometric_gains._PRIVILEGED_YAW * gains.yaw_rate}
+        )
     )
     for _ in range(100):
         state = batch.true_state()
