@@ -1,8 +1,7 @@
 """The part that all environments share: spaces, keywords, and reading and setting in flight."""
 
 import inspect
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, TypedDict
 
 import numpy as np
@@ -12,6 +11,7 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.batch import QuadcopterBatch, Rows
 from sb3_quad.simulation.frames import PositionIntegral
@@ -21,7 +21,7 @@ from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.state import TARGET, QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource
 
 # Keys of an info, and the fields of ``batch.outcome`` that they show.
 INFOS = {
@@ -40,16 +40,16 @@ class FlightKeywords(TypedDict, total=False):
     meanings. Each constructor adds ``task`` and ``task_kwargs``, and a test holds both lists equal.
     """
 
-    vehicle: str | Path | Vehicle | Sequence[str | Path | Vehicle]
-    rotor_layout: str | Path | Vehicle | None
-    noise: float | Sequence[float] | npt.NDArray[Any] | Mapping[str, float] | Noise
+    vehicle: VehicleSource | Sequence[VehicleSource]
+    rotor_layout: VehicleSource | None
+    noise: npt.ArrayLike | StrMapping | Noise
     observation_mean: npt.ArrayLike | None
     observation_std: npt.ArrayLike | None
     last_action: bool
     history: Sequence[int] | None
-    position_integral: Mapping[str, Any] | PositionIntegral | None
-    vehicles: Mapping[str, Any] | VehicleDistribution | None
-    randomize: Mapping[str, Any] | Randomization | None
+    position_integral: StrMapping | PositionIntegral | None
+    vehicles: StrMapping | VehicleDistribution | None
+    randomize: StrMapping | Randomization | None
     max_episode_steps: int | Sequence[int]
 
 
@@ -78,7 +78,7 @@ class BatchEnv:
         seed: int | None,
         n_threads: int | None,
         task: TaskSpec,
-        task_kwargs: Mapping[str, Any] | None,
+        task_kwargs: StrMapping | None,
         autoreset: bool,
         **keywords: Unpack[FlightKeywords],
     ) -> None:
@@ -89,10 +89,9 @@ class BatchEnv:
         """
         name = type(self).__name__
         # Check the names first, so that a slip in one of the constructor's own is recognised, too.
-        own = inspect.signature(type(self)).parameters.keys() - {"keywords"}
-        valid = own | FlightSettings.model_fields.keys()
+        valid = inspect.signature(type(self)).parameters.keys() | FlightSettings.model_fields.keys()
         for key in keywords.keys() - valid:
-            raise ConfigError(f"{name}: {unknown('keyword', key, valid)}")
+            raise ConfigError(f"{name}: {unknown('keyword', key, valid - {'keywords'})}")
         settings = {"task": task, "task_kwargs": task_kwargs, **keywords}
         self.flight_settings = validate(FlightSettings, settings, name)
         self.batch = QuadcopterBatch(n, self.flight_settings, seed, n_threads, autoreset)
@@ -186,7 +185,7 @@ class BatchEnv:
         return self.batch.task
 
     @property
-    def task_kwargs(self) -> dict[str, Any]:
+    def task_kwargs(self) -> StrDict:
         """Fields of the task that are overridden."""
         return dict(self.batch.task_kwargs)
 

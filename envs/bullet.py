@@ -50,19 +50,16 @@ class BulletBody:
     """
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
-        self.has_window = False
-        if window is not None:
-            self.has_window = has_display()
-            if not self.has_window:
-                print(
-                    "sb3_quad: DISPLAY is not set, so no window opens; "
-                    "render_mode='rgb_array' makes pictures",
-                    file=sys.stderr,
-                )
-        if window is not None and self.has_window:
-            client = open_window(*window)
-        else:
+        self.has_window = window is not None and has_display()
+        if window is None or not self.has_window:
             client = int(p.connect(p.DIRECT))
+        else:
+            client = open_window(*window)
+        if window is not None and not self.has_window:
+            sys.stderr.write(
+                "sb3_quad: DISPLAY is not set, so no window opens; "
+                "render_mode='rgb_array' makes pictures\n"
+            )
         self.client = client
         # The number of PyBullet's clients is limited, so this one is also closed if the object is
         # garbage-collected without close(), and when the interpreter exits.
@@ -77,9 +74,6 @@ class BulletBody:
             p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=client
         )
         self.body = p.createMultiBody(vehicle.mass, ball, physicsClientId=client)
-        p.changeDynamics(
-            self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=client
-        )
         self.become(vehicle.parameters())
         # The body must not collide with the ground or a target that is drawn.
         p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=client)
@@ -92,6 +86,8 @@ class BulletBody:
             -1,
             mass=float(parameters[P.mass]),
             localInertiaDiagonal=inertia,
+            linearDamping=0.0,
+            angularDamping=0.0,
             physicsClientId=self.client,
         )
 

@@ -1,6 +1,6 @@
 """``QuadcopterVectorEnv``: n quadcopters as one Gymnasium vector environment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from typing_extensions import Unpack
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
@@ -38,13 +39,13 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
     :raises ConfigError: an argument that does not fit.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: StrDict = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
         num_envs: int = 1,
         task: TaskSpec = "target_tracking",
-        task_kwargs: Mapping[str, Any] | None = None,
+        task_kwargs: StrMapping | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         seed: int | None = None,
@@ -77,8 +78,8 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Float32Array, dict[str, Any]]:
+        options: StrDict | None = None,
+    ) -> tuple[Float32Array, StrDict]:
         """Begin new episodes in all rows.
 
         :param seed: one number, from which each row gets its own stream, or a number or None for
@@ -89,24 +90,23 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
                 f"reset option {key!r}: the batched environment takes none; "
                 "call set_target after it"
             )
-        # Rows whose seed is None continue with their stream.
         if isinstance(seed, (int, np.integer)):
-            self.batch.seed(row_seeds(int(seed), self.num_envs))
-        elif seed is not None:
-            if len(seed) != self.num_envs:
-                raise ConfigError(
-                    f"seed: {len(seed)} numbers for {self.num_envs} environments; "
-                    "give one, or one for each"
-                )
-            for row, number in enumerate(seed):
-                if number is not None:
-                    self.batch.seed([number], row)
+            seed = row_seeds(int(seed), self.num_envs)
+        if seed is not None and len(seed) != self.num_envs:
+            raise ConfigError(
+                f"seed: {len(seed)} numbers for {self.num_envs} environments; "
+                "give one, or one for each"
+            )
+        # Rows whose seed is None continue with their stream.
+        for row, number in enumerate(seed or ()):
+            if number is not None:
+                self.batch.seed([number], row)
         self._ended[:] = False
         return self._begin(~self._ended), self._infos()
 
     def step(
         self, actions: npt.NDArray[Any]
-    ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, StrDict]:
         """Fly one control step.
 
         :param actions: (n, 4), clipped to [-1, 1].
@@ -120,7 +120,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
             done[self._ended] = False
         truncated = done & self.batch.outcome["truncated"]
         terminated = done & ~truncated
-        final: dict[str, Any] = {}
+        final: StrDict = {}
         if self._mode is AutoresetMode.NEXT_STEP:
             self._ended = done
         elif done.any():
@@ -143,7 +143,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         self.batch.clear_outcome(rows)
         return observations
 
-    def _infos(self, rows: BoolArray | None = None) -> dict[str, Any]:
+    def _infos(self, rows: BoolArray | None = None) -> StrDict:
         """Return the infos of the last step of some rows, bool (n,); None: of all.
 
         The other rows are zeros.

@@ -1,7 +1,7 @@
 """``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -11,21 +11,18 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.simulation.checks import check_size, per_row
 from sb3_quad.simulation.settings import ENDLESS
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, P
+from sb3_quad.simulation.state import STATE, P, row_slices
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
-# Parts of the state that ``reset`` can fix, and their rows.
-_START = {
-    "position": POSITION,
-    "quaternion": QUATERNION,
-    "velocity": VELOCITY,
-    "body_rates": BODY_RATES,
-}
+# Parts of the state that ``reset`` can fix, besides the target.
+_START = ("position", "quaternion", "velocity", "body_rates")
+_ROWS = row_slices(STATE)
 
 
 class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
@@ -192,12 +189,12 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     - v0: first version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}
+    metadata: StrDict = {"render_modes": list(RENDER_MODES), "render_fps": 100}
 
     def __init__(
         self,
         task: TaskSpec = "target_tracking",
-        task_kwargs: Mapping[str, Any] | None = None,
+        task_kwargs: StrMapping | None = None,
         render_mode: str | None = None,
         render_width: int = 640,
         render_height: int = 480,
@@ -231,8 +228,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             self._renderer = Renderer(self.vehicle, *self._size, self._body)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float32Array, dict[str, Any]]:
+        self, *, seed: int | None = None, options: StrDict | None = None
+    ) -> tuple[Float32Array, StrDict]:
         """Begin an episode; after :meth:`close`, in a new simulation.
 
         :param seed: begins a new stream of random numbers. None: continue with the current one.
@@ -264,9 +261,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         batch.clear_outcome()
         return self.observe(), self._info()
 
-    def step(
-        self, action: npt.NDArray[Any]
-    ) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: npt.NDArray[Any]) -> tuple[Float32Array, float, bool, bool, StrDict]:
         """Fly one control step.
 
         :param action: (4,), clipped to [-1, 1].
@@ -295,11 +290,9 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         info = self._info()
         return observations[0], float(batch.outcome["reward"][0]), not info["survival"], False, info
 
-    def _info(self) -> dict[str, Any]:
-        # One item() for all fields takes less time than one for each.
-        fields = self.batch.outcome.dtype.names or ()
-        outcome = dict(zip(fields, self.batch.outcome[0].item(), strict=True))
-        return {key: outcome[field] for key, field in INFOS.items()}
+    def _info(self) -> StrDict:
+        outcome = self.batch.outcome[0]
+        return {key: outcome[field].item() for key, field in INFOS.items()}
 
     def render(self) -> Image | None:
         """Return a picture, uint8 (height, width, 3), in render mode ``"rgb_array"``.
@@ -330,32 +323,23 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         """
         return np.asarray(self.batch.observe()[0])
 
-    @property
-    def wrench(self) -> FloatArray:
-        """The external wrench that was set or sampled, without gusts, (12,); a live view.
-
-        Force in the world frame, force in the body frame, torque in the world frame, torque in the
-        body frame; N and N m.
-        """
-        return self.batch.wrench[:, 0]
-
     def _by_row(self, columns: FloatArray) -> FloatArray:
         return np.asarray(super()._by_row(columns)[0])
 
 
-def _fixed_rows(options: Mapping[str, Any], vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
+def _fixed_rows(options: StrMapping, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
     """Return the rows of the state that the options of a reset fix, with their values."""
-    _check_keys(options, ("target", "state"))
     start = options.get("state") or {}
     if not isinstance(start, Mapping):
         raise ConfigError(f"options: state {start!r}: must hold some of {', '.join(_START)}")
-    _check_keys(start, _START)
+    for given, known in ((options, ("target", "state")), (start, _START)):
+        for key in given.keys() - set(known):
+            raise ConfigError(f"options: {unknown('key', key, known)}")
     fixed = []
-    given = {"target": options.get("target"), **start}
-    for name, rows in {"target": TARGET, **_START}.items():
-        if given.get(name) is None:
+    for name, value in {**start, "target": options.get("target")}.items():
+        if value is None:
             continue
-        values = per_row(f"options: {name}", given[name], 1, rows.stop - rows.start)[:, 0]
+        values = per_row(f"options: {name}", value, 1, STATE[name])[:, 0]
         if name == "position" and values[2] <= vehicle.collision_radius:
             raise ConfigError(
                 f"position {values.tolist()}: touches the ground; "
@@ -366,11 +350,5 @@ def _fixed_rows(options: Mapping[str, Any], vehicle: Vehicle) -> list[tuple[slic
             if norm < 1e-6:
                 raise ConfigError("options: quaternion: must not be zero")
             values = values / norm
-        fixed.append((rows, values))
+        fixed.append((_ROWS[name], values))
     return fixed
-
-
-def _check_keys(options: Mapping[str, Any], known: Collection[str]) -> None:
-    for key in options:
-        if key not in known:
-            raise ConfigError(f"options: {unknown('key', key, known)}")

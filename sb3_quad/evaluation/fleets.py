@@ -132,7 +132,7 @@ class PyBulletFleet:
 
     def set_wrench(self, wrench: FloatArray) -> None:
         for env, values in zip(self._envs, wrench, strict=True):
-            env.wrench[:] = values
+            env.batch.wrench[:, 0] = values
 
     @property
     def wrench(self) -> FloatArray:

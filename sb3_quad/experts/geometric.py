@@ -4,13 +4,12 @@ It recovers from nearly every attitude, spin and fall, and flies to targets.
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.geometric_gains import TrueConstants, constants_of, derived_gains
 from sb3_quad.experts.geometric_law import fly_geometric
-from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.experts.protocol import Actions, Expert, Scaling
 from sb3_quad.simulation.state import (
     FORCE_WORLD,
     WRENCH_SIZE,
@@ -19,7 +18,7 @@ from sb3_quad.simulation.state import (
     drag_forces,
 )
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 # Half of the drag by the vehicle's own motion stays uncompensated, because it damps.
@@ -67,24 +66,21 @@ class GeometricExpert(Expert):
 
     def __init__(
         self,
-        vehicle: str | Vehicle = "itm",
+        vehicle: VehicleSource = "itm",
         gains: GeometricGains | None = None,
-        observation_mean: npt.ArrayLike | None = None,
-        observation_std: npt.ArrayLike | None = None,
+        observation_mean: Scaling = None,
+        observation_std: Scaling = None,
         privileged: bool = False,
         reserve: float = 0.0,
         late: dict[str, float] | None = None,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
         late = late or {}
-        if reserve < 0.0 or (reserve and not privileged):
+        is_valid = privileged and reserve >= 0.0 and late.keys() <= set(GAIN_NAMES)
+        if (reserve or late) and not is_valid:
             raise ConfigError(
-                f"reserve {reserve:g}: must not be negative, and needs privileged=True"
-            )
-        if late and (not privileged or late.keys() - set(GAIN_NAMES)):
-            raise ConfigError(
-                f"late {', '.join(late)}: must be among {', '.join(GAIN_NAMES)}, "
-                "and needs privileged=True"
+                f"reserve {reserve:g}, late {', '.join(late)}: they need privileged=True, "
+                f"a reserve of at least 0, and names among {', '.join(GAIN_NAMES)}"
             )
         self.reserve = reserve
         self.gains = gains or self.vehicle.geometric_gains or derived_gains(self.vehicle)
@@ -121,12 +117,12 @@ class GeometricExpert(Expert):
         return wrench
 
 
-def privileged_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+def privileged_geometric(vehicle: VehicleSource = "itm") -> GeometricExpert:
     """Return a :class:`GeometricExpert` that knows the true vehicle and wrench."""
     return GeometricExpert(vehicle, privileged=True)
 
 
-def privileged_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+def privileged_derived(vehicle: VehicleSource = "itm") -> GeometricExpert:
     """Return a privileged expert with the derived gains of each vehicle.
 
     It is meant for distributions of vehicles unlike this one. Where commands act late, its outer
@@ -136,7 +132,7 @@ def privileged_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     return GeometricExpert(vehicle, gains, privileged=True, late=_LATE)
 
 
-def privileged_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+def privileged_cautious(vehicle: VehicleSource = "itm") -> GeometricExpert:
     """Return a privileged expert with gentler descents and tilts.
 
     It has 0.7 of the gains ``descent`` and ``tilt``, and 0.05 weights of thrust in reserve. It

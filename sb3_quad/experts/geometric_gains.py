@@ -1,5 +1,6 @@
 """The constants of the geometric expert's law: gains, and what follows from a vehicle."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -20,24 +21,16 @@ _LATE_TO = 0.125
 
 
 class LawConstants(NamedTuple):
-    """Constants of n vehicles, one column for each."""
+    """Constants of n vehicles, one column for each, in the layout that the law is compiled for."""
 
+    vehicles: FloatArray
+    """Parameters, (len(PARAMETER_NAMES), n)."""
     gains: FloatArray
     """Shape (len(GAIN_NAMES), n), in the order of ``GAIN_NAMES``."""
-    mass: FloatArray
-    """Shape (n,), kg."""
-    gravity: FloatArray
-    """Shape (n,), m/s²."""
-    inertia: FloatArray
-    """Shape (3, n), kg m²."""
     lag: FloatArray
     """Shape (n,), τ, from a command to its thrust, s."""
     mixer_inverse: FloatArray
     """Shape (4, 4, n), rotor thrusts from thrust and moments."""
-    least_thrust: FloatArray
-    """Shape (n,), of one rotor, N."""
-    most_thrust: FloatArray
-    """Shape (n,), of one rotor, N."""
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
@@ -102,25 +95,15 @@ def _command_lag(v: FloatArray, control_step: float) -> FloatArray:
 def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawConstants:
     """Return the constants for n vehicles, from their parameters and gains.
 
-    The arrays are copies, in the layout that the law is compiled for.
-
     :param v: parameters, (len(PARAMETER_NAMES), n).
     :param gains: (len(GAIN_NAMES), n).
     """
     # [ΣF; Mx; My; Mz] = mixer · F: ones, then the arms of the rotors about each axis.
     arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
     mixers = np.concatenate([np.ones_like(arms[:1]), arms])
-    constants = LawConstants(
-        gains,
-        mass=v[P.mass],
-        gravity=v[P.gravity],
-        inertia=v[P.ixx : P.izz + 1],
-        lag=_command_lag(v, control_step),
-        mixer_inverse=np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0),
-        least_thrust=v[P.thrust_middle] - v[P.thrust_half_range],
-        most_thrust=v[P.thrust_middle] + v[P.thrust_half_range],
-    )
-    return LawConstants(*[np.array(values, order="C") for values in constants])
+    inverse = np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0)
+    constants = (v, gains, _command_lag(v, control_step), inverse)
+    return LawConstants._make(np.array(values, order="C") for values in constants)
 
 
 class TrueConstants:
@@ -134,26 +117,25 @@ class TrueConstants:
     :param late: factors of gains by name, the more effective the later commands act.
     """
 
-    def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: dict[str, float]) -> None:
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: Mapping[str, float]) -> None:
         self._control_step = vehicle.control_step
-        derived = gains_by_authority(vehicle.parameters()[:, None], vehicle.control_step)
-        self._scale = gains.values()[:, None] / derived
+        own = vehicle.parameters()[:, None]
+        self._scale = gains.values()[:, None] / gains_by_authority(own, self._control_step)
         self._scale[G.yaw_rate] *= PRIVILEGED_YAW
         self._late = np.array([[late.get(name, 1.0)] for name in GAIN_NAMES])
-        self._seen = np.empty((0, 0))
+        self._kept = self._compute(own)
 
     def of(self, vehicles: FloatArray) -> LawConstants:
         """Return the constants for parameters (len(PARAMETER_NAMES), n)."""
         # Another number of vehicles is another environment.
-        if self._seen.shape != vehicles.shape:
-            self._seen = vehicles.copy()
-            self._constants = self._compute(vehicles)
-        changed = np.flatnonzero((self._seen != vehicles).any(axis=0))
+        if self._kept.vehicles.shape != vehicles.shape:
+            self._kept = self._compute(vehicles)
+        changed = np.flatnonzero((self._kept.vehicles != vehicles).any(axis=0))
         if changed.size:
-            self._seen[:, changed] = vehicles[:, changed]
-            for kept, new in zip(self._constants, self._compute(vehicles[:, changed]), strict=True):
-                kept[..., changed] = new
-        return self._constants
+            new = self._compute(vehicles[:, changed])
+            for kept, values in zip(self._kept, new, strict=True):
+                kept[..., changed] = values
+        return self._kept
 
     def _compute(self, v: FloatArray) -> LawConstants:
         lag = _command_lag(v, self._control_step)

@@ -10,17 +10,17 @@ import numpy as np
 
 from sb3_quad.experts.geometric_gains import G
 from sb3_quad.experts.vectors import (
-    added,
     cross,
     difference,
     divided,
     dot,
+    plus_rotated,
     rotated,
     rotations_at,
     vector_at,
 )
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.state import W, X
+from sb3_quad.simulation.state import P, W, X
 
 
 @compiled
@@ -34,21 +34,23 @@ def fly_geometric(state, constants, wrench, reserve, actions):
     """
     # Each vehicle's gains are copied, so that they lie side by side. One column stands for all.
     gains = np.empty(constants.gains.shape[0])
+    tilting = np.empty(4)
     for i in range(actions.shape[0]):
         k = min(i, constants.gains.shape[1] - 1)
         j = min(i, wrench.shape[1] - 1)
         gains[:] = constants.gains[:, k]
-        mass = constants.mass[k]
-        g = constants.gravity[k]
-        inertia = vector_at(constants.inertia, 0, k)
+        mass = constants.vehicles[P.mass, k]
+        g = constants.vehicles[P.gravity, k]
+        inertia = vector_at(constants.vehicles, P.ixx, k)
         rotation, rotation_inverse = rotations_at(state, X.quaternion, i)
         omega = vector_at(state, X.body_rates, i)
 
         # What the external wrench does: an acceleration in the world frame, a torque in the body's.
         body_force = vector_at(wrench, W.force_body, j)
-        force = added(vector_at(wrench, W.force_world, j), rotated(rotation, body_force))
+        force = plus_rotated(vector_at(wrench, W.force_world, j), rotation, body_force)
         world_torque = vector_at(wrench, W.torque_world, j)
-        torque = added(vector_at(wrench, W.torque_body, j), rotated(rotation_inverse, world_torque))
+        body_torque = vector_at(wrench, W.torque_body, j)
+        torque = plus_rotated(body_torque, rotation_inverse, world_torque)
 
         # The force that the rotors should give per mass, and its direction b as the body will see
         # it when the command acts.
@@ -72,8 +74,9 @@ def fly_geometric(state, constants, wrench, reserve, actions):
             mass * size * b[2],
             moments,
             constants.mixer_inverse[:, :, k],
-            constants.least_thrust[k],
-            constants.most_thrust[k],
+            constants.vehicles[P.thrust_middle, k],
+            constants.vehicles[P.thrust_half_range, k],
+            tilting,
             actions[i],
         )
 
@@ -198,18 +201,16 @@ def turn_moments(b, omega, gains, inertia):
 
 
 @compiled
-def tilting_thrust(mixer_inverse, moments, rotor):
-    """Return a rotor's share of the roll and pitch moments, N."""
-    return mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
-
-
-@compiled
-def allocate(thrust, moments, mixer_inverse, low, high, actions):
+def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, tilting, actions):
     """Write the actions of one vehicle that make a thrust, N, and moments, N m.
 
     Roll and pitch come before the thrust, and the thrust before yaw, all within the limits of every
-    rotor (``low`` and ``high``, N).
+    rotor, ``thrust_middle`` ± ``thrust_half_range``, N.
+
+    :param tilting: scratch for the rotors' shares of the roll and pitch moments, (4,), N.
     """
+    low = thrust_middle - thrust_half_range
+    high = thrust_middle + thrust_half_range
     middle = (high + low) / 2
     half = (high - low) / 2
 
@@ -218,10 +219,11 @@ def allocate(thrust, moments, mixer_inverse, low, high, actions):
     most = 0.0
     largest = 0.0
     for rotor in range(4):
-        tilting = tilting_thrust(mixer_inverse, moments, rotor)
-        least = min(least, tilting)
-        most = max(most, tilting)
-        largest = max(largest, abs(tilting))
+        share = mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
+        tilting[rotor] = share
+        least = min(least, share)
+        most = max(most, share)
+        largest = max(largest, abs(share))
     scale = 1.0
     if largest > half:
         scale = half / largest
@@ -231,7 +233,7 @@ def allocate(thrust, moments, mixer_inverse, low, high, actions):
     # The share of the yaw moment that every rotor has room for.
     share = 1.0
     for rotor in range(4):
-        without_yaw = common + scale * tilting_thrust(mixer_inverse, moments, rotor)
+        without_yaw = common + scale * tilting[rotor]
         yaw = mixer_inverse[rotor, 3] * moments[2]
         room = without_yaw - low
         if yaw > 0.0:
@@ -241,6 +243,6 @@ def allocate(thrust, moments, mixer_inverse, low, high, actions):
 
     # Eq. 3.18: actions are thrusts between the limits, as numbers from -1 to 1.
     for rotor in range(4):
-        without_yaw = common + scale * tilting_thrust(mixer_inverse, moments, rotor)
-        rotor_thrust = without_yaw + share * mixer_inverse[rotor, 3] * moments[2]
+        yaw = share * mixer_inverse[rotor, 3] * moments[2]
+        rotor_thrust = common + scale * tilting[rotor] + yaw
         actions[rotor] = min(1.0, max(-1.0, (rotor_thrust - middle) / half))

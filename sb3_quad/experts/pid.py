@@ -3,14 +3,13 @@
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.experts.protocol import Actions, Expert, Scaling
 from sb3_quad.experts.vectors import difference, rotated, rotations_at, vector_at
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.state import QuadcopterState, X
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.vehicles.vehicle import VehicleSource
 
 # The thesis takes φ_des and θ_des at a quarter, "to ensure smoother rotations" (3.2.1).
 ANGLE_FACTOR = 0.25
@@ -35,20 +34,25 @@ class PIDExpert(Expert):
 
     def __init__(
         self,
-        vehicle: str | Vehicle = "itm",
+        vehicle: VehicleSource = "itm",
         kp: float = 1.5,
         ki: float = 50.0,
         kd: float = 4.1,
         natural_frequency: float = 9.0,
         damping: float = 1.0,
-        observation_mean: npt.ArrayLike | None = None,
-        observation_std: npt.ArrayLike | None = None,
+        observation_mean: Scaling = None,
+        observation_std: Scaling = None,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
-        gains = {"kp": kp, "ki": ki, "kd": kd, "damping": damping}
-        gains["natural_frequency"] = natural_frequency
+        gains = {
+            "kp": kp,
+            "ki": ki,
+            "kd": kd,
+            "natural_frequency": natural_frequency,
+            "damping": damping,
+        }
         for name, value in gains.items():
-            if not (math.isfinite(value) and value >= 0):
+            if not 0.0 <= value < math.inf:
                 raise ConfigError(
                     f"PIDExpert: {name} is {value}, must be a finite number of at least 0"
                 )

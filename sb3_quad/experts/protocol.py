@@ -16,9 +16,11 @@ from sb3_quad.simulation.state import (
     VELOCITY,
     QuadcopterState,
 )
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 Actions = Float32Array
+Scaling = npt.ArrayLike | None
+Floats = npt.NDArray[np.floating]
 
 
 class Expert(ABC):
@@ -40,17 +42,17 @@ class Expert(ABC):
 
     def __init__(
         self,
-        vehicle: str | Vehicle = "itm",
-        observation_mean: npt.ArrayLike | None = None,
-        observation_std: npt.ArrayLike | None = None,
+        vehicle: VehicleSource = "itm",
+        observation_mean: Scaling = None,
+        observation_std: Scaling = None,
     ) -> None:
         self.vehicle = load_vehicle(vehicle)
         if observation_mean is None:
             observation_mean = DEFAULT_MEAN
         if observation_std is None:
             observation_std = DEFAULT_STD
-        self.observation_mean = np.array(observation_mean, dtype=np.float64)
-        self.observation_std = np.array(observation_std, dtype=np.float64)
+        self.observation_mean = np.array(observation_mean, np.float64)
+        self.observation_std = np.array(observation_std, np.float64)
 
     @abstractmethod
     def actions(self, state: QuadcopterState) -> Actions:
@@ -58,11 +60,11 @@ class Expert(ABC):
 
     def predict(
         self,
-        observation: npt.NDArray[np.floating] | dict[str, npt.NDArray[np.floating]],
-        state: tuple[npt.NDArray[np.floating], ...] | None = None,
+        observation: Floats | dict[str, Floats],
+        state: tuple[Floats, ...] | None = None,
         episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = True,
-    ) -> tuple[Actions, tuple[npt.NDArray[np.floating], ...] | None]:
+    ) -> tuple[Actions, tuple[Floats, ...] | None]:
         """Return the actions for observations of shape (18,) or (n, 18), as SB3's ``predict`` does.
 
         Noise of the observations stays in.
@@ -108,14 +110,11 @@ def _nearest_quaternion(matrices: FloatArray) -> FloatArray:
     trace of R(q)ᵀ M is qᵀ K q, with a symmetric matrix K made of M. Of all unit quaternions the
     eigenvector to the greatest eigenvalue makes it greatest.
     """
-    trace = np.trace(matrices, axis1=1, axis2=2)
+    trace = np.trace(matrices, axis1=1, axis2=2)[:, None, None]
     transposed = matrices.transpose(0, 2, 1)
-    axis = (matrices - transposed)[:, [2, 0, 1], [1, 2, 0]]
-    k = np.empty((len(matrices), 4, 4))
-    k[:, 0, 0] = trace
-    k[:, 0, 1:] = axis
-    k[:, 1:, 0] = axis
-    k[:, 1:, 1:] = matrices + transposed - trace[:, None, None] * np.eye(3)
+    axis = (matrices - transposed)[:, None, [2, 0, 1], [1, 2, 0]]
+    inner = matrices + transposed - trace * np.eye(3)
+    k = np.block([[trace, axis], [axis.transpose(0, 2, 1), inner]])
     # eigh sorts the eigenvalues in ascending order.
     quaternions = np.linalg.eigh(k).eigenvectors[:, :, -1]
     return np.where(quaternions[:, :1] < 0, -quaternions, quaternions)

@@ -35,12 +35,6 @@ def cross(a, b):
 
 
 @compiled(inline="always")
-def added(a, b):
-    """Return a + b."""
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-@compiled(inline="always")
 def difference(a, b):
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
@@ -56,3 +50,19 @@ def divided(a, divisor):
 def rotated(rotation, a):
     """Return R a."""
     return dot(rotation[0], a), dot(rotation[1], a), dot(rotation[2], a)
+
+
+@compiled(inline="always")
+def plus_dot(start, a, b):
+    """Return start + a · b, summed from left to right."""
+    return start + a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled(inline="always")
+def plus_rotated(start, rotation, a):
+    """Return start + R a."""
+    return (
+        plus_dot(start[0], rotation[0], a),
+        plus_dot(start[1], rotation[1], a),
+        plus_dot(start[2], rotation[2], a),
+    )

@@ -1,75 +1,73 @@
-"""Layouts: the order of a vehicle's rotors and its body axes, and the turn from one layout to
-another.
-"""
+"""Layouts: a vehicle's order of rotors and body axes, and how one layout becomes another."""
 
 import itertools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sb3_quad.vehicles.vehicle import Vehicle
 
 # Rotors in the same place may differ by this angle, seen from the centre of mass.
 TOLERANCE = math.radians(20.0)
-# Angles that differ by less are taken for equal, since published positions are rounded.
+# Angles that differ by less are equal, since published positions are rounded.
 _SLACK = math.radians(1.0)
+_EIGHTH = math.pi / 4
 
 
 class Turn(NamedTuple):
-    """From a vehicle's own axes and rotors to those of a layout.
-
-    :param angle: rad, about z. Components of a body vector are rotated by it.
-    :param order: rotor k of the layout is the vehicle's rotor ``order[k]``.
-    """
+    """From a vehicle's own axes and rotors to those of a layout."""
 
     angle: float = 0.0
+    """Angle by which the vectors of the body turn about z, rad."""
     order: tuple[int, ...] = (0, 1, 2, 3)
+    """Rotor k of the layout is the vehicle's rotor ``order[k]``."""
 
     @property
     def axes(self) -> FloatArray:
-        """Rotation matrix (3, 3) from the own body frame to the layout's."""
-        cosine, sine = math.cos(self.angle), math.sin(self.angle)
+        """Rotation from the own body frame to the layout's, (3, 3)."""
+        cosine = math.cos(self.angle)
+        sine = math.sin(self.angle)
         return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
     @property
     def own(self) -> list[int]:
-        """The inverse of ``order``: rotor k of the vehicle is the layout's rotor ``own[k]``."""
+        """Rotor k of the vehicle is the layout's rotor ``own[k]``."""
         return [self.order.index(k) for k in range(4)]
 
 
-def find_turn(
-    ours: npt.ArrayLike,
-    our_directions: Sequence[int],
-    theirs: npt.ArrayLike,
-    their_directions: Sequence[int],
-) -> Turn | None:
-    """Return the turn that maps rotors onto others, each onto one with the same spin direction.
+def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
+    """Return the turn that brings the rotors of a vehicle to where those of another are.
 
-    Of turns that fit equally well it is the smallest. None if no turn does within ``TOLERANCE``.
+    Each comes to one with the same sign of its yaw moment. Of turns that fit equally well it is the
+    smallest.
 
-    :param ours: x, y of each rotor, (4, 2), m; ``theirs`` likewise.
-    :param our_directions: sign of the yaw moment of each rotor; ``their_directions`` likewise.
+    :raises ConfigError: there is none.
     """
-    # As complex numbers, whose arguments are the rotors' directions from the centre of mass.
-    places = np.asarray(ours) @ (1.0, 1.0j)
-    goals = np.asarray(theirs) @ (1.0, 1.0j)
-    candidates: list[tuple[float, Turn]] = []
+    # Places in the plane as complex numbers: a turn is a factor.
+    places = np.array(own.rotor_positions) @ (1.0, 1.0j)
+    goals = np.array(other.rotor_positions) @ (1.0, 1.0j)
+    fits: dict[Turn, float] = {}
     for order in itertools.permutations(range(4)):
-        if [our_directions[k] for k in order] != list(their_directions):
+        if tuple(own.rotor_directions[k] for k in order) != other.rotor_directions:
             continue
-        # The mean turn of the four rotors, and the largest deviation from it.
-        turns = np.exp(1j * np.angle(goals * places[list(order)].conj()))
-        angle = float(np.angle(turns.sum()))
-        misfit = float(np.abs(np.angle(turns * np.exp(-1j * angle))).max())
-        eighth = round(angle / (math.pi / 4)) * (math.pi / 4)
+        between = np.exp(1j * np.angle(goals * places[list(order)].conj()))
+        angle = float(np.angle(between.sum()))
+        misfit = np.abs(np.angle(between * np.exp(-1j * angle))).max()
+        eighth = round(angle / _EIGHTH) * _EIGHTH
         if abs(angle - eighth) < _SLACK:
             angle = eighth
-        candidates.append((misfit, Turn(angle, order)))
-    least = min(misfit for misfit, _ in candidates)
+        fits[Turn(angle, order)] = float(misfit)
+    least = min(fits.values())
     if least >= TOLERANCE:
-        return None
-    fitting = [turn for misfit, turn in candidates if misfit < least + _SLACK]
+        raise ConfigError(
+            f"rotor_layout: no turn brings the rotors of {own.name} to where those of "
+            f"{other.name} are, directions included; an agent flies only vehicles whose "
+            "rotors are where it knows them, once turned and renumbered"
+        )
+    fitting = [turn for turn, misfit in fits.items() if misfit < least + _SLACK]
     return min(fitting, key=lambda turn: (round(abs(turn.angle), 6), -turn.angle))
