@@ -8,6 +8,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
+from sb3_quad.base.types import StrDict
 
 CLASSES = (
     "nn.ELU",
@@ -66,7 +67,7 @@ def parse_value(text: str, key: str = "") -> Any:
         return parse_number(text)
 
 
-def parse_mapping(value: Any, key: str) -> dict[str, Any]:
+def parse_mapping(value: Any, key: str) -> StrDict:
     """Return a mapping, given as one, as None, or as rl_zoo3's ``"dict(net_arch=[64, 64])"``.
 
     Names such as ``nn.Tanh`` become classes.
@@ -80,11 +81,11 @@ def parse_mapping(value: Any, key: str) -> dict[str, Any]:
         value = {}
     if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
         raise ConfigError(f"{key}: must be a mapping of names to values, not {value!r}")
-    mapping: dict[str, Any] = _resolve(value, key)
+    mapping: StrDict = _resolve(value, key)
     return mapping
 
 
-def put_key(data: dict[str, Any], key: str, value: Any, where: str) -> None:
+def put_key(data: StrDict, key: str, value: Any, where: str) -> None:
     """Set a value at a dotted key, in place. Numbers are positions in a list.
 
     :raises ConfigError: Something on the way holds no keys.

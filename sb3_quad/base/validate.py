@@ -2,7 +2,7 @@
 
 import json
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import read_text
+from sb3_quad.base.types import StrMapping
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -18,7 +19,9 @@ Model = TypeVar("Model", bound=BaseModel)
 class Frozen(BaseModel):
     """A record: frozen, with finite numbers and no unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
@@ -81,7 +84,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     return "; ".join(lines.values())
 
 
-def _message(item: Mapping[str, Any]) -> str:
+def _message(item: StrMapping) -> str:
     value = item["input"]
     if str(item["type"]).startswith(("float_", "int_")) and isinstance(value, str):
         return f"{value!r} must be a plain number, without a unit"

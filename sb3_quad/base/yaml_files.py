@@ -10,6 +10,7 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text
+from sb3_quad.base.types import StrDict, StrPath
 
 
 class Loader(yaml.SafeLoader):
@@ -93,7 +94,7 @@ class YamlFolder:
         """Return the names of the files in the package."""
         return sorted(self._files())
 
-    def is_path(self, source: str | Path) -> bool:
+    def is_path(self, source: StrPath) -> bool:
         """Whether a source is the path of a file rather than a name.
 
         Where the suffix is part of the name, a source is a path if the user has such a file.
@@ -104,7 +105,7 @@ class YamlFolder:
             return Path(source).is_file()
         return bool(Path(source).suffix) or "/" in source
 
-    def text(self, source: str | Path) -> tuple[str, str]:
+    def text(self, source: StrPath) -> tuple[str, str]:
         """Return the text of a file by name or path, and the file's name for messages.
 
         :raises ConfigError: An unknown name, or a file that is missing or cannot be read.
@@ -120,7 +121,7 @@ class YamlFolder:
         text = files[name].read_text(encoding="utf-8")
         return text, name.removesuffix(self.suffix) + self.suffix
 
-    def read(self, source: str | Path) -> tuple[dict[Any, Any], str]:
+    def read(self, source: StrPath) -> tuple[dict[Any, Any], str]:
         """Return the keys and values of a file by name or path, and its name for messages.
 
         :raises ConfigError: See :meth:`text` and :func:`parse_keys`.
@@ -128,7 +129,7 @@ class YamlFolder:
         text, where = self.text(source)
         return parse_keys(text, where), where
 
-    def _files(self) -> dict[str, Any]:
+    def _files(self) -> StrDict:
         package = resources.files(self.package)
         files = {}
         for folder in ("", *self.folders):

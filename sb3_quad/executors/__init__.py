@@ -1,11 +1,12 @@
 """Executors, which call functions in other processes: workers on this machine, or a Ray cluster."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.process import StopSignals
+from sb3_quad.base.types import Report
 from sb3_quad.executors.local import LocalExecutor
 
 EXECUTORS = ("local", "ray")
@@ -58,7 +59,7 @@ def as_they_end(
     executor: Executor,
     calls: "dict[Future[Any], Key]",
     signals: StopSignals,
-    report: Callable[[str], None],
+    report: Report,
 ) -> "Iterator[tuple[Key, Future[Any]]]":
     """Yield the key and the future of each call when it ends.
 

@@ -17,6 +17,7 @@ from sb3_quad.base.errors import ConfigError, WorkerDied
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import TRUST_VARIABLE, trusted
+from sb3_quad.base.types import StrDict
 
 # Times that Ray repeats a call whose node or worker process dies.
 RETRIES = 3
@@ -75,7 +76,7 @@ class RayExecutor:
         variables = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
         if trusted():
             variables[TRUST_VARIABLE] = "1"
-        environment: dict[str, Any] = {"env_vars": variables}
+        environment: StrDict = {"env_vars": variables}
         if py_modules is not None:
             environment["py_modules"] = py_modules
         self._ray.init(

@@ -19,6 +19,7 @@ from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
+from sb3_quad.base.types import StrPath
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.runs import Run
@@ -36,7 +37,7 @@ MEASURES = (SUCCESS, SURVIVAL, REWARD, ERROR, TIME)
 tightest tolerance, or, where it starts at its target, until stable (None: never)."""
 
 
-class RunResult(Frozen, use_attribute_docstrings=True):
+class RunResult(Frozen):
     """The end of a run."""
 
     name: str
@@ -70,7 +71,7 @@ class SweepFolder:
     :param path: the folder.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: StrPath) -> None:
         self.path = Path(path)
 
     def write(self, sweep: Sweep) -> None:

@@ -19,6 +19,7 @@ from sb3_quad.base.files import one_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.types import Report
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import fly_scenario
@@ -52,7 +53,7 @@ def execute(
     executor: Executor,
     signals: StopSignals,
     show: Show,
-    report: Callable[[str], None],
+    report: Report,
 ) -> dict[str, RunResult]:
     """Execute all runs that are not finished.
 

@@ -7,10 +7,10 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
@@ -31,14 +31,14 @@ NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # whose value s
 LONGEST = 80  # characters of a name
 
 
-class Run(Frozen, use_attribute_docstrings=True):
+class Run(Frozen):
     """One training of a sweep: all that a worker needs, with the contents of settings files."""
 
     name: str
     """configuration/seed_k: its folder under runs/"""
     configuration: str
     seed: int
-    job: dict[str, Any]
+    job: StrDict
     """arguments of TrainingJob, less config, seed and log_folder"""
     stages: tuple[Stage, ...]
     """of its pipeline, with all their settings; a single run is one of one stage"""
@@ -91,7 +91,7 @@ def suite_of(spec: SweepSpec) -> Suite | None:
     return None
 
 
-def _cells(spec: SweepSpec) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+def _cells(spec: SweepSpec) -> Iterator[tuple[StrDict, StrDict]]:
     """Yield the keys in which a configuration differs, and all its keys."""
     for key, values in spec.grid.items():
         if not isinstance(values, list) or not values:
@@ -118,7 +118,7 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
             yield {**own, **cell}, data
 
 
-def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(shared: StrMapping, own: StrMapping) -> StrDict:
     both = {**shared, **own}
     for key, value in own.items():
         if isinstance(value, Mapping) and isinstance(shared.get(key), Mapping):
@@ -135,10 +135,10 @@ def _folder_name(configuration: Configuration, label: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", name).strip("-.,")[:LONGEST] or "run"
 
 
-def _stages(configuration: Configuration) -> tuple[dict[str, Any], list[Stage]]:
+def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     """Return the job of a configuration's runs and their stages, with all settings."""
     # A vehicle is a keyword of the environment.
-    changes: dict[str, Any] = {}
+    changes: StrDict = {}
     if configuration.vehicle is not None:
         kwargs = configuration.env_kwargs or {}
         changes["env_kwargs"] = {**kwargs, "vehicle": configuration.vehicle}
@@ -188,7 +188,7 @@ def _pipeline(configuration: Configuration) -> Pipeline:
     return Pipeline(stages=(stage,))
 
 
-def _name(varied: Mapping[str, Any]) -> str:
+def _name(varied: StrMapping) -> str:
     """Return the keys in which a configuration differs as words: ``pid,learning_rate=0.001``."""
     # Some values say enough without their key.
     words = []

@@ -2,12 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import yaml
 from optuna.trial import FrozenTrial
 
 from sb3_quad.base.files import write_csv, write_text
+from sb3_quad.base.types import StrDict
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
 
@@ -41,9 +41,9 @@ def write_results(search: Search) -> None:
     write_text(folder / BEST, "".join(f"# {line}\n" for line in comments) + settings)
 
 
-def _row(search: Search, trial: FrozenTrial) -> dict[str, Any]:
+def _row(search: Search, trial: FrozenTrial) -> StrDict:
     """The line of a trial in the table of all trials."""
-    row: dict[str, Any] = {
+    row: StrDict = {
         **trial.user_attrs,
         **varied(search, trial),
         "number": trial.number,
@@ -60,12 +60,12 @@ def _row(search: Search, trial: FrozenTrial) -> dict[str, Any]:
     return row
 
 
-def settings_of(trial: FrozenTrial) -> dict[str, Any]:
+def settings_of(trial: FrozenTrial) -> StrDict:
     """All settings of a trial, as YAML holds them; none if it failed before it had any."""
     return dict(json.loads(trial.user_attrs.get(SETTINGS, "{}")))
 
 
-def varied(search: Search, trial: FrozenTrial) -> dict[str, Any]:
+def varied(search: Search, trial: FrozenTrial) -> StrDict:
     """The settings of a trial that the search varies."""
     settings = settings_of(trial)
     if not settings:

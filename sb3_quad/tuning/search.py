@@ -29,6 +29,7 @@ from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
@@ -90,7 +91,7 @@ class Search:
         job: TrainingJob,
         space: SearchSpace,
         name: str,
-        storage: str | Path,
+        storage: StrPath,
         sampler: str = "tpe",
         pruner: str = "median",
         n_startup_trials: int = 10,
@@ -223,7 +224,7 @@ class Search:
             raise TrainingError(f"the mean reward is {trial.user_attrs[REWARD]}")
         return values[-1]
 
-    def _shared(self) -> dict[str, Any]:
+    def _shared(self) -> StrDict:
         """Return all that the trials of a study must share to be compared."""
         job = self.job
         # The agent counts by its content, since its file may move.
@@ -271,14 +272,14 @@ class NumberedSampler(BaseSampler):
         self._sampler = SAMPLERS[self._kind](seed, self._startup)
         return self._sampler.infer_relative_search_space(study, trial)
 
-    def sample_relative(self, *arguments: Any) -> dict[str, Any]:
+    def sample_relative(self, *arguments: Any) -> StrDict:
         return self._sampler.sample_relative(*arguments)
 
     def sample_independent(self, *arguments: Any) -> Any:
         return self._sampler.sample_independent(*arguments)
 
 
-def open_study(name: str, storage: str | Path) -> optuna.Study:
+def open_study(name: str, storage: StrPath) -> optuna.Study:
     """Return the study of this name, which the storage may hold already.
 
     :raises ConfigError: cmaes is missing; a storage that cannot be used, such as a file that is not

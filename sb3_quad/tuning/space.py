@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from optuna.distributions import (
@@ -24,6 +23,7 @@ from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_number, parse_value
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.training.algorithms import (
@@ -66,10 +66,10 @@ class SearchSpace:
     """
 
     algo: str
-    base: Mapping[str, Any]
+    base: StrMapping
     dimensions: Mapping[str, BaseDistribution]
 
-    def settings(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    def settings(self, parameters: StrMapping) -> StrDict:
         """Return all settings of a trial with these parameters, as YAML holds them."""
         changed = dict(self.base)
         for name, parameter in parameters.items():
@@ -84,11 +84,11 @@ class SearchSpace:
             changed["batch_size"] = math.ceil(_rollout(self.algo, changed) / count)
         return changed
 
-    def start(self) -> dict[str, Any] | None:
+    def start(self) -> StrDict | None:
         """Return the parameters that stand for the settings as they are; None if one of these lies
         outside the space.
         """
-        start: dict[str, Any] = {}
+        start: StrDict = {}
         for name, dimension in self.dimensions.items():
             # A list must hold the value, a range must include it.
             value = current(self.algo, self.base, name)
@@ -120,9 +120,7 @@ class SearchSpace:
         return float(f"{rounded:.4g}")
 
 
-def load_space(
-    algo: str, settings: Mapping[str, Any], source: str | Path | None = None
-) -> SearchSpace:
+def load_space(algo: str, settings: StrMapping, source: StrPath | None = None) -> SearchSpace:
     """Load the space of a search around some settings.
 
     :param source: a YAML file; None: the package's own for the algorithm.
@@ -152,7 +150,7 @@ def load_space(
     return SearchSpace(algo, settings, dimensions)
 
 
-def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
+def current(algo: str, settings: StrMapping, name: str) -> Any:
     """Return the value that some settings have under a name of a search space, or else the
     algorithm's default.
     """
@@ -172,7 +170,7 @@ def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
 
 
 def _dimension(
-    algo: str, settings: Mapping[str, Any], name: str, values: Any, where: str
+    algo: str, settings: StrMapping, name: str, values: Any, where: str
 ) -> BaseDistribution:
     if isinstance(values, list) and values:
         return CategoricalDistribution([_label(value) for value in values])
@@ -212,13 +210,13 @@ def _around(value: Any, factor: Any, whole: bool, where: str) -> Interval:
     return Interval(low=middle / around, high=middle * around, log=True)
 
 
-def _rollout(algo: str, settings: Mapping[str, Any]) -> float:
+def _rollout(algo: str, settings: StrMapping) -> float:
     """Return the timesteps of a rollout of all environments."""
     factors = [_number_of(current(algo, settings, name)) or 1 for name in ("n_steps", "n_envs")]
     return math.prod(factors)
 
 
-def _plain(value: Any) -> dict[str, Any]:
+def _plain(value: Any) -> StrDict:
     """Return a mapping of the settings with its values as written, also one like ``dict(…)``."""
     if isinstance(value, str):
         value = parse_value(value)
