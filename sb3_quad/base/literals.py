@@ -96,7 +96,10 @@ def put_key(data: StrDict, key: str, value: Any, where: str) -> None:
         if isinstance(place, list) and part.isdigit() and int(part) < len(place):
             place = place[int(part)]
         elif isinstance(place, dict):
-            place = place.setdefault(part, {})
+            # A key without a value in a file is None.
+            if place.get(part) is None:
+                place[part] = {}
+            place = place[part]
         else:
             place = None
     if not isinstance(place, dict):

@@ -27,12 +27,7 @@ from sb3_quad.sweep.spec import SweepSpec
 
 PLAN = "plan.json"
 Numbers: TypeAlias = tuple[float | None, ...]
-SUCCESS = "success"
-SURVIVAL = "survival"
-REWARD = "reward"
-ERROR = "final_error"
-TIME = "time"
-MEASURES = (SUCCESS, SURVIVAL, REWARD, ERROR, TIME)
+MEASURES = ("success", "survival", "reward", "final_error", "time")
 """The numbers of an episode: 0 or 1, 0 or 1, sum, m (None: crashed or out of range), s to the
 tightest tolerance, or, where it starts at its target, until stable (None: never)."""
 
@@ -85,8 +80,6 @@ class SweepFolder:
 
         :raises ConfigError: a folder that holds no sweep, or a damaged file.
         """
-        if not self.path.is_dir():
-            raise ConfigError(f"sweep folder {self.path}: no such folder")
         if not (self.path / PLAN).is_file():
             raise ConfigError(f"sweep folder {self.path}: holds no sweep ({PLAN} is missing)")
         return read_record(self.path / PLAN, Sweep)
@@ -103,10 +96,12 @@ class SweepFolder:
 
     def results(self, runs: Sequence[Run]) -> dict[str, RunResult]:
         """Read the results of those runs that ended, by name."""
-        paths = {run.name: self._result(run.name) for run in runs}
-        return {
-            name: read_record(path, RunResult) for name, path in paths.items() if path.is_file()
-        }
+        results = {}
+        for run in runs:
+            path = self._result(run.name)
+            if path.is_file():
+                results[run.name] = read_record(path, RunResult)
+        return results
 
     def _result(self, name: str) -> Path:
         return self.path / "records" / f"{name}.json"

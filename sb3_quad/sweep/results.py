@@ -9,7 +9,9 @@ the Statistical Precipice, NeurIPS 2021): with one seed they cover the choice of
 
 import itertools
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,28 +32,19 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.sweep.folder import (
-    ERROR,
-    MEASURES,
-    REWARD,
-    SUCCESS,
-    SURVIVAL,
-    TIME,
-    RunResult,
-    Sweep,
-    SweepFolder,
-)
+from sb3_quad.sweep.folder import MEASURES, RunResult, Sweep, SweepFolder
 
 # By measure: its row, the factor from values to cells, and their decimals.
 ROWS = {
-    SUCCESS: (metric_tables.SUCCESS, 100.0, 2),
-    SURVIVAL: (metric_tables.SURVIVAL, 100.0, 2),
-    REWARD: (metric_tables.REWARD, 1.0, 2),
-    ERROR: (metric_tables.MEDIAN, 1.0, 3),
-    TIME: (Row("mean time until there, or stable", "s"), 1.0, 2),
+    "success": (metric_tables.SUCCESS, 100.0, 2),
+    "survival": (metric_tables.SURVIVAL, 100.0, 2),
+    "reward": (metric_tables.REWARD, 1.0, 2),
+    "final_error": (metric_tables.MEDIAN, 1.0, 3),
+    "time": (Row("mean time until there, or stable", "s"), 1.0, 2),
 }
-COMPARED = (SUCCESS, REWARD)
+COMPARED = ("success", "reward")
 CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
+PAIRED = "paired bootstrap over the seeds and episodes that both have"
 # The levels that tell apart the rows of a table of episodes.
 LEVELS = ("configuration", "seed", "scenario", "episode")
 COLUMNS = (
@@ -59,6 +52,14 @@ COLUMNS = (
     *MEASURES,
     *("timesteps", "agent", "weights", "message"),
 )
+
+
+class MeanOverSeeds(Estimate):
+    """The mean of a measure over the finished runs of a configuration."""
+
+    configuration: str
+    scenario: str
+    measure: str
 
 
 class Comparison(Estimate):
@@ -72,14 +73,6 @@ class Comparison(Estimate):
     """whether the first is better or worse"""
 
 
-class ConfigurationResults(Frozen):
-    """The results of the finished runs of a configuration."""
-
-    seeds: list[int]
-    scenarios: dict[str, dict[str, Estimate | None]] = {}
-    """by scenario and measure; None: not measured"""
-
-
 class SweepResults(Frozen):
     """The content of ``results.json``."""
 
@@ -89,8 +82,9 @@ class SweepResults(Frozen):
     finished: int
     failed: dict[str, str]
     """by the name of a run, why it failed"""
-    configurations: dict[str, ConfigurationResults]
-    """only those that have finished runs"""
+    configurations: dict[str, list[int]]
+    """by the name of a configuration, the seeds of its finished runs, if it has any"""
+    estimates: list[MeanOverSeeds] = []
     comparisons: list[Comparison] = []
 
 
@@ -112,24 +106,27 @@ def write_results(
         for scenario, measures in result.flights.items():
             part = _episodes(measures)
             parts[result.configuration, result.seed, scenario] = part
-            statistics = {**part.mean(), ERROR: part[ERROR].quantile()}
+            # All are means but for the final error, which is a median.
+            statistics = {**part.mean(), "final_error": part["final_error"].quantile()}
             lines.append({**line, "scenario": scenario, "episodes": len(part), **statistics})
         # The table holds every run that ended, also those that failed.
         if not result.flights:
             lines.append(line)
     table = pd.DataFrame(lines, columns=COLUMNS)
     write_text(place.path / "results.csv", table.to_csv(index=False, float_format="%.9g"))
-    configurations = {}
-    finished = [result for result in ended if result.state == "finished"]
-    for result in finished:
-        entry = ConfigurationResults(seeds=[])
-        configurations.setdefault(result.configuration, entry).seeds.append(result.seed)
+    seeds: dict[str, list[int]] = {}
+    failed = {}
+    for result in ended:
+        if result.state == "failed":
+            failed[result.name] = result.message
+        else:
+            seeds.setdefault(result.configuration, []).append(result.seed)
     summary = SweepResults(
         sweep=sweep.spec.name,
         runs=len(sweep.runs),
-        finished=len(finished),
-        failed={result.name: result.message for result in ended if result.state == "failed"},
-        configurations=configurations,
+        finished=len(ended) - len(failed),
+        failed=failed,
+        configurations=seeds,
     )
     _estimate(summary, pd.concat(parts, names=LEVELS))
     write_text(place.path / "results.json", summary.model_dump_json(indent=1) + "\n")
@@ -151,12 +148,15 @@ def _estimate(summary: SweepResults, flights: Any) -> None:
     for scenario, group in flights.groupby(level="scenario", sort=False):
         names = group.index.unique("configuration")
         for measure in MEASURES:
-            statistic = np.nanmedian if measure == ERROR else np.nanmean
+            key = {"scenario": scenario, "measure": measure}
+            statistic = np.nanmedian if measure == "final_error" else np.nanmean
             # A row for each run, a column for each episode.
             values = group[measure].unstack()
             for name in names:
-                estimates = summary.configurations[name].scenarios.setdefault(scenario, {})
-                estimates[measure] = over_seeds(values.loc[name].to_numpy(), statistic)
+                estimate = over_seeds(values.loc[name].to_numpy(), statistic)
+                if estimate is not None:
+                    fields = {**dict(estimate), **key, "configuration": name}
+                    summary.estimates.append(MeanOverSeeds(**fields))
             if measure not in COMPARED:
                 continue
             for first, second in itertools.combinations(names, 2):
@@ -164,14 +164,8 @@ def _estimate(summary: SweepResults, flights: Any) -> None:
                 paired = (values.loc[first] - values.loc[second]).dropna(how="all")
                 difference = over_seeds(paired.to_numpy())
                 if difference is not None:
-                    comparison = Comparison(
-                        **difference.model_dump(),
-                        scenario=scenario,
-                        measure=measure,
-                        first=first,
-                        second=second,
-                        verdict=verdict(difference),
-                    )
+                    fields = {**dict(difference), **key, "first": first, "second": second}
+                    comparison = Comparison(**fields, verdict=verdict(difference))
                     summary.comparisons.append(comparison)
 
 
@@ -211,62 +205,51 @@ def verdict(difference: Estimate) -> str:
     return "worse" if difference.high < 0 else "cannot tell"
 
 
-def tables(summary: SweepResults) -> dict[str, list[Table]]:
-    """Return by scenario a table with a column for each configuration, and one that compares
-    them.
+def tables(summary: SweepResults) -> list[Table]:
+    """Return for each scenario a table with a column for each configuration, and a last one that
+    compares them.
     """
-    entries = summary.configurations
     columns = []
-    for name, entry in entries.items():
-        seeds = "1 seed" if len(entry.seeds) == 1 else f"{len(entry.seeds)} seeds"
+    for name, runs in summary.configurations.items():
+        seeds = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
         columns.append(Column(f"{name} ({seeds})"))
-    by_scenario: dict[str, list[Table]] = {}
-    for scenario in itertools.chain.from_iterable(entry.scenarios for entry in entries.values()):
-        # A measure that no configuration has gets no row.
+    made = []
+    for scenario, group in itertools.groupby(summary.estimates, lambda item: item.scenario):
+        known = {(item.measure, item.configuration): _cell(item) for item in group}
         rows = []
-        for measure, (row, _, _) in ROWS.items():
-            cells = []
-            for entry in entries.values():
-                cells.append(_cell(entry.scenarios.get(scenario, {}).get(measure), measure))
-            if any(cell.number for cell in cells):
-                rows.append(Row(row.name, row.unit, cells))
-        by_scenario[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
-        # A second table compares the configurations, if there are several.
-        lines = []
-        for comparison in summary.comparisons:
-            if comparison.scenario == scenario:
-                name = f"{comparison.first} than {comparison.second}"
-                cells = [Cell(words=comparison.verdict), _cell(comparison, comparison.measure)]
-                lines.append(Row(name, ROWS[comparison.measure][0].heading, cells))
-        if lines:
-            table = Table(
-                [Column("is", align="left"), Column("difference")],
-                lines,
-                title=f"{scenario}: better, worse, cannot tell",
-                caption="paired bootstrap over the seeds and episodes that both have",
-            )
-            by_scenario[scenario].append(table)
-    return by_scenario
+        for measure in dict.fromkeys(measure for measure, _ in known):
+            row = ROWS[measure][0]
+            cells = [known.get((measure, name), Cell()) for name in summary.configurations]
+            rows.append(Row(row.name, row.unit, cells))
+        made.append(Table(columns, rows, title=scenario, caption=CAPTION))
+    # The comparisons, if there are several configurations.
+    rows = []
+    for item in summary.comparisons:
+        name = f"{item.scenario}, {ROWS[item.measure][0].heading}: {item.first} than {item.second}"
+        rows.append(Row(name, cells=[Cell(words=item.verdict), _cell(item)]))
+    if rows:
+        columns = [Column("is", align="left"), Column("difference")]
+        made.append(Table(columns, rows, title="better, worse, cannot tell", caption=PAIRED))
+    return made
 
 
-def _cell(estimate: Estimate | None, measure: str) -> Cell:
-    _, factor, decimals = ROWS[measure]
-    return estimate_cell(estimate, factor, decimals, none="")
+def _cell(estimate: MeanOverSeeds | Comparison) -> Cell:
+    _, factor, decimals = ROWS[estimate.measure]
+    return estimate_cell(estimate, factor, decimals)
 
 
-def write_report(
-    place: SweepFolder, summary: SweepResults, shown: Mapping[str, Sequence[Table]]
-) -> Path:
-    """Write the report of a sweep's finished runs: a section for each scenario and the learning
+def write_report(place: SweepFolder, summary: SweepResults, shown: Sequence[Table]) -> Path:
+    """Write the report of a sweep's finished runs: a section for each table, and the learning
     curves.
 
-    :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`, by scenario.
+    :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`.
     :return: the page.
     :raises ConfigError: a folder that cannot be written.
     """
     parts = []
-    for scenario, flown in shown.items():
-        parts.append(Section(f"scenario-{len(parts)}", scenario, "", flown, facts=flown[0].caption))
+    for table in shown:
+        anchor = f"table-{len(parts)}"
+        parts.append(Section(anchor, table.title, tables=[table], facts=table.caption))
     plots = _curves(place, summary)
     if plots:
         description = "Mean over seeds, with their range."
@@ -279,21 +262,19 @@ def _curves(place: SweepFolder, summary: SweepResults) -> list[Plot]:
     """Plot the evaluations along the way; of pipelines, one plot for each algorithm and environment
     of a stage.
     """
-    # A run folder is <algo>/<Env>_<number>; its stages have curves of their own.
-    curves: dict[str, dict[str, list[Curve]]] = {}
-    for name, entry in summary.configurations.items():
-        for seed in entry.seeds:
+    curves: dict[str, dict[str, list[Curve]]] = defaultdict(lambda: defaultdict(list))
+    for name, seeds in summary.configurations.items():
+        for seed in seeds:
+            # Below it, a run folder is <algo>/<Env>_<number>; its stages have their own.
             folder = place.path / "runs" / name / f"seed_{seed}"
             for path in sorted(folder.glob("*/*/evaluations.npz")):
-                kind = f"{path.parts[-3]} {path.parts[-2].rpartition('_')[0]}"
-                curves.setdefault(kind, {}).setdefault(name, []).append(read_curve(path.parent))
+                *_, algo, run, _ = path.parts
+                kind = f"{algo} {run.rpartition('_')[0]}"
+                curves[kind][name].append(read_curve(path.parent))
     plots = []
     for kind, groups in curves.items():
-        try:
-            figure = plot_curves(groups, {}, kind)
-        except ConfigError:
-            # No evaluation of this kind has success or reward.
-            continue
-        caption = f"{kind}: success and reward along the training."
-        plots.append(Plot(f"curves_{len(plots)}", caption, figure))
+        # An environment of others may report neither success nor reward.
+        with suppress(ConfigError):
+            caption = f"{kind}: success and reward along the training."
+            plots.append(Plot(f"curves_{len(plots)}", caption, plot_curves(groups, {}, kind)))
     return plots

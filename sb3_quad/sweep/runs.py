@@ -5,7 +5,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
@@ -52,13 +52,14 @@ def make_runs(spec: SweepSpec) -> list[Run]:
         two configurations of one name, too many runs.
     """
     # Every configuration is checked before the first run starts.
-    runs: dict[str, list[Run]] = {}
+    runs: list[Run] = []
+    names = set[str]()
     for varied, data in _cells(spec):
         label = _name(varied)
         where = f"configuration {label!r}" if varied else "sweep"
         configuration = validate(Configuration, data, where)
         name = _folder_name(configuration, label)
-        if name in runs:
+        if name in names:
             raise ConfigError(
                 f"two configurations are called {name!r}; give them names, or values that differ"
             )
@@ -66,8 +67,9 @@ def make_runs(spec: SweepSpec) -> list[Run]:
             job, stages = _stages(configuration)
         except ConfigError as error:
             raise ConfigError(f"configuration {name!r}: {error}") from None
-        runs[name] = [
-            Run(
+        names.add(name)
+        for seed in spec.seed:
+            run = Run(
                 name=f"{name}/seed_{seed}",
                 configuration=name,
                 seed=seed,
@@ -75,9 +77,8 @@ def make_runs(spec: SweepSpec) -> list[Run]:
                 stages=tuple(stages),
                 gym_packages=spec.gym_packages,
             )
-            for seed in spec.seed
-        ]
-    return [*itertools.chain.from_iterable(runs.values())]
+            runs.append(run)
+    return runs
 
 
 def suite_of(spec: SweepSpec) -> Suite | None:
@@ -104,26 +105,19 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[StrDict, StrDict]]:
     for own in listed:
         for values in itertools.product(*spec.grid.values()):
             cell = dict(zip(spec.grid, values, strict=True))
-            data = copy.deepcopy(_merged(spec.given, own))
-            data.pop("name", None)
+            data = spec.given
+            # The entries of mappings are merged, such as those of env_kwargs.
+            for key, value in own.items():
+                if isinstance(value, dict) and isinstance(data.get(key), dict):
+                    value = data[key] | value
+                data[key] = copy.deepcopy(value)
             for key, value in cell.items():
-                # A key without a value in the file is null, and holds no mapping to put this into.
-                outer = key.partition(".")[0]
-                if data.get(outer) is None:
-                    data.pop(outer, None)
                 put_key(data, key, value, f"grid: {key}")
             # A named configuration keeps its name in each cell of the grid.
+            data["name"] = None
             if own.get("name"):
                 data["name"] = ",".join(filter(None, [str(own["name"]), _name(cell)]))
             yield {**own, **cell}, data
-
-
-def _merged(shared: StrMapping, own: StrMapping) -> StrDict:
-    both = {**shared, **own}
-    for key, value in own.items():
-        if isinstance(value, Mapping) and isinstance(shared.get(key), Mapping):
-            both[key] = {**shared[key], **value}
-    return both
 
 
 def _folder_name(configuration: Configuration, label: str) -> str:
@@ -140,8 +134,10 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     # A vehicle is a keyword of the environment.
     changes: StrDict = {}
     if configuration.vehicle is not None:
-        kwargs = configuration.env_kwargs or {}
-        changes["env_kwargs"] = {**kwargs, "vehicle": configuration.vehicle}
+        changes["env_kwargs"] = {
+            **(configuration.env_kwargs or {}),
+            "vehicle": configuration.vehicle,
+        }
     # The agent that the training starts from, as a path that workers find.
     if configuration.trained_agent is not None:
         changes["trained_agent"] = agent_path(configuration.trained_agent)

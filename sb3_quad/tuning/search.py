@@ -11,15 +11,13 @@ import json
 import math
 import os
 import platform
-import warnings
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
-from optuna.distributions import BaseDistribution, distribution_to_json
-from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
+from optuna.distributions import distribution_to_json
+from optuna.pruners import MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
@@ -35,7 +33,7 @@ from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 
 # From a seed and n_startup_trials.
-SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {
+SAMPLERS = {
     "tpe": lambda seed, n: TPESampler(
         seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True
     ),
@@ -45,7 +43,7 @@ SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {
     ),
 }
 # From n_startup_trials and n_evaluations.
-PRUNERS: Mapping[str, Callable[[int, int], BasePruner]] = {
+PRUNERS = {
     "median": lambda n, evaluations: MedianPruner(
         n_startup_trials=n, n_warmup_steps=evaluations // 3
     ),
@@ -121,7 +119,7 @@ class Search:
                 self.study.enqueue_trial(first)
         known = self.study.user_attrs.get(BEGUN_WITH)
         where = f"study {name} in {storage}"
-        if not isinstance(known, dict):
+        if known is None:
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
         if differing:
@@ -146,10 +144,9 @@ class Search:
             retry_dead_trials(self.study)
             if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
                 return None
-            trial = self.study.ask(dict(self.space.dimensions))
+            trial = self.study.ask(self.space.dimensions)
             trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
-            self.study.tell(trial, *self._outcome(trial))
-            return self.study.get_trials(deepcopy=False)[trial.number]
+            return self.study.tell(trial, *self._outcome(trial))
         except (OSError, optuna.exceptions.OptunaError) as error:
             raise ConfigError(
                 f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})"
@@ -197,24 +194,21 @@ class Search:
         values: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
-            value = reward
-            if known.task is not None:
-                value = score(success, reward, self.job.eval_episodes)
-            values.append(value)
-            trial.report(value, len(values))
+            if known.task is None:
+                values.append(reward)
+            else:
+                values.append(score(success, reward, self.job.eval_episodes))
+            trial.report(values[-1], len(values))
             trial.set_user_attr(SUCCESS, success)
             trial.set_user_attr(REWARD, reward)
             return len(values) >= self.n_evaluations or not trial.should_prune()
 
-        # SB3 warns of each batch size that does not divide the rollout, which a search often tries.
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
-            result = train(
-                self.job.model_copy(update=changes),
-                report=lambda line: None,
-                on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
-                should_continue=should_continue,
-            )
+        result = train(
+            self.job.model_copy(update=changes),
+            report=lambda line: None,
+            on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
+            should_continue=should_continue,
+        )
         # The training ends early by a signal, or because the pruner stopped it.
         if result.exit_code != 0:
             raise KeyboardInterrupt
@@ -233,9 +227,7 @@ class Search:
             try:
                 agent = hashlib.sha256(Path(job.trained_agent).read_bytes()).hexdigest()
             except OSError as error:
-                raise ConfigError(
-                    f"{job.trained_agent}: cannot be read ({error.strerror or error})"
-                ) from None
+                raise ConfigError(f"{job.trained_agent}: cannot be read ({error})") from None
         dimensions = self.space.dimensions.items()
         return {
             "algo": job.config.algo,
@@ -262,9 +254,7 @@ class NumberedSampler(BaseSampler):
         self._seed = seed
         self._startup = n_startup_trials
 
-    def infer_relative_search_space(
-        self, study: optuna.Study, trial: FrozenTrial
-    ) -> dict[str, BaseDistribution]:
+    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> StrDict:
         # A retry has the parameters of an earlier trial, and no number of its own.
         before = study.get_trials(deepcopy=False)[: trial.number]
         number = sum("again" not in earlier.user_attrs for earlier in before)
@@ -286,12 +276,13 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
         a journal.
     """
     require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
+    is_url = "://" in str(storage)
     try:
-        backend: Any = str(storage)
-        if "://" not in backend:
-            backend = _open_journal(Path(storage))
         return optuna.create_study(
-            study_name=name, storage=backend, direction="maximize", load_if_exists=True
+            study_name=name,
+            storage=str(storage) if is_url else _open_journal(Path(storage)),
+            direction="maximize",
+            load_if_exists=True,
         )
     except Exception as error:  # databases and damaged journals raise anything
         reason = f"{type(error).__name__}: {one_line(error)}"

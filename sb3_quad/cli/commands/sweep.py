@@ -216,11 +216,10 @@ def _write_results(folder: Any, sweep: Any, records: Any) -> Any:
 
     results = write_results(folder, sweep, records)
     if results.finished:
-        sections = tables(results)
-        for section in sections.values():
-            for table in section:
-                console().print(table)
-        write_report(folder, results, sections)
+        shown = tables(results)
+        for table in shown:
+            console().print(table)
+        write_report(folder, results, shown)
     return results
 
 
