@@ -1,6 +1,5 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
-import csv
 import io
 import os
 from collections.abc import Iterable, Iterator
@@ -95,11 +94,11 @@ def write_csv(path: StrPath, columns: Iterable[str], rows: Iterable[StrMapping])
 
     A cell is empty where its row lacks the key. Keys without a column are ignored.
     """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
+    # Imported here because --help needs no tables.
+    import pandas as pd
+
+    table = pd.DataFrame(list(rows), columns=list(columns), dtype=object)
+    write_text(path, table.to_csv(index=False))
 
 
 def write_arrays(path: StrPath, compressed: bool = False, **arrays: Any) -> None:

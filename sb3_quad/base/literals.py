@@ -113,9 +113,7 @@ def _resolve(value: Any, key: str) -> Any:
         return {name: _resolve(entry, f"{key}.{name}") for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
         return type(value)(_resolve(entry, key) for entry in value)
-    if not isinstance(value, str):
-        return value
-    match = _CLASS_NAME.fullmatch(value)
+    match = _CLASS_NAME.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         return parse_number(value)
     if match[1] not in CLASSES:
@@ -128,11 +126,11 @@ class _AsLiterals(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
-        names = [keyword.arg for keyword in node.keywords]
-        if ast.unparse(node.func) != "dict" or node.args or None in names:
+        if ast.unparse(node.func) != "dict" or node.args:
             return node
-        values = [keyword.value for keyword in node.keywords]
-        return ast.Dict([ast.Constant(name) for name in names], values)
+        # The name of **mapping is None, which parse_mapping refuses.
+        names: list[ast.expr | None] = [ast.Constant(keyword.arg) for keyword in node.keywords]
+        return ast.Dict(names, [keyword.value for keyword in node.keywords])
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         text = ast.unparse(node)

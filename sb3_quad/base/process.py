@@ -18,7 +18,7 @@ _FROM_THE_TERMINAL = [number for number in (signal.SIGINT, _SIGHUP) if number is
 SIGNALS = (*_FROM_THE_TERMINAL, signal.SIGTERM)
 TRUST_VARIABLE = "SB3_QUAD_TRUST"
 
-_most_cpus: int | None = None
+_most_cpus = sys.maxsize
 
 
 class StopSignals:
@@ -43,16 +43,12 @@ class StopSignals:
         """The exit code that a shell expects after a signal, such as 130 after SIGINT. 0 if none
         came.
         """
-        if self.received is None:
-            return 0
-        return 128 + self.received
+        return 128 + self.received if self.received else 0
 
     @property
     def name(self) -> str:
         """The signal's name, empty if none came."""
-        if self.received is None:
-            return ""
-        return signal.Signals(self.received).name
+        return signal.Signals(self.received).name if self.received else ""
 
     def __enter__(self) -> "StopSignals":
         if threading.current_thread() is threading.main_thread():
@@ -115,12 +111,8 @@ def available_cpus() -> int:
     """The number of CPUs that this process may use."""
     # Only Linux knows the CPUs that a process is restricted to.
     if hasattr(os, "sched_getaffinity"):
-        count = len(os.sched_getaffinity(0))
-    else:
-        count = os.cpu_count() or 1
-    if _most_cpus is None:
-        return count
-    return min(count, _most_cpus)
+        return min(len(os.sched_getaffinity(0)), _most_cpus)
+    return min(os.cpu_count() or 1, _most_cpus)
 
 
 def has_ended(process: int) -> bool:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic.fields import FieldInfo
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import read_text
@@ -72,7 +71,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     for item in error.errors():
         inner, key, meaning = _locate(model, item["loc"])
         if item["type"] == "extra_forbidden":
-            text = unknown("key", item["loc"][-1], _fields(inner))
+            text = unknown("key", item["loc"][-1], inner.model_fields)
         elif meaning:
             text = f"{_message(item)} ({meaning})"
         else:
@@ -100,7 +99,7 @@ def _locate(
     names: list[str] = []
     meaning = ""
     for part in location:
-        field = _fields(model).get(str(part))
+        field = model.model_fields.get(str(part))
         if isinstance(part, int):
             names.append(str(part))
         elif field is not None:
@@ -109,14 +108,6 @@ def _locate(
             model = _model_in(field.annotation) or model
         # Anything else is the name of a union's alternative, which the user does not know.
     return model, ".".join(names), meaning
-
-
-def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a model by the keys that its data have."""
-    fields = {}
-    for name, field in model.model_fields.items():
-        fields[str(field.validation_alias or name)] = field
-    return fields
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

@@ -43,8 +43,6 @@ def start_executor(
     """
     if kind not in EXECUTORS:
         raise ConfigError(unknown("executor", kind, EXECUTORS))
-    if workers < 1:
-        raise ConfigError(f"workers {workers}: must be at least 1")
     if kind == "local":
         if address is not None:
             raise ConfigError(f"address {address}: goes with --executor ray")

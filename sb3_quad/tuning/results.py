@@ -3,11 +3,10 @@
 import json
 from pathlib import Path
 
-import pandas as pd
 import yaml
 from optuna.trial import FrozenTrial
 
-from sb3_quad.base.files import write_text
+from sb3_quad.base.files import write_csv, write_text
 from sb3_quad.base.types import StrDict
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
@@ -26,9 +25,7 @@ def write_results(search: Search) -> None:
     # The table is written after each trial, so that an interruption loses none.
     columns = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds"]
     columns += [*search.space.dimensions, RUN, ERROR]
-    rows = [_row(search, trial) for trial in search.trials()]
-    table = pd.DataFrame(rows, columns=columns, dtype=object)
-    write_text(folder / TRIALS, table.to_csv(index=False))
+    write_csv(folder / TRIALS, columns, [_row(search, trial) for trial in search.trials()])
     best = search.best
     if best is None:
         return
