@@ -118,31 +118,29 @@ def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> 
     # One core for each run: so the same weights come out on any machine.
     use_cpus(1)
     place = Path(folder)
-    interrupted = _result(run, state="interrupted")
     try:
         place.mkdir(parents=True, exist_ok=True)
         import_packages(run.gym_packages, "gym_packages:")
         trained = _train(run, place)
         if trained.exit_code != 0:
-            return interrupted
+            return _result(run, state="interrupted")
         stages = [*trained.stages.values()]
         agent = Path(stages[-1].agent)
-        flights = _fly(agent, trained.job, suite, evaluation)
+        return _result(
+            run,
+            state="finished",
+            agent=agent.relative_to(place).as_posix(),
+            weights=digest(agent),
+            timesteps=sum(stage.timesteps for stage in stages),
+            seconds=round(sum(stage.seconds for stage in stages), 1),
+            flights=_fly(agent, trained.job, suite, evaluation),
+        )
     except KeyboardInterrupt:
-        return interrupted
+        return _result(run, state="interrupted")
     # Also the errors of a user's callback or environment: the other runs continue.
     except (Exception, SystemExit) as error:
         kind = "" if isinstance(error, SB3QuadError) else f"{type(error).__name__}: "
         return _result(run, state="failed", message=kind + one_line(error))
-    return _result(
-        run,
-        state="finished",
-        agent=agent.relative_to(place).as_posix(),
-        weights=digest(agent),
-        timesteps=sum(stage.timesteps for stage in stages),
-        seconds=round(sum(stage.seconds for stage in stages), 1),
-        flights=flights,
-    )
 
 
 def _result(run: Run, **fields: Any) -> RunResult:

@@ -3,7 +3,6 @@
 import copy
 import itertools
 import json
-import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
-from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
+from sb3_quad.sweep.spec import Configuration, SweepSpec
 from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.training.pipeline import (
     Pipeline,
@@ -49,7 +48,7 @@ def make_runs(spec: SweepSpec) -> list[Run]:
     """Return the runs of a sweep, the seeds of a configuration one after another.
 
     :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
-        two configurations of one name, too many runs.
+        two configurations of one name.
     """
     # Every configuration is checked before the first run starts.
     runs: list[Run] = []
@@ -99,9 +98,6 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[StrDict, StrDict]]:
             raise ConfigError(f"grid: {key}: must be a list of at least one value, not {values!r}")
     # Without a list there is one configuration, that of the shared keys.
     listed = spec.configurations or ({},)
-    count = len(listed) * len(spec.seed) * math.prod(map(len, spec.grid.values()))
-    if count > MAX_RUNS:
-        raise ConfigError(f"the sweep has {count:,} runs, at most {MAX_RUNS:,} are allowed")
     for own in listed:
         for values in itertools.product(*spec.grid.values()):
             cell = dict(zip(spec.grid, values, strict=True))
@@ -124,8 +120,8 @@ def _folder_name(configuration: Configuration, label: str) -> str:
     """Return the name of a configuration, or else one made of its settings."""
     name = configuration.name or label
     if not name:
-        named_by = configuration.model_dump(include={"algo", "conf_file"}, exclude_none=True)
-        name = _name(named_by).replace(",", "-")
+        words = (configuration.algo, Path(configuration.conf_file or "").stem)
+        name = "-".join(filter(None, words))
     return re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", name).strip("-.,")[:LONGEST] or "run"
 
 

@@ -23,7 +23,6 @@ from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.vehicles.vehicle import NAME
 
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
-MAX_RUNS = 10_000
 
 
 class Configuration(SettingsOptions, RunOptions):

@@ -30,15 +30,12 @@ def write_results(search: Search) -> None:
     if best is None:
         return
     # The best settings say where they come from, in comments that train skips.
-    comments = [
-        f"Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, "
-        f"study {search.name}.",
-        f"{in_words(search, best)} over {search.job.eval_episodes} episodes, "
-        f"by which it was chosen; seed {search.job.seed}.",
-        train_command(search),
-    ]
     settings = yaml.safe_dump({search.job.config.env_id: settings_of(best)}, sort_keys=False)
-    write_text(folder / BEST, "".join(f"# {line}\n" for line in comments) + settings)
+    origin = (
+        f"# Found by sb3-quad tune: trial {best.number} of study {search.name}, "
+        f"{in_words(search, best)}.\n# {train_command(search)}\n"
+    )
+    write_text(folder / BEST, origin + settings)
 
 
 def _row(search: Search, trial: FrozenTrial) -> StrDict:
