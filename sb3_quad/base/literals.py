@@ -92,19 +92,18 @@ def put_key(data: StrDict, key: str, value: Any, where: str) -> None:
     """
     *path, last = key.split(".")
     place: Any = data
-    for part in path:
-        if isinstance(place, list) and part.isdigit() and int(part) < len(place):
-            place = place[int(part)]
-        elif isinstance(place, dict):
-            # A key without a value in a file is None.
-            if place.get(part) is None:
-                place[part] = {}
-            place = place[part]
-        else:
-            place = None
-    if not isinstance(place, dict):
-        raise ConfigError(f"{where}: {'.'.join(path)} holds no keys here")
-    place[last] = value
+    try:
+        for part in path:
+            if isinstance(place, list):
+                place = place[int(part)]
+            else:
+                # A key without a value in a file is None.
+                if place.get(part) is None:
+                    place[part] = {}
+                place = place[part]
+        place[last] = value
+    except (AttributeError, IndexError, TypeError, ValueError):
+        raise ConfigError(f"{where}: {'.'.join(path)} holds no keys here") from None
 
 
 def _resolve(value: Any, key: str) -> Any:

@@ -70,12 +70,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     lines: dict[str, str] = {}
     for item in error.errors():
         inner, key, meaning = _locate(model, item["loc"])
+        text = _message(item) + meaning
         if item["type"] == "extra_forbidden":
             text = unknown("key", item["loc"][-1], inner.model_fields)
-        elif meaning:
-            text = f"{_message(item)} ({meaning})"
-        else:
-            text = _message(item)
         if not text.startswith(key):
             text = f"{key}: {text}"
         # Each alternative of a union has errors of its own. Only those of the first one are shown.
@@ -95,7 +92,9 @@ def _message(item: StrMapping) -> str:
 def _locate(
     model: type[BaseModel], location: tuple[int | str, ...]
 ) -> tuple[type[BaseModel], str, str]:
-    """Return the innermost model at a location, the dotted key, and the meaning of its field."""
+    """Return the innermost model at a location, the dotted key, and the meaning of its field in
+    brackets.
+    """
     names: list[str] = []
     meaning = ""
     for part in location:
@@ -104,7 +103,7 @@ def _locate(
             names.append(str(part))
         elif field is not None:
             names.append(part)
-            meaning = field.description or ""
+            meaning = f" ({field.description})" if field.description else ""
             model = _model_in(field.annotation) or model
         # Anything else is the name of a union's alternative, which the user does not know.
     return model, ".".join(names), meaning

@@ -1,6 +1,5 @@
 """YAML files, by the name of one that comes with the package, or by path."""
 
-from collections import Counter
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -21,10 +20,10 @@ class Loader(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
-        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        repeated = [key for key, times in keys.items() if times > 1]
-        if repeated:
-            raise yaml.YAMLError(f"{', '.join(repeated)}: given twice{node.start_mark}")
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.YAMLError(f"{key}: given twice{node.start_mark}")
         return node
 
     def construct_python(self, tag: str, node: Any) -> Any:

@@ -186,11 +186,8 @@ class Search:
         # A training ends with a whole rollout.
         rollout = config.rollout_steps * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout
-        changes = {
-            "config": config,
-            "eval_freq": math.ceil(total / self.n_evaluations),
-            "snapshot_every": 0,
-        }
+        eval_freq = math.ceil(total / self.n_evaluations)
+        changes = {"config": config, "eval_freq": eval_freq, "snapshot_every": 0}
         values: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
