@@ -65,7 +65,9 @@ def did_you_mean(name: object, valid: Iterable[str]) -> str:
     "did you mean 'far_tracking' or 'target_tracking'? "
     """
     guesses = " or ".join(map(repr, _guesses(str(name).lower(), sorted(valid))))
-    return f"did you mean {guesses}? " if guesses else ""
+    if not guesses:
+        return ""
+    return f"did you mean {guesses}? "
 
 
 def _guesses(text: str, names: list[str]) -> list[str]:

@@ -112,7 +112,9 @@ def _resolve(value: Any, key: str) -> Any:
         return {name: _resolve(entry, f"{key}.{name}") for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
         return type(value)(_resolve(entry, key) for entry in value)
-    match = _CLASS_NAME.fullmatch(value) if isinstance(value, str) else None
+    if not isinstance(value, str):
+        return value
+    match = _CLASS_NAME.fullmatch(value)
     if match is None:
         return parse_number(value)
     if match[1] not in CLASSES:

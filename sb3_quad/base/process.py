@@ -43,12 +43,16 @@ class StopSignals:
         """The exit code that a shell expects after a signal, such as 130 after SIGINT. 0 if none
         came.
         """
-        return 128 + self.received if self.received else 0
+        if self.received is None:
+            return 0
+        return 128 + self.received
 
     @property
     def name(self) -> str:
         """The signal's name, empty if none came."""
-        return signal.Signals(self.received).name if self.received else ""
+        if self.received is None:
+            return ""
+        return signal.Signals(self.received).name
 
     def __enter__(self) -> "StopSignals":
         if threading.current_thread() is threading.main_thread():

@@ -134,6 +134,6 @@ class YamlFolder:
         for folder in ("", *self.folders):
             for file in package.joinpath(folder).iterdir():
                 if file.name.endswith(self.suffix):
-                    name = f"{folder}/{file.name}" if folder else file.name
+                    name = f"{folder}/{file.name}".removeprefix("/")
                     files[name if self.folders else name.removesuffix(self.suffix)] = file
         return files

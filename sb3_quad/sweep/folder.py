@@ -10,7 +10,6 @@ A sweep's folder holds
   measured.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -92,16 +91,13 @@ class SweepFolder:
 
     def add(self, result: RunResult) -> None:
         """Write the result of a run that ended."""
-        write_text(self._result(result.name), result.model_dump_json() + "\n")
+        path = self.path / "records" / f"{result.name}.json"
+        write_text(path, result.model_dump_json() + "\n")
 
-    def results(self, runs: Sequence[Run]) -> dict[str, RunResult]:
-        """Read the results of those runs that ended, by name."""
+    def results(self) -> dict[str, RunResult]:
+        """Read the results of all runs that ended, by name."""
         results = {}
-        for run in runs:
-            path = self._result(run.name)
-            if path.is_file():
-                results[run.name] = read_record(path, RunResult)
+        for path in (self.path / "records").rglob("*.json"):
+            result = read_record(path, RunResult)
+            results[result.name] = result
         return results
-
-    def _result(self, name: str) -> Path:
-        return self.path / "records" / f"{name}.json"

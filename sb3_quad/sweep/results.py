@@ -98,13 +98,14 @@ def write_results(
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     lines: list[StrDict] = []
-    parts = {("", 0, ""): _episodes({})}
+    parts = {}
     # In the order of the plan, not in that in which runs ended.
     ended = [results[run.name] for run in sweep.runs if run.name in results]
     for result in ended:
         line = {"run": result.name, **result.model_dump(exclude={"flights"})}
         for scenario, measures in result.flights.items():
-            part = _episodes(measures)
+            # A row for each episode, NaN where there is no number.
+            part = pd.DataFrame(measures, columns=MEASURES, dtype=np.float64)
             parts[result.configuration, result.seed, scenario] = part
             # All are means but for the final error, which is a median.
             statistics = {**part.mean(), "final_error": part["final_error"].quantile()}
@@ -128,16 +129,10 @@ def write_results(
         failed=failed,
         configurations=seeds,
     )
-    _estimate(summary, pd.concat(parts, names=LEVELS))
+    if parts:
+        _estimate(summary, pd.concat(parts, names=LEVELS))
     write_text(place.path / "results.json", summary.model_dump_json(indent=1) + "\n")
     return summary
-
-
-def _episodes(measures: Mapping[str, Sequence[float | None]]) -> Any:
-    """Return a table with a row for each episode and a column for each measure, NaN where there is
-    no number.
-    """
-    return pd.DataFrame(measures, columns=MEASURES, dtype=np.float64)
 
 
 def _estimate(summary: SweepResults, flights: Any) -> None:
@@ -202,7 +197,9 @@ def verdict(difference: Estimate) -> str:
     """
     if difference.low > 0:
         return "better"
-    return "worse" if difference.high < 0 else "cannot tell"
+    if difference.high < 0:
+        return "worse"
+    return "cannot tell"
 
 
 def tables(summary: SweepResults) -> list[Table]:
@@ -246,7 +243,7 @@ def write_report(place: SweepFolder, summary: SweepResults, shown: Sequence[Tabl
     :return: the page.
     :raises ConfigError: a folder that cannot be written.
     """
-    parts = []
+    parts: list[Section] = []
     for table in shown:
         anchor = f"table-{len(parts)}"
         parts.append(Section(anchor, table.title, tables=[table], facts=table.caption))
@@ -271,7 +268,7 @@ def _curves(place: SweepFolder, summary: SweepResults) -> list[Plot]:
                 *_, algo, run, _ = path.parts
                 kind = f"{algo} {run.rpartition('_')[0]}"
                 curves[kind][name].append(read_curve(path.parent))
-    plots = []
+    plots: list[Plot] = []
     for kind, groups in curves.items():
         # An environment of others may report neither success nor reward.
         with suppress(ConfigError):

@@ -19,7 +19,7 @@ from sb3_quad.base.files import one_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.base.types import Report
+from sb3_quad.base.types import Report, StrDict
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import fly_scenario
@@ -65,7 +65,7 @@ def execute(
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     # Finished runs stay as they are; failed ones are tried again.
-    results = place.results(sweep.runs)
+    results = place.results()
     calls: dict[Future[RunResult], Run] = {}
 
     def submit(run: Run, reason: str) -> None:
@@ -139,8 +139,10 @@ def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> 
         return _result(run, state="interrupted")
     # Also the errors of a user's callback or environment: the other runs continue.
     except (Exception, SystemExit) as error:
-        kind = "" if isinstance(error, SB3QuadError) else f"{type(error).__name__}: "
-        return _result(run, state="failed", message=kind + one_line(error))
+        message = one_line(error)
+        if not isinstance(error, SB3QuadError):
+            message = f"{type(error).__name__}: {message}"
+        return _result(run, state="failed", message=message)
 
 
 def _result(run: Run, **fields: Any) -> RunResult:
@@ -150,13 +152,15 @@ def _result(run: Run, **fields: Any) -> RunResult:
 def digest(agent: Path) -> str:
     """The SHA-256 of the parameters in an agent's zip."""
     parameters = parameters_to_vector(load_model(agent).policy.parameters())
-    return hashlib.sha256(parameters.detach().numpy()).hexdigest()
+    return hashlib.sha256(parameters.detach().numpy().tobytes()).hexdigest()
 
 
 def pipeline_folder(place: Path) -> Path | None:
     """The folder of a run's training, if it has begun."""
     begun = sorted(place.glob(f"*/*/{STATUS_FILE}"))
-    return begun[0].parent if begun else None
+    if begun:
+        return begun[0].parent
+    return None
 
 
 def _train(run: Run, place: Path) -> PipelineResult:
@@ -217,7 +221,7 @@ def _numbers(flights: Flights) -> dict[str, Numbers]:
         arrival = flights.time_to[min(flights.time_to)]
     # An episode that starts at its target has no way to it, and so no cross-track error.
     has_way = np.isfinite(flights.cross_track_error)
-    measures = {
+    measures: StrDict = {
         "success": flights.success,
         "survival": flights.survival,
         "reward": flights.reward,

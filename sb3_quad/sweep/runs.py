@@ -2,7 +2,6 @@
 
 import copy
 import itertools
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -185,7 +184,7 @@ def _name(varied: StrMapping) -> str:
     # Some values say enough without their key.
     words = []
     for key, value in varied.items():
-        word = value if isinstance(value, str) else json.dumps(value, default=str)
+        word = str(value)
         if key == "conf_file":
             word = Path(word).with_suffix("").as_posix()
         if key not in NAMED_ALONE:

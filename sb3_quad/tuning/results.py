@@ -93,8 +93,12 @@ def trial_line(search: Search, trial: FrozenTrial) -> str:
 
 def count_trials(search: Search) -> str:
     """The numbers of trials of the study that finished, were pruned and failed."""
-    counts = {word: len(search.trials(state)) for state, word in STATES.items()}
-    return ", ".join(f"{count} {word}" for word, count in counts.items() if count) or "no trial yet"
+    words = []
+    for state, word in STATES.items():
+        count = len(search.trials(state))
+        if count:
+            words.append(f"{count} {word}")
+    return ", ".join(words) or "no trial yet"
 
 
 def train_command(search: Search) -> str:

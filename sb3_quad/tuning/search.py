@@ -11,12 +11,12 @@ import json
 import math
 import os
 import platform
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
-from optuna.distributions import distribution_to_json
 from optuna.pruners import MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
 from optuna.storages import JournalStorage
@@ -32,8 +32,9 @@ from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 
+Factories = dict[str, Callable[..., Any]]
 # From a seed and n_startup_trials.
-SAMPLERS = {
+SAMPLERS: Factories = {
     "tpe": lambda seed, n: TPESampler(
         seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True
     ),
@@ -43,7 +44,7 @@ SAMPLERS = {
     ),
 }
 # From n_startup_trials and n_evaluations.
-PRUNERS = {
+PRUNERS: Factories = {
     "median": lambda n, evaluations: MedianPruner(
         n_startup_trials=n, n_warmup_steps=evaluations // 3
     ),
@@ -225,12 +226,11 @@ class Search:
                 agent = hashlib.sha256(Path(job.trained_agent).read_bytes()).hexdigest()
             except OSError as error:
                 raise ConfigError(f"{job.trained_agent}: cannot be read ({error})") from None
-        dimensions = self.space.dimensions.items()
         return {
             "algo": job.config.algo,
             "env": job.config.env_id,
             **job.config.settings,
-            "search_space": {name: distribution_to_json(values) for name, values in dimensions},
+            "search_space": str(self.space.dimensions),
             "seed": job.seed,
             "trained_agent": agent,
             "n_evaluations": self.n_evaluations,
@@ -251,7 +251,7 @@ class NumberedSampler(BaseSampler):
         self._seed = seed
         self._startup = n_startup_trials
 
-    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> StrDict:
+    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> Any:
         # A retry has the parameters of an earlier trial, and no number of its own.
         before = study.get_trials(deepcopy=False)[: trial.number]
         number = sum("again" not in earlier.user_attrs for earlier in before)
@@ -259,7 +259,7 @@ class NumberedSampler(BaseSampler):
         self._sampler = SAMPLERS[self._kind](seed, self._startup)
         return self._sampler.infer_relative_search_space(study, trial)
 
-    def sample_relative(self, *arguments: Any) -> StrDict:
+    def sample_relative(self, *arguments: Any) -> Any:
         return self._sampler.sample_relative(*arguments)
 
     def sample_independent(self, *arguments: Any) -> Any:
@@ -273,13 +273,12 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
         a journal.
     """
     require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
-    is_url = "://" in str(storage)
+    backend: Any = str(storage)
     try:
+        if "://" not in backend:
+            backend = _open_journal(Path(storage))
         return optuna.create_study(
-            study_name=name,
-            storage=str(storage) if is_url else _open_journal(Path(storage)),
-            direction="maximize",
-            load_if_exists=True,
+            study_name=name, storage=backend, direction="maximize", load_if_exists=True
         )
     except Exception as error:  # databases and damaged journals raise anything
         reason = f"{type(error).__name__}: {one_line(error)}"

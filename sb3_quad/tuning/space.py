@@ -163,6 +163,7 @@ def current(algo: str, settings: StrMapping, name: str) -> Any:
         return round(_rollout(algo, settings) / batch_size)
     if name in settings:
         return settings[name]
+    # A setting of the training is no parameter: there is one environment by default.
     parameter = constructor_parameters(get_algorithm(algo)).get(name)
     if parameter is None:
         return 1 if name == "n_envs" else None
@@ -183,12 +184,9 @@ def _dimension(
     if "around" in values:
         values = _around(current(algo, settings, name), values, whole, where)
     # The fields of an interval are the arguments of Optuna's distributions.
+    interval = validate(WholeInterval if whole else Interval, values, where)
     try:
-        if whole:
-            return IntDistribution(**validate(WholeInterval, values, where).model_dump())
-        return FloatDistribution(**validate(Interval, values, where).model_dump())
-    except ConfigError:
-        raise
+        return (IntDistribution if whole else FloatDistribution)(**dict(interval))
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
 
@@ -225,9 +223,9 @@ def _plain(value: Any) -> StrDict:
 
 def _label(value: Any) -> Any:
     """Return a value of a list as Optuna holds it: a plain one as it is, others as JSON."""
-    if isinstance(value, (bool, int, float, str, type(None))):
-        return value
-    return json.dumps(value)
+    if isinstance(value, (list, dict)):
+        return json.dumps(value)
+    return value
 
 
 def _number_of(value: Any) -> float | None:
