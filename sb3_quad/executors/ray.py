@@ -34,9 +34,7 @@ class RayExecutor:
     :raises ConfigError: No cluster answers at the address.
     """
 
-    def __init__(
-        self, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
-    ) -> None:
+    def __init__(self, workers: int, address: str | None, num_cpus: float, num_gpus: float) -> None:
         self._ray = require("ray", "ray", "--executor ray")
         self._options = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
         self._references = list[Any]()

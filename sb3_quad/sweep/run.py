@@ -102,8 +102,8 @@ def execute(
             continue
         place.add(result)
         results[run.name] = result
-        end = result.message or f"in {result.seconds:.1f} s"
-        report(f"{run.name}: {result.state}: {end} ({len(results)} of {len(sweep.runs)})")
+        end = result.message or f"{result.seconds:.1f} s"
+        report(f"{run.name}: {result.state}, {end} ({len(results)} of {len(sweep.runs)})")
         show(len(results), len(sweep.runs), "runs")
     return results
 

@@ -91,10 +91,10 @@ class Search:
         space: SearchSpace,
         name: str,
         storage: StrPath,
-        sampler: str = "tpe",
-        pruner: str = "median",
-        n_startup_trials: int = 10,
-        n_evaluations: int = 10,
+        sampler: str,
+        pruner: str,
+        n_startup_trials: int,
+        n_evaluations: int,
     ) -> None:
         if sampler not in SAMPLERS:
             raise ConfigError(unknown("sampler", sampler, SAMPLERS))
