@@ -62,7 +62,7 @@ def cluster(monkeypatch):
 
 def weights(folder):
     place = SweepFolder(folder)
-    return {name: record.weights for name, record in place.results(place.read().runs).items()}
+    return {name: record.weights for name, record in place.results().items()}
 
 
 def test_an_address_that_nobody_answers_is_refused_in_one_line():

@@ -275,7 +275,7 @@ def test_resuming_rereads_no_settings_file(tmp_path, monkeypatch):
     place.write(sweep)
     (tmp_path / "two.yml").unlink()
     assert main(["sweep", "--resume", "logs/s_1", "--no-progress"]) == 0
-    (record,) = place.results(sweep.runs).values()
+    (record,) = place.results().values()
     assert record.state == "finished" and record.timesteps == 320
 
 
@@ -312,7 +312,7 @@ def test_a_sweep_gives_what_train_gives(tmp_path, monkeypatch):
         main(["sweep", write(tmp_path / "s.yaml", **keys), "--workers", "2", "--no-progress"]) == 0
     )
     place = SweepFolder("logs/sweep/s_1")
-    records = place.results(place.read().runs)
+    records = place.results()
     hyperparams = [
         "n_steps:20",
         "batch_size:80",

@@ -339,7 +339,7 @@ def test_bad_input_is_one_line(command, arguments, message, capsys):
         ({"beta": {"low": 0, "high": 1, "log": True}}, "low"),
         ({"beta": {"low": 0}}, "high"),
         ({"beta": {"low": 0, "high": 1, "step": 2}}, "step"),
-        ({"n_steps": {"low": 1.5, "high": 20}}, "whole"),
+        ({"n_steps": {"low": 1.5, "high": 20}}, "low: Input should be a valid integer"),
         ({"bc_loss": []}, "list of values"),
         ({"bc_loss": "mse"}, "list"),
         ({"n_minibatches": [2], "batch_size": [2]}, "remove one"),

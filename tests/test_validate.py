@@ -21,7 +21,7 @@ class Craft(Frozen):
     length: float | Rotor | None = None
     rotors: tuple[Rotor, ...] = ()
     by_name: dict[str, Rotor] = Field(default_factory=dict)
-    kept: Rotor | None = Field(default=None, validation_alias="saved")
+    saved: Rotor | None = None
     fault: Literal["none", "hover", "expert"] = "none"
     second: Literal["none", "hover", "other"] = "none"
 

@@ -64,18 +64,17 @@ def did_you_mean(name: object, valid: Iterable[str]) -> str:
     >>> did_you_mean("tracking", ["far_tracking", "state_recovery", "target_tracking"])
     "did you mean 'far_tracking' or 'target_tracking'? "
     """
-    guesses = _guesses(str(name).lower(), sorted(valid))
+    guesses = " or ".join(map(repr, _guesses(str(name).lower(), sorted(valid))))
     if not guesses:
         return ""
-    return f"did you mean {' or '.join(map(repr, guesses))}? "
+    return f"did you mean {guesses}? "
 
 
 def _guesses(text: str, names: list[str]) -> list[str]:
     words = _words(text)
-    if words:
-        longer = [name for name in names if words <= _words(name.lower())]
-        if 1 <= len(longer) <= 3:
-            return longer
+    longer = [name for name in names if words <= _words(name.lower())]
+    if words and 1 <= len(longer) <= 3:
+        return longer
     by_lower_case = {name.lower(): name for name in names}
     # Few slips change the first letter. Among all names, those of three letters and any two loss
     # weights such as bc_coef and vf_coef are alike to difflib, so that they ask for more.

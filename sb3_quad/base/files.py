@@ -1,9 +1,8 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
-import csv
 import io
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -12,12 +11,13 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 
 LOCK = ".lock"
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[BinaryIO]:
+def replacing(path: StrPath) -> Iterator[BinaryIO]:
     """A stream to a temporary file that replaces ``path`` once it is finished.
 
     A reader never meets half a file. If anything fails, ``path`` keeps what it held.
@@ -43,7 +43,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-def write_bytes(path: str | Path, content: bytes) -> None:
+def write_bytes(path: StrPath, content: bytes) -> None:
     """Write a file by :func:`replacing`."""
     with replacing(path) as stream:
         stream.write(content)
@@ -84,31 +84,31 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         lock.release()
 
 
-def write_text(path: str | Path, text: str) -> None:
+def write_text(path: StrPath, text: str) -> None:
     """Write text in UTF-8 by :func:`replacing`."""
     write_bytes(path, text.encode("utf-8"))
 
 
-def write_csv(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
+def write_csv(path: StrPath, columns: Iterable[str], rows: Iterable[StrMapping]) -> None:
     """Write a table by :func:`replacing`.
 
     A cell is empty where its row lacks the key. Keys without a column are ignored.
     """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
+    # Imported here because --help needs no tables.
+    import pandas as pd
+
+    table = pd.DataFrame(list(rows), columns=list(columns), dtype=object)
+    write_text(path, table.to_csv(index=False))
 
 
-def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> None:
+def write_arrays(path: StrPath, compressed: bool = False, **arrays: Any) -> None:
     """Write NumPy arrays as ``.npz`` by :func:`replacing`."""
     save = np.savez_compressed if compressed else np.savez
     with replacing(path) as stream:
         save(stream, **arrays)
 
 
-def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
+def read_arrays(path: StrPath, prefix: str = "") -> StrDict:
     """Return the arrays of an ``.npz`` file whose names begin with ``prefix``.
 
     Arrays with other names are not even read.
@@ -123,7 +123,7 @@ def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
 
 
-def read_text(path: str | Path) -> str:
+def read_text(path: StrPath) -> str:
     """Return the text of a file.
 
     :raises ConfigError: It is missing or cannot be read.
@@ -137,7 +137,7 @@ def read_text(path: str | Path) -> str:
         raise ConfigError(f"{path}: cannot be read ({error})") from None
 
 
-def refuse_existing(path: str | Path, overwrite: bool) -> None:
+def refuse_existing(path: StrPath, overwrite: bool) -> None:
     """Check that writing a file replaces none, unless ``overwrite``.
 
     :raises ConfigError: The file exists, or it is a folder.
@@ -148,7 +148,7 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
         raise ConfigError(f"{path}: exists already; name another file, or add --overwrite")
 
 
-def make_folder(path: str | Path, what: str, flag: str) -> None:
+def make_folder(path: StrPath, what: str, flag: str) -> None:
     """Make a folder for files to come, if it does not exist, and check that it can be written.
 
     :param what: Name of the folder in the error message.
@@ -173,7 +173,7 @@ def model_bytes(model: Any) -> bytes:
     return buffer.getvalue()
 
 
-def save_model(model: Any, path: str | Path) -> None:
+def save_model(model: Any, path: StrPath) -> None:
     """Save a model by :func:`replacing`.
 
     :raises ConfigError: A folder that cannot be written, or a full disk.

@@ -8,6 +8,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
+from sb3_quad.base.types import StrDict
 
 CLASSES = (
     "nn.ELU",
@@ -66,7 +67,7 @@ def parse_value(text: str, key: str = "") -> Any:
         return parse_number(text)
 
 
-def parse_mapping(value: Any, key: str) -> dict[str, Any]:
+def parse_mapping(value: Any, key: str) -> StrDict:
     """Return a mapping, given as one, as None, or as rl_zoo3's ``"dict(net_arch=[64, 64])"``.
 
     Names such as ``nn.Tanh`` become classes.
@@ -80,27 +81,29 @@ def parse_mapping(value: Any, key: str) -> dict[str, Any]:
         value = {}
     if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
         raise ConfigError(f"{key}: must be a mapping of names to values, not {value!r}")
-    mapping: dict[str, Any] = _resolve(value, key)
+    mapping: StrDict = _resolve(value, key)
     return mapping
 
 
-def put_key(data: dict[str, Any], key: str, value: Any, where: str) -> None:
+def put_key(data: StrDict, key: str, value: Any, where: str) -> None:
     """Set a value at a dotted key, in place. Numbers are positions in a list.
 
     :raises ConfigError: Something on the way holds no keys.
     """
     *path, last = key.split(".")
     place: Any = data
-    for part in path:
-        if isinstance(place, list) and part.isdigit() and int(part) < len(place):
-            place = place[int(part)]
-        elif isinstance(place, dict):
-            place = place.setdefault(part, {})
-        else:
-            place = None
-    if not isinstance(place, dict):
-        raise ConfigError(f"{where}: {'.'.join(path)} holds no keys here")
-    place[last] = value
+    try:
+        for part in path:
+            if isinstance(place, list):
+                place = place[int(part)]
+            else:
+                # A key without a value in a file is None.
+                if place.get(part) is None:
+                    place[part] = {}
+                place = place[part]
+        place[last] = value
+    except (AttributeError, IndexError, TypeError, ValueError):
+        raise ConfigError(f"{where}: {'.'.join(path)} holds no keys here") from None
 
 
 def _resolve(value: Any, key: str) -> Any:
@@ -124,11 +127,11 @@ class _AsLiterals(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
-        names = [keyword.arg for keyword in node.keywords]
-        if ast.unparse(node.func) != "dict" or node.args or None in names:
+        if ast.unparse(node.func) != "dict" or node.args:
             return node
-        values = [keyword.value for keyword in node.keywords]
-        return ast.Dict([ast.Constant(name) for name in names], values)
+        # The name of **mapping is None, which parse_mapping refuses.
+        names: list[ast.expr | None] = [ast.Constant(keyword.arg) for keyword in node.keywords]
+        return ast.Dict(names, [keyword.value for keyword in node.keywords])
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         text = ast.unparse(node)

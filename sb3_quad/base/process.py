@@ -18,7 +18,7 @@ _FROM_THE_TERMINAL = [number for number in (signal.SIGINT, _SIGHUP) if number is
 SIGNALS = (*_FROM_THE_TERMINAL, signal.SIGTERM)
 TRUST_VARIABLE = "SB3_QUAD_TRUST"
 
-_most_cpus: int | None = None
+_most_cpus = sys.maxsize
 
 
 class StopSignals:
@@ -115,12 +115,8 @@ def available_cpus() -> int:
     """The number of CPUs that this process may use."""
     # Only Linux knows the CPUs that a process is restricted to.
     if hasattr(os, "sched_getaffinity"):
-        count = len(os.sched_getaffinity(0))
-    else:
-        count = os.cpu_count() or 1
-    if _most_cpus is None:
-        return count
-    return min(count, _most_cpus)
+        return min(len(os.sched_getaffinity(0)), _most_cpus)
+    return min(os.cpu_count() or 1, _most_cpus)
 
 
 def has_ended(process: int) -> bool:

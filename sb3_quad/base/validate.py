@@ -2,15 +2,15 @@
 
 import json
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic.fields import FieldInfo
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import read_text
+from sb3_quad.base.types import StrMapping
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -18,7 +18,9 @@ Model = TypeVar("Model", bound=BaseModel)
 class Frozen(BaseModel):
     """A record: frozen, with finite numbers and no unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
@@ -68,12 +70,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     lines: dict[str, str] = {}
     for item in error.errors():
         inner, key, meaning = _locate(model, item["loc"])
+        text = _message(item) + meaning
         if item["type"] == "extra_forbidden":
-            text = unknown("key", item["loc"][-1], _fields(inner))
-        elif meaning:
-            text = f"{_message(item)} ({meaning})"
-        else:
-            text = _message(item)
+            text = unknown("key", item["loc"][-1], inner.model_fields)
         if not text.startswith(key):
             text = f"{key}: {text}"
         # Each alternative of a union has errors of its own. Only those of the first one are shown.
@@ -81,7 +80,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     return "; ".join(lines.values())
 
 
-def _message(item: Mapping[str, Any]) -> str:
+def _message(item: StrMapping) -> str:
     value = item["input"]
     if str(item["type"]).startswith(("float_", "int_")) and isinstance(value, str):
         return f"{value!r} must be a plain number, without a unit"
@@ -93,27 +92,21 @@ def _message(item: Mapping[str, Any]) -> str:
 def _locate(
     model: type[BaseModel], location: tuple[int | str, ...]
 ) -> tuple[type[BaseModel], str, str]:
-    """Return the innermost model at a location, the dotted key, and the meaning of its field."""
+    """Return the innermost model at a location, the dotted key, and the meaning of its field in
+    brackets.
+    """
     names: list[str] = []
     meaning = ""
     for part in location:
-        field = _fields(model).get(str(part))
+        field = model.model_fields.get(str(part))
         if isinstance(part, int):
             names.append(str(part))
         elif field is not None:
             names.append(part)
-            meaning = field.description or ""
+            meaning = f" ({field.description})" if field.description else ""
             model = _model_in(field.annotation) or model
         # Anything else is the name of a union's alternative, which the user does not know.
     return model, ".".join(names), meaning
-
-
-def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a model by the keys that its data have."""
-    fields = {}
-    for name, field in model.model_fields.items():
-        fields[str(field.validation_alias or name)] = field
-    return fields
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

@@ -1,6 +1,5 @@
 """YAML files, by the name of one that comes with the package, or by path."""
 
-from collections import Counter
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -10,6 +9,7 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text
+from sb3_quad.base.types import StrDict, StrPath
 
 
 class Loader(yaml.SafeLoader):
@@ -20,10 +20,10 @@ class Loader(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
-        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        repeated = [key for key, times in keys.items() if times > 1]
-        if repeated:
-            raise yaml.YAMLError(f"{', '.join(repeated)}: given twice{node.start_mark}")
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.YAMLError(f"{key}: given twice{node.start_mark}")
         return node
 
     def construct_python(self, tag: str, node: Any) -> Any:
@@ -93,7 +93,7 @@ class YamlFolder:
         """Return the names of the files in the package."""
         return sorted(self._files())
 
-    def is_path(self, source: str | Path) -> bool:
+    def is_path(self, source: StrPath) -> bool:
         """Whether a source is the path of a file rather than a name.
 
         Where the suffix is part of the name, a source is a path if the user has such a file.
@@ -104,7 +104,7 @@ class YamlFolder:
             return Path(source).is_file()
         return bool(Path(source).suffix) or "/" in source
 
-    def text(self, source: str | Path) -> tuple[str, str]:
+    def text(self, source: StrPath) -> tuple[str, str]:
         """Return the text of a file by name or path, and the file's name for messages.
 
         :raises ConfigError: An unknown name, or a file that is missing or cannot be read.
@@ -120,7 +120,7 @@ class YamlFolder:
         text = files[name].read_text(encoding="utf-8")
         return text, name.removesuffix(self.suffix) + self.suffix
 
-    def read(self, source: str | Path) -> tuple[dict[Any, Any], str]:
+    def read(self, source: StrPath) -> tuple[dict[Any, Any], str]:
         """Return the keys and values of a file by name or path, and its name for messages.
 
         :raises ConfigError: See :meth:`text` and :func:`parse_keys`.
@@ -128,12 +128,12 @@ class YamlFolder:
         text, where = self.text(source)
         return parse_keys(text, where), where
 
-    def _files(self) -> dict[str, Any]:
+    def _files(self) -> StrDict:
         package = resources.files(self.package)
         files = {}
         for folder in ("", *self.folders):
             for file in package.joinpath(folder).iterdir():
                 if file.name.endswith(self.suffix):
-                    name = f"{folder}/{file.name}" if folder else file.name
+                    name = f"{folder}/{file.name}".removeprefix("/")
                     files[name if self.folders else name.removesuffix(self.suffix)] = file
         return files

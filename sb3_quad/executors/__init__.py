@@ -1,11 +1,12 @@
 """Executors, which call functions in other processes: workers on this machine, or a Ray cluster."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.process import StopSignals
+from sb3_quad.base.types import Report
 from sb3_quad.executors.local import LocalExecutor
 
 EXECUTORS = ("local", "ray")
@@ -42,8 +43,6 @@ def start_executor(
     """
     if kind not in EXECUTORS:
         raise ConfigError(unknown("executor", kind, EXECUTORS))
-    if workers < 1:
-        raise ConfigError(f"workers {workers}: must be at least 1")
     if kind == "local":
         if address is not None:
             raise ConfigError(f"address {address}: goes with --executor ray")
@@ -58,7 +57,7 @@ def as_they_end(
     executor: Executor,
     calls: "dict[Future[Any], Key]",
     signals: StopSignals,
-    report: Callable[[str], None],
+    report: Report,
 ) -> "Iterator[tuple[Key, Future[Any]]]":
     """Yield the key and the future of each call when it ends.
 

@@ -82,7 +82,7 @@ def _context() -> Any:
     """Return how workers start: on Linux forked from a server that has imported what takes seconds,
     elsewhere as new processes.
     """
-    if sys.platform != "linux" or not hasattr(os, "fork"):
+    if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torch", "stable_baselines3", "numba"])

@@ -16,7 +16,8 @@ import torch
 from sb3_quad.base.errors import ConfigError, WorkerDied
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
-from sb3_quad.base.process import TRUST_VARIABLE, trusted
+from sb3_quad.base.process import TRUST_VARIABLE
+from sb3_quad.base.types import StrDict
 
 # Times that Ray repeats a call whose node or worker process dies.
 RETRIES = 3
@@ -33,17 +34,34 @@ class RayExecutor:
     :raises ConfigError: No cluster answers at the address.
     """
 
-    def __init__(
-        self, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
-    ) -> None:
+    def __init__(self, workers: int, address: str | None, num_cpus: float, num_gpus: float) -> None:
         self._ray = require("ray", "ray", "--executor ray")
         self._options = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
         self._references = list[Any]()
+        variables = {
+            "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
+            TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0"),
+        }
+        environment: StrDict = {"env_vars": variables}
+        options: StrDict = {
+            "runtime_env": environment,
+            "log_to_driver": False,
+            "logging_level": "ERROR",
+        }
         try:
             if address is None:
-                self._start(workers * num_cpus)
+                # Ray warns about a variable that this package does not use.
+                os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+                # With Ray's niceness of 15, workers get no time next to other work.
+                os.environ.setdefault("RAY_worker_niceness", "0")
+                options |= {"num_cpus": workers * num_cpus, "include_dashboard": False}
+                self._ray.init(address="local", **options)
             else:
-                self._connect(address)
+                _check_address(address)
+                # Ray uploads the package during init.
+                with tempfile.TemporaryDirectory() as folder:
+                    environment["py_modules"] = [str(_copy_package(Path(folder)))]
+                    self._ray.init(address=address, **options)
             total = self._ray.cluster_resources()
         except ConfigError:
             raise
@@ -55,36 +73,6 @@ class RayExecutor:
         self.workers = workers
         if num_cpus:
             self.workers = max(1, int(total.get("CPU", 0) // num_cpus))
-
-    def _start(self, num_cpus: float) -> None:
-        """Start a cluster on this machine."""
-        # Ray warns about a variable that this package does not use.
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        # With Ray's niceness of 15, workers get no time next to other work.
-        os.environ.setdefault("RAY_worker_niceness", "0")
-        self._init("local", num_cpus=num_cpus, include_dashboard=False)
-
-    def _connect(self, address: str) -> None:
-        """Connect to a running cluster."""
-        _check_address(address)
-        # Ray uploads the package during init.
-        with tempfile.TemporaryDirectory() as folder:
-            self._init(address, py_modules=[str(_copy_package(Path(folder)))])
-
-    def _init(self, address: str, py_modules: list[str] | None = None, **options: Any) -> None:
-        variables = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
-        if trusted():
-            variables[TRUST_VARIABLE] = "1"
-        environment: dict[str, Any] = {"env_vars": variables}
-        if py_modules is not None:
-            environment["py_modules"] = py_modules
-        self._ray.init(
-            address=address,
-            log_to_driver=False,
-            logging_level="ERROR",
-            runtime_env=environment,
-            **options,
-        )
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
         name = getattr(function, "__name__", "call")

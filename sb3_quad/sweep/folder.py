@@ -10,7 +10,6 @@ A sweep's folder holds
   measured.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -19,6 +18,7 @@ from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
+from sb3_quad.base.types import StrPath
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.runs import Run
@@ -26,17 +26,12 @@ from sb3_quad.sweep.spec import SweepSpec
 
 PLAN = "plan.json"
 Numbers: TypeAlias = tuple[float | None, ...]
-SUCCESS = "success"
-SURVIVAL = "survival"
-REWARD = "reward"
-ERROR = "final_error"
-TIME = "time"
-MEASURES = (SUCCESS, SURVIVAL, REWARD, ERROR, TIME)
+MEASURES = ("success", "survival", "reward", "final_error", "time")
 """The numbers of an episode: 0 or 1, 0 or 1, sum, m (None: crashed or out of range), s to the
 tightest tolerance, or, where it starts at its target, until stable (None: never)."""
 
 
-class RunResult(Frozen, use_attribute_docstrings=True):
+class RunResult(Frozen):
     """The end of a run."""
 
     name: str
@@ -70,7 +65,7 @@ class SweepFolder:
     :param path: the folder.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: StrPath) -> None:
         self.path = Path(path)
 
     def write(self, sweep: Sweep) -> None:
@@ -84,8 +79,6 @@ class SweepFolder:
 
         :raises ConfigError: a folder that holds no sweep, or a damaged file.
         """
-        if not self.path.is_dir():
-            raise ConfigError(f"sweep folder {self.path}: no such folder")
         if not (self.path / PLAN).is_file():
             raise ConfigError(f"sweep folder {self.path}: holds no sweep ({PLAN} is missing)")
         return read_record(self.path / PLAN, Sweep)
@@ -98,14 +91,13 @@ class SweepFolder:
 
     def add(self, result: RunResult) -> None:
         """Write the result of a run that ended."""
-        write_text(self._result(result.name), result.model_dump_json() + "\n")
+        path = self.path / "records" / f"{result.name}.json"
+        write_text(path, result.model_dump_json() + "\n")
 
-    def results(self, runs: Sequence[Run]) -> dict[str, RunResult]:
-        """Read the results of those runs that ended, by name."""
-        paths = {run.name: self._result(run.name) for run in runs}
-        return {
-            name: read_record(path, RunResult) for name, path in paths.items() if path.is_file()
-        }
-
-    def _result(self, name: str) -> Path:
-        return self.path / "records" / f"{name}.json"
+    def results(self) -> dict[str, RunResult]:
+        """Read the results of all runs that ended, by name."""
+        results = {}
+        for path in (self.path / "records").rglob("*.json"):
+            result = read_record(path, RunResult)
+            results[result.name] = result
+        return results

@@ -3,7 +3,6 @@ agent.
 """
 
 import hashlib
-from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import closing
@@ -13,12 +12,14 @@ from typing import Any
 import numpy as np
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
+from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
 from sb3_quad.base.files import one_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.types import Report, StrDict
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import fly_scenario
@@ -26,7 +27,7 @@ from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, RunResult, Sweep, SweepFolder
+from sb3_quad.sweep.folder import Numbers, RunResult, Sweep, SweepFolder
 from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import Evaluation
 from sb3_quad.training.config import TrainingJob
@@ -41,8 +42,8 @@ from sb3_quad.training.pipeline import (
 
 EPISODES = 240  # of each task, where no suite is named
 TASKS = ("state_recovery", "target_tracking")
-TRIES = 2  # of a run whose worker process dies
-Show = Callable[[int, int, str], None]  # runs that ended, all runs, and their name
+# Receives the number of runs that ended, that of all runs, and their name.
+Show = Callable[[int, int, str], None]
 LOG = "log.txt"  # the reports of the training, in the run's folder
 
 
@@ -52,7 +53,7 @@ def execute(
     executor: Executor,
     signals: StopSignals,
     show: Show,
-    report: Callable[[str], None],
+    report: Report,
 ) -> dict[str, RunResult]:
     """Execute all runs that are not finished.
 
@@ -64,29 +65,25 @@ def execute(
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     # Finished runs stay as they are; failed ones are tried again.
-    known = place.results(sweep.runs)
-    results = {name: result for name, result in known.items() if result.state == "finished"}
+    results = place.results()
     calls: dict[Future[RunResult], Run] = {}
-    tries = Counter[str]()
 
-    def submit(run: Run) -> None:
-        folder = str(place.run(run))
-        calls[executor.submit(work, run, folder, sweep.suite, sweep.spec.evaluation)] = run
-        tries[run.name] += 1
-
-    def next_step(run: Run) -> str:
-        begun = pipeline_folder(place.run(run)) is not None
-        return "resumes where it stopped" if begun else "begins again"
+    def submit(run: Run, reason: str) -> None:
+        folder = place.run(run)
+        if pipeline_folder(folder) is not None:
+            report(f"{run.name}: {reason}resumes where it stopped")
+        elif reason:
+            report(f"{run.name}: {reason}begins again")
+        call = executor.submit(work, run, str(folder), sweep.suite, sweep.spec.evaluation)
+        calls[call] = run
 
     # All runs are submitted at once; the executor starts as many as it has workers.
     for run in sweep.runs:
-        if run.name in results:
-            continue
-        if run.name in known:
-            report(f"{run.name}: failed before ({known[run.name].message}); {next_step(run)}")
-        elif pipeline_folder(place.run(run)) is not None:
-            report(f"{run.name}: {next_step(run)}")
-        submit(run)
+        if run.name not in results:
+            submit(run, "")
+        elif results[run.name].state == "failed":
+            submit(run, f"failed before ({results.pop(run.name).message}); ")
+    retried = set[str]()
     show(len(results), len(sweep.runs), "runs")
     for run, future in as_they_end(executor, calls, signals, report):
         try:
@@ -95,20 +92,18 @@ def execute(
             # After a signal a worker may have been ended by it.
             if signals.received is not None:
                 continue
-            if tries[run.name] < TRIES:
-                report(f"{run.name}: {died}; {next_step(run)}")
-                submit(run)
+            if run.name not in retried:
+                retried.add(run.name)
+                submit(run, f"{died}; ")
                 continue
             result = _result(run, state="failed", message=str(died))
         if result.state == "interrupted":
-            report(f"{run.name}: interrupted; {next_step(run)} with --resume")
+            report(f"{run.name}: interrupted; continues with --resume")
             continue
         place.add(result)
         results[run.name] = result
-        end = f"finished in {result.seconds:.1f} s"
-        if result.state == "failed":
-            end = f"failed: {result.message}"
-        report(f"{run.name}: {end} ({len(results)} of {len(sweep.runs)})")
+        end = result.message or f"{result.seconds:.1f} s"
+        report(f"{run.name}: {result.state}, {end} ({len(results)} of {len(sweep.runs)})")
         show(len(results), len(sweep.runs), "runs")
     return results
 
@@ -123,31 +118,31 @@ def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> 
     # One core for each run: so the same weights come out on any machine.
     use_cpus(1)
     place = Path(folder)
-    interrupted = _result(run, state="interrupted")
     try:
         place.mkdir(parents=True, exist_ok=True)
         import_packages(run.gym_packages, "gym_packages:")
         trained = _train(run, place)
         if trained.exit_code != 0:
-            return interrupted
+            return _result(run, state="interrupted")
         stages = [*trained.stages.values()]
         agent = Path(stages[-1].agent)
-        flights = _fly(agent, trained.job, suite, evaluation)
+        return _result(
+            run,
+            state="finished",
+            agent=agent.relative_to(place).as_posix(),
+            weights=digest(agent),
+            timesteps=sum(stage.timesteps for stage in stages),
+            seconds=round(sum(stage.seconds for stage in stages), 1),
+            flights=_fly(agent, trained.job, suite, evaluation),
+        )
     except KeyboardInterrupt:
-        return interrupted
+        return _result(run, state="interrupted")
     # Also the errors of a user's callback or environment: the other runs continue.
     except (Exception, SystemExit) as error:
-        kind = "" if isinstance(error, SB3QuadError) else f"{type(error).__name__}: "
-        return _result(run, state="failed", message=kind + one_line(error))
-    return _result(
-        run,
-        state="finished",
-        agent=agent.relative_to(place).as_posix(),
-        weights=digest(agent),
-        timesteps=sum(stage.timesteps for stage in stages),
-        seconds=round(sum(stage.seconds for stage in stages), 1),
-        flights=flights,
-    )
+        message = one_line(error)
+        if not isinstance(error, SB3QuadError):
+            message = f"{type(error).__name__}: {message}"
+        return _result(run, state="failed", message=message)
 
 
 def _result(run: Run, **fields: Any) -> RunResult:
@@ -156,16 +151,16 @@ def _result(run: Run, **fields: Any) -> RunResult:
 
 def digest(agent: Path) -> str:
     """The SHA-256 of the parameters in an agent's zip."""
-    parameters = load_model(agent).policy.state_dict()
-    sha256 = hashlib.sha256()
-    for name, tensor in sorted(parameters.items()):
-        sha256.update(name.encode() + tensor.numpy().tobytes())
-    return sha256.hexdigest()
+    parameters = parameters_to_vector(load_model(agent).policy.parameters())
+    return hashlib.sha256(parameters.detach().numpy().tobytes()).hexdigest()
 
 
 def pipeline_folder(place: Path) -> Path | None:
     """The folder of a run's training, if it has begun."""
-    return next((path.parent for path in sorted(place.glob(f"*/*/{STATUS_FILE}"))), None)
+    begun = sorted(place.glob(f"*/*/{STATUS_FILE}"))
+    if begun:
+        return begun[0].parent
+    return None
 
 
 def _train(run: Run, place: Path) -> PipelineResult:
@@ -203,17 +198,15 @@ def _fly(
         config = job.for_evaluation()
         with closing(make_environments(config, 1, seed)) as env:
             rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
-        return {config.env_id: {REWARD: tuple(np.ravel(rewards).tolist())}}
+        return {config.env_id: {"reward": tuple(np.ravel(rewards).tolist())}}
+    flights = {}
     # Without a suite, the episodes are those of the closing table of train.
     if suite is None:
-        seeds = row_seeds(seed, episodes)
-        settings = job.flight_settings.in_any_task()
-        return {
-            task: _numbers(fly_settings(model, FlightSettings(task=task, **settings), seeds))
-            for task in TASKS
-        }
+        for task in TASKS:
+            settings = FlightSettings(task=task, **job.flight_settings.in_any_task())
+            flights[task] = _numbers(fly_settings(model, settings, row_seeds(seed, episodes)))
+        return flights
     spec = ControllerSpec("agent", str(agent))
-    flights = {}
     for scenario in suite.scenarios:
         flown = scenario.flown_by(spec.own and spec.own.vehicle)
         flights[scenario.name] = _numbers(fly_scenario(model, flown, own=spec.observed)[0])
@@ -228,13 +221,14 @@ def _numbers(flights: Flights) -> dict[str, Numbers]:
         arrival = flights.time_to[min(flights.time_to)]
     # An episode that starts at its target has no way to it, and so no cross-track error.
     has_way = np.isfinite(flights.cross_track_error)
-    columns = (
-        flights.success,
-        flights.survival,
-        flights.reward,
-        np.where(flights.survival, flights.final_error, np.nan),
-        np.where(has_way, arrival, flights.recovery_time),
-    )
-    numbers = np.array(columns, dtype=np.float64)
-    rows = np.where(np.isfinite(numbers), numbers, np.array(None)).tolist()
-    return dict(zip(MEASURES, map(tuple, rows), strict=True))
+    measures: StrDict = {
+        "success": flights.success,
+        "survival": flights.survival,
+        "reward": flights.reward,
+        "final_error": np.where(flights.survival, flights.final_error, np.nan),
+        "time": np.where(has_way, arrival, flights.recovery_time),
+    }
+    none = np.array(None)
+    for name, values in measures.items():
+        measures[name] = np.where(np.isfinite(values), values, none).tolist()
+    return measures

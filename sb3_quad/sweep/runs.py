@@ -2,20 +2,18 @@
 
 import copy
 import itertools
-import json
-import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
-from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
+from sb3_quad.sweep.spec import Configuration, SweepSpec
 from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.training.pipeline import (
     Pipeline,
@@ -31,14 +29,14 @@ NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # whose value s
 LONGEST = 80  # characters of a name
 
 
-class Run(Frozen, use_attribute_docstrings=True):
+class Run(Frozen):
     """One training of a sweep: all that a worker needs, with the contents of settings files."""
 
     name: str
     """configuration/seed_k: its folder under runs/"""
     configuration: str
     seed: int
-    job: dict[str, Any]
+    job: StrDict
     """arguments of TrainingJob, less config, seed and log_folder"""
     stages: tuple[Stage, ...]
     """of its pipeline, with all their settings; a single run is one of one stage"""
@@ -49,16 +47,17 @@ def make_runs(spec: SweepSpec) -> list[Run]:
     """Return the runs of a sweep, the seeds of a configuration one after another.
 
     :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
-        two configurations of one name, too many runs.
+        two configurations of one name.
     """
     # Every configuration is checked before the first run starts.
-    runs: dict[str, list[Run]] = {}
+    runs: list[Run] = []
+    names = set[str]()
     for varied, data in _cells(spec):
         label = _name(varied)
         where = f"configuration {label!r}" if varied else "sweep"
         configuration = validate(Configuration, data, where)
         name = _folder_name(configuration, label)
-        if name in runs:
+        if name in names:
             raise ConfigError(
                 f"two configurations are called {name!r}; give them names, or values that differ"
             )
@@ -66,8 +65,9 @@ def make_runs(spec: SweepSpec) -> list[Run]:
             job, stages = _stages(configuration)
         except ConfigError as error:
             raise ConfigError(f"configuration {name!r}: {error}") from None
-        runs[name] = [
-            Run(
+        names.add(name)
+        for seed in spec.seed:
+            run = Run(
                 name=f"{name}/seed_{seed}",
                 configuration=name,
                 seed=seed,
@@ -75,9 +75,8 @@ def make_runs(spec: SweepSpec) -> list[Run]:
                 stages=tuple(stages),
                 gym_packages=spec.gym_packages,
             )
-            for seed in spec.seed
-        ]
-    return [*itertools.chain.from_iterable(runs.values())]
+            runs.append(run)
+    return runs
 
 
 def suite_of(spec: SweepSpec) -> Suite | None:
@@ -91,57 +90,49 @@ def suite_of(spec: SweepSpec) -> Suite | None:
     return None
 
 
-def _cells(spec: SweepSpec) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+def _cells(spec: SweepSpec) -> Iterator[tuple[StrDict, StrDict]]:
     """Yield the keys in which a configuration differs, and all its keys."""
     for key, values in spec.grid.items():
         if not isinstance(values, list) or not values:
             raise ConfigError(f"grid: {key}: must be a list of at least one value, not {values!r}")
     # Without a list there is one configuration, that of the shared keys.
     listed = spec.configurations or ({},)
-    count = len(listed) * len(spec.seed) * math.prod(map(len, spec.grid.values()))
-    if count > MAX_RUNS:
-        raise ConfigError(f"the sweep has {count:,} runs, at most {MAX_RUNS:,} are allowed")
     for own in listed:
         for values in itertools.product(*spec.grid.values()):
             cell = dict(zip(spec.grid, values, strict=True))
-            data = copy.deepcopy(_merged(spec.given, own))
-            data.pop("name", None)
+            data = spec.given
+            # The entries of mappings are merged, such as those of env_kwargs.
+            for key, value in own.items():
+                if isinstance(value, dict) and isinstance(data.get(key), dict):
+                    value = data[key] | value
+                data[key] = copy.deepcopy(value)
             for key, value in cell.items():
-                # A key without a value in the file is null, and holds no mapping to put this into.
-                outer = key.partition(".")[0]
-                if data.get(outer) is None:
-                    data.pop(outer, None)
                 put_key(data, key, value, f"grid: {key}")
             # A named configuration keeps its name in each cell of the grid.
+            data["name"] = None
             if own.get("name"):
                 data["name"] = ",".join(filter(None, [str(own["name"]), _name(cell)]))
             yield {**own, **cell}, data
-
-
-def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    both = {**shared, **own}
-    for key, value in own.items():
-        if isinstance(value, Mapping) and isinstance(shared.get(key), Mapping):
-            both[key] = {**shared[key], **value}
-    return both
 
 
 def _folder_name(configuration: Configuration, label: str) -> str:
     """Return the name of a configuration, or else one made of its settings."""
     name = configuration.name or label
     if not name:
-        named_by = configuration.model_dump(include={"algo", "conf_file"}, exclude_none=True)
-        name = _name(named_by).replace(",", "-")
+        words = (configuration.algo, Path(configuration.conf_file or "").stem)
+        name = "-".join(filter(None, words))
     return re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", name).strip("-.,")[:LONGEST] or "run"
 
 
-def _stages(configuration: Configuration) -> tuple[dict[str, Any], list[Stage]]:
+def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     """Return the job of a configuration's runs and their stages, with all settings."""
     # A vehicle is a keyword of the environment.
-    changes: dict[str, Any] = {}
+    changes: StrDict = {}
     if configuration.vehicle is not None:
-        kwargs = configuration.env_kwargs or {}
-        changes["env_kwargs"] = {**kwargs, "vehicle": configuration.vehicle}
+        changes["env_kwargs"] = {
+            **(configuration.env_kwargs or {}),
+            "vehicle": configuration.vehicle,
+        }
     # The agent that the training starts from, as a path that workers find.
     if configuration.trained_agent is not None:
         changes["trained_agent"] = agent_path(configuration.trained_agent)
@@ -188,12 +179,12 @@ def _pipeline(configuration: Configuration) -> Pipeline:
     return Pipeline(stages=(stage,))
 
 
-def _name(varied: Mapping[str, Any]) -> str:
+def _name(varied: StrMapping) -> str:
     """Return the keys in which a configuration differs as words: ``pid,learning_rate=0.001``."""
     # Some values say enough without their key.
     words = []
     for key, value in varied.items():
-        word = value if isinstance(value, str) else json.dumps(value, default=str)
+        word = str(value)
         if key == "conf_file":
             word = Path(word).with_suffix("").as_posix()
         if key not in NAMED_ALONE:

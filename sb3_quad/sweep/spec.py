@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, mode
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import Seed
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.training.classes import as_list
@@ -22,10 +23,9 @@ from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.vehicles.vehicle import NAME
 
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
-MAX_RUNS = 10_000
 
 
-class Configuration(SettingsOptions, RunOptions, use_attribute_docstrings=True):
+class Configuration(SettingsOptions, RunOptions):
     """The settings of one training, less its seed; a missing key has the default of ``train``."""
 
     name: str | None = Field(default=None, pattern=NAME)
@@ -36,7 +36,7 @@ class Configuration(SettingsOptions, RunOptions, use_attribute_docstrings=True):
     """environment id of a single run"""
     conf_file: str | None = None
     """settings file, of a single run or of a pipeline"""
-    hyperparams: dict[str, Any] = {}
+    hyperparams: StrDict = {}
     """settings to change, such as n_steps: 500"""
     vehicle: str | None = None
     """env_kwargs' vehicle, by name or YAML file"""
@@ -53,12 +53,12 @@ class Configuration(SettingsOptions, RunOptions, use_attribute_docstrings=True):
         }
 
     @property
-    def given(self) -> dict[str, Any]:
+    def given(self) -> StrDict:
         """The keys that have another value than their default."""
         return self.model_dump(include={*Configuration.model_fields}, exclude_defaults=True)
 
 
-class Resources(Frozen, use_attribute_docstrings=True):
+class Resources(Frozen):
     """The resources of a run, for Ray to place it."""
 
     num_cpus: NonNegativeFloat = 1
@@ -67,7 +67,7 @@ class Resources(Frozen, use_attribute_docstrings=True):
     """GPUs"""
 
 
-class Evaluation(Frozen, use_attribute_docstrings=True):
+class Evaluation(Frozen):
     """The fresh episodes on which all agents are compared."""
 
     suite: str | None = None
@@ -80,14 +80,14 @@ class Evaluation(Frozen, use_attribute_docstrings=True):
     """of the episodes"""
 
 
-class SweepSpec(Configuration, use_attribute_docstrings=True):
+class SweepSpec(Configuration):
     """The keys of a sweep's file."""
 
     seed: Annotated[tuple[Seed, ...], BeforeValidator(as_list)] = Field(default=(0,), min_length=1)
     """one or a list"""
-    grid: dict[str, Any] = {}
+    grid: StrDict = {}
     """keys, each with a list of values"""
-    configurations: tuple[dict[str, Any], ...] = ()
+    configurations: tuple[StrDict, ...] = ()
     """a list of keys and values each"""
     evaluation: Evaluation = Evaluation()
     """the episodes that the agents fly in the end"""
@@ -97,7 +97,7 @@ class SweepSpec(Configuration, use_attribute_docstrings=True):
     """modules that register further environments"""
 
 
-def load_sweep(source: str | Path) -> SweepSpec:
+def load_sweep(source: StrPath) -> SweepSpec:
     """Load the sweep in a YAML file, by path or by the name of one in the package.
 
     :raises ConfigError: an unreadable file, or a key that is unknown or does not fit.

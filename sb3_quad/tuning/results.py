@@ -2,12 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import yaml
 from optuna.trial import FrozenTrial
 
 from sb3_quad.base.files import write_csv, write_text
+from sb3_quad.base.types import StrDict
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
 
@@ -30,20 +30,17 @@ def write_results(search: Search) -> None:
     if best is None:
         return
     # The best settings say where they come from, in comments that train skips.
-    comments = [
-        f"Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, "
-        f"study {search.name}.",
-        f"{in_words(search, best)} over {search.job.eval_episodes} episodes, "
-        f"by which it was chosen; seed {search.job.seed}.",
-        train_command(search),
-    ]
     settings = yaml.safe_dump({search.job.config.env_id: settings_of(best)}, sort_keys=False)
-    write_text(folder / BEST, "".join(f"# {line}\n" for line in comments) + settings)
+    origin = (
+        f"# Found by sb3-quad tune: trial {best.number} of study {search.name}, "
+        f"{in_words(search, best)}.\n# {train_command(search)}\n"
+    )
+    write_text(folder / BEST, origin + settings)
 
 
-def _row(search: Search, trial: FrozenTrial) -> dict[str, Any]:
+def _row(search: Search, trial: FrozenTrial) -> StrDict:
     """The line of a trial in the table of all trials."""
-    row: dict[str, Any] = {
+    row: StrDict = {
         **trial.user_attrs,
         **varied(search, trial),
         "number": trial.number,
@@ -60,12 +57,12 @@ def _row(search: Search, trial: FrozenTrial) -> dict[str, Any]:
     return row
 
 
-def settings_of(trial: FrozenTrial) -> dict[str, Any]:
+def settings_of(trial: FrozenTrial) -> StrDict:
     """All settings of a trial, as YAML holds them; none if it failed before it had any."""
     return dict(json.loads(trial.user_attrs.get(SETTINGS, "{}")))
 
 
-def varied(search: Search, trial: FrozenTrial) -> dict[str, Any]:
+def varied(search: Search, trial: FrozenTrial) -> StrDict:
     """The settings of a trial that the search varies."""
     settings = settings_of(trial)
     if not settings:
@@ -96,8 +93,12 @@ def trial_line(search: Search, trial: FrozenTrial) -> str:
 
 def count_trials(search: Search) -> str:
     """The numbers of trials of the study that finished, were pruned and failed."""
-    counts = {word: len(search.trials(state)) for state, word in STATES.items()}
-    return ", ".join(f"{count} {word}" for word, count in counts.items() if count) or "no trial yet"
+    words = []
+    for state, word in STATES.items():
+        count = len(search.trials(state))
+        if count:
+            words.append(f"{count} {word}")
+    return ", ".join(words) or "no trial yet"
 
 
 def train_command(search: Search) -> str:

@@ -11,15 +11,13 @@ import json
 import math
 import os
 import platform
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
-from optuna.distributions import BaseDistribution, distribution_to_json
-from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
+from optuna.pruners import MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
@@ -29,12 +27,14 @@ from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 
+Factories = dict[str, Callable[..., Any]]
 # From a seed and n_startup_trials.
-SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {
+SAMPLERS: Factories = {
     "tpe": lambda seed, n: TPESampler(
         seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True
     ),
@@ -44,7 +44,7 @@ SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {
     ),
 }
 # From n_startup_trials and n_evaluations.
-PRUNERS: Mapping[str, Callable[[int, int], BasePruner]] = {
+PRUNERS: Factories = {
     "median": lambda n, evaluations: MedianPruner(
         n_startup_trials=n, n_warmup_steps=evaluations // 3
     ),
@@ -90,11 +90,11 @@ class Search:
         job: TrainingJob,
         space: SearchSpace,
         name: str,
-        storage: str | Path,
-        sampler: str = "tpe",
-        pruner: str = "median",
-        n_startup_trials: int = 10,
-        n_evaluations: int = 10,
+        storage: StrPath,
+        sampler: str,
+        pruner: str,
+        n_startup_trials: int,
+        n_evaluations: int,
     ) -> None:
         if sampler not in SAMPLERS:
             raise ConfigError(unknown("sampler", sampler, SAMPLERS))
@@ -120,7 +120,7 @@ class Search:
                 self.study.enqueue_trial(first)
         known = self.study.user_attrs.get(BEGUN_WITH)
         where = f"study {name} in {storage}"
-        if not isinstance(known, dict):
+        if known is None:
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
         if differing:
@@ -145,10 +145,9 @@ class Search:
             retry_dead_trials(self.study)
             if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
                 return None
-            trial = self.study.ask(dict(self.space.dimensions))
+            trial = self.study.ask(self.space.dimensions)
             trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
-            self.study.tell(trial, *self._outcome(trial))
-            return self.study.get_trials(deepcopy=False)[trial.number]
+            return self.study.tell(trial, *self._outcome(trial))
         except (OSError, optuna.exceptions.OptunaError) as error:
             raise ConfigError(
                 f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})"
@@ -188,32 +187,26 @@ class Search:
         # A training ends with a whole rollout.
         rollout = config.rollout_steps * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout
-        changes = {
-            "config": config,
-            "eval_freq": math.ceil(total / self.n_evaluations),
-            "snapshot_every": 0,
-        }
+        eval_freq = math.ceil(total / self.n_evaluations)
+        changes = {"config": config, "eval_freq": eval_freq, "snapshot_every": 0}
         values: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
-            value = reward
-            if known.task is not None:
-                value = score(success, reward, self.job.eval_episodes)
-            values.append(value)
-            trial.report(value, len(values))
+            if known.task is None:
+                values.append(reward)
+            else:
+                values.append(score(success, reward, self.job.eval_episodes))
+            trial.report(values[-1], len(values))
             trial.set_user_attr(SUCCESS, success)
             trial.set_user_attr(REWARD, reward)
             return len(values) >= self.n_evaluations or not trial.should_prune()
 
-        # SB3 warns of each batch size that does not divide the rollout, which a search often tries.
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
-            result = train(
-                self.job.model_copy(update=changes),
-                report=lambda line: None,
-                on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
-                should_continue=should_continue,
-            )
+        result = train(
+            self.job.model_copy(update=changes),
+            report=lambda line: None,
+            on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
+            should_continue=should_continue,
+        )
         # The training ends early by a signal, or because the pruner stopped it.
         if result.exit_code != 0:
             raise KeyboardInterrupt
@@ -223,7 +216,7 @@ class Search:
             raise TrainingError(f"the mean reward is {trial.user_attrs[REWARD]}")
         return values[-1]
 
-    def _shared(self) -> dict[str, Any]:
+    def _shared(self) -> StrDict:
         """Return all that the trials of a study must share to be compared."""
         job = self.job
         # The agent counts by its content, since its file may move.
@@ -232,15 +225,12 @@ class Search:
             try:
                 agent = hashlib.sha256(Path(job.trained_agent).read_bytes()).hexdigest()
             except OSError as error:
-                raise ConfigError(
-                    f"{job.trained_agent}: cannot be read ({error.strerror or error})"
-                ) from None
-        dimensions = self.space.dimensions.items()
+                raise ConfigError(f"{job.trained_agent}: cannot be read ({error})") from None
         return {
             "algo": job.config.algo,
             "env": job.config.env_id,
             **job.config.settings,
-            "search_space": {name: distribution_to_json(values) for name, values in dimensions},
+            "search_space": str(self.space.dimensions),
             "seed": job.seed,
             "trained_agent": agent,
             "n_evaluations": self.n_evaluations,
@@ -261,9 +251,7 @@ class NumberedSampler(BaseSampler):
         self._seed = seed
         self._startup = n_startup_trials
 
-    def infer_relative_search_space(
-        self, study: optuna.Study, trial: FrozenTrial
-    ) -> dict[str, BaseDistribution]:
+    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> Any:
         # A retry has the parameters of an earlier trial, and no number of its own.
         before = study.get_trials(deepcopy=False)[: trial.number]
         number = sum("again" not in earlier.user_attrs for earlier in before)
@@ -271,22 +259,22 @@ class NumberedSampler(BaseSampler):
         self._sampler = SAMPLERS[self._kind](seed, self._startup)
         return self._sampler.infer_relative_search_space(study, trial)
 
-    def sample_relative(self, *arguments: Any) -> dict[str, Any]:
+    def sample_relative(self, *arguments: Any) -> Any:
         return self._sampler.sample_relative(*arguments)
 
     def sample_independent(self, *arguments: Any) -> Any:
         return self._sampler.sample_independent(*arguments)
 
 
-def open_study(name: str, storage: str | Path) -> optuna.Study:
+def open_study(name: str, storage: StrPath) -> optuna.Study:
     """Return the study of this name, which the storage may hold already.
 
     :raises ConfigError: cmaes is missing; a storage that cannot be used, such as a file that is not
         a journal.
     """
     require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
+    backend: Any = str(storage)
     try:
-        backend: Any = str(storage)
         if "://" not in backend:
             backend = _open_journal(Path(storage))
         return optuna.create_study(

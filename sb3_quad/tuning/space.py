@@ -9,9 +9,7 @@ whole numbers, others get four significant digits.
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from optuna.distributions import (
@@ -24,6 +22,7 @@ from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_number, parse_value
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.training.algorithms import (
@@ -41,12 +40,18 @@ LINEAR = "lin_"
 
 
 class Interval(Frozen):
-    """A number between two others; ``whole``: a whole one also where the setting need not be."""
+    """A number between two others."""
 
     low: float
     high: float
     log: bool = False
-    whole: bool = False
+
+
+class WholeInterval(Interval):
+    """A whole number between two others."""
+
+    low: int
+    high: int
 
 
 class Factor(Frozen):
@@ -66,16 +71,16 @@ class SearchSpace:
     """
 
     algo: str
-    base: Mapping[str, Any]
-    dimensions: Mapping[str, BaseDistribution]
+    base: StrMapping
+    dimensions: dict[str, Any]
 
-    def settings(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    def settings(self, parameters: StrMapping) -> StrDict:
         """Return all settings of a trial with these parameters, as YAML holds them."""
         changed = dict(self.base)
         for name, parameter in parameters.items():
-            outer, dot, inner = name.partition(".")
+            outer, _, inner = name.partition(".")
             value = self._setting(name, parameter)
-            if dot:
+            if inner:
                 value = {**_plain(changed.get(outer)), inner: value}
             changed[outer] = value
         if MINIBATCHES in changed:
@@ -84,45 +89,39 @@ class SearchSpace:
             changed["batch_size"] = math.ceil(_rollout(self.algo, changed) / count)
         return changed
 
-    def start(self) -> dict[str, Any] | None:
+    def start(self) -> StrDict | None:
         """Return the parameters that stand for the settings as they are; None if one of these lies
         outside the space.
         """
-        start: dict[str, Any] = {}
+        start: StrDict = {}
         for name, dimension in self.dimensions.items():
             # A list must hold the value, a range must include it.
             value = current(self.algo, self.base, name)
             if isinstance(dimension, CategoricalDistribution):
-                start[name] = _label(value)
-                if start[name] not in dimension.choices:
-                    return None
-                continue
-            number = _number_of(value)
-            if number is None or not dimension.low <= number <= dimension.high:  # type: ignore[attr-defined]
+                value = _label(value)
+                inside = value in dimension.choices
+            else:
+                value = _number_of(value)
+                inside = value is not None and dimension.low <= value <= dimension.high
+            if not inside:
                 return None
-            start[name] = int(number) if isinstance(dimension, IntDistribution) else float(number)
+            start[name] = value
         return start
 
     def _setting(self, name: str, parameter: Any) -> Any:
         """Return the value that a parameter stands for."""
         dimension = self.dimensions[name]
-        if isinstance(dimension, CategoricalDistribution):
-            if isinstance(parameter, str) and parameter[:1] in ("[", "{"):
-                return json.loads(parameter)
-            return parameter
+        if isinstance(parameter, str) and parameter[:1] in ("[", "{"):
+            return json.loads(parameter)
         if not isinstance(dimension, FloatDistribution):
             return parameter
-        # Four digits, but not beyond a bound.
-        rounded = min(max(float(f"{parameter:.4g}"), dimension.low), dimension.high)
-        present = current(self.algo, self.base, name)
-        if isinstance(present, str) and present.startswith(LINEAR):
-            return f"{LINEAR}{rounded:.4g}"
-        return float(f"{rounded:.4g}")
+        rounded = f"{parameter:.4g}"
+        if str(current(self.algo, self.base, name)).startswith(LINEAR):
+            return LINEAR + rounded
+        return float(rounded)
 
 
-def load_space(
-    algo: str, settings: Mapping[str, Any], source: str | Path | None = None
-) -> SearchSpace:
+def load_space(algo: str, settings: StrMapping, source: StrPath | None = None) -> SearchSpace:
     """Load the space of a search around some settings.
 
     :param source: a YAML file; None: the package's own for the algorithm.
@@ -145,26 +144,26 @@ def load_space(
             raise ConfigError(f"{where}: {unknown(f'setting of {algo}', name, valid)}")
     if MINIBATCHES in content and "batch_size" in content:
         raise ConfigError(f"{where}: {MINIBATCHES} sets batch_size; remove one of them")
-    dimensions = {
-        name: _dimension(algo, settings, name, values, f"{where}: {name}")
-        for name, values in content.items()
-    }
+    dimensions = {}
+    for name, values in content.items():
+        dimensions[name] = _dimension(algo, settings, name, values, f"{where}: {name}")
     return SearchSpace(algo, settings, dimensions)
 
 
-def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
+def current(algo: str, settings: StrMapping, name: str) -> Any:
     """Return the value that some settings have under a name of a search space, or else the
     algorithm's default.
     """
-    outer, dot, inner = name.partition(".")
+    outer, _, inner = name.partition(".")
     # An entry of a mapping, such as policy_kwargs.net_arch.
-    if dot:
+    if inner:
         return _plain(settings.get(outer)).get(inner)
     if name == MINIBATCHES:
         batch_size = _number_of(current(algo, settings, "batch_size")) or 1
         return round(_rollout(algo, settings) / batch_size)
     if name in settings:
         return settings[name]
+    # A setting of the training is no parameter: there is one environment by default.
     parameter = constructor_parameters(get_algorithm(algo)).get(name)
     if parameter is None:
         return 1 if name == "n_envs" else None
@@ -172,7 +171,7 @@ def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
 
 
 def _dimension(
-    algo: str, settings: Mapping[str, Any], name: str, values: Any, where: str
+    algo: str, settings: StrMapping, name: str, values: Any, where: str
 ) -> BaseDistribution:
     if isinstance(values, list) and values:
         return CategoricalDistribution([_label(value) for value in values])
@@ -182,23 +181,18 @@ def _dimension(
         )
     parameter = constructor_parameters(get_algorithm(algo)).get(name)
     whole = name in (MINIBATCHES, "n_envs") or (parameter is not None and takes_whole(parameter))
-    # Both kinds of ranges become bounds; whole numbers get whole bounds.
     if "around" in values:
-        bounds = _around(current(algo, settings, name), values, whole, where)
-    else:
-        bounds = validate(Interval, values, where)
+        values = _around(current(algo, settings, name), values, whole, where)
+    # The fields of an interval are the arguments of Optuna's distributions.
+    interval = validate(WholeInterval if whole else Interval, values, where)
     try:
-        if not (whole or bounds.whole):
-            return FloatDistribution(bounds.low, bounds.high, bounds.log)
-        if bounds.low.is_integer() and bounds.high.is_integer():
-            return IntDistribution(int(bounds.low), int(bounds.high), bounds.log)
+        return (IntDistribution if whole else FloatDistribution)(**dict(interval))
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
-    raise ConfigError(f"{where}: low {bounds.low:g} and high {bounds.high:g} must be whole numbers")
 
 
-def _around(value: Any, factor: Any, whole: bool, where: str) -> Interval:
-    """Return the interval of ``around``, from the setting's present value."""
+def _around(value: Any, factor: Any, whole: bool, where: str) -> StrDict:
+    """Return the bounds of ``around``, from the setting's present value."""
     around = validate(Factor, factor, where).around
     middle = _number_of(value)
     if middle is None or middle <= 0:
@@ -206,19 +200,21 @@ def _around(value: Any, factor: Any, whole: bool, where: str) -> Interval:
             f"{where}: around needs a number above 0 in the settings, not {value!r}; "
             "give low and high"
         )
+    low = middle / around
+    high = middle * around
     if whole:
-        low = max(1, math.floor(middle / around))
-        return Interval(low=low, high=math.ceil(middle * around), log=True)
-    return Interval(low=middle / around, high=middle * around, log=True)
+        low = max(1, math.floor(low))
+        high = math.ceil(high)
+    return {"low": low, "high": high, "log": True}
 
 
-def _rollout(algo: str, settings: Mapping[str, Any]) -> float:
+def _rollout(algo: str, settings: StrMapping) -> float:
     """Return the timesteps of a rollout of all environments."""
-    factors = [_number_of(current(algo, settings, name)) or 1 for name in ("n_steps", "n_envs")]
-    return math.prod(factors)
+    n_steps = _number_of(current(algo, settings, "n_steps")) or 1
+    return n_steps * (_number_of(current(algo, settings, "n_envs")) or 1)
 
 
-def _plain(value: Any) -> dict[str, Any]:
+def _plain(value: Any) -> StrDict:
     """Return a mapping of the settings with its values as written, also one like ``dict(…)``."""
     if isinstance(value, str):
         value = parse_value(value)
@@ -227,16 +223,13 @@ def _plain(value: Any) -> dict[str, Any]:
 
 def _label(value: Any) -> Any:
     """Return a value of a list as Optuna holds it: a plain one as it is, others as JSON."""
-    if isinstance(value, (bool, int, float, str, type(None))):
-        return value
-    return json.dumps(value)
+    if isinstance(value, (list, dict)):
+        return json.dumps(value)
+    return value
 
 
 def _number_of(value: Any) -> float | None:
     """Return a number, also that of ``lin_x``; None for anything else."""
-    if isinstance(value, str):
-        value = value.removeprefix(LINEAR)
-    number = parse_number(value)
-    if isinstance(number, bool) or not isinstance(number, (int, float)):
-        return None
-    return number
+    number = parse_number(value.removeprefix(LINEAR) if isinstance(value, str) else value)
+    # True and False are numbers to Python.
+    return number if type(number) in (int, float) else None

@@ -189,7 +189,7 @@ def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
     failures = [record for record in records.values() if record.state == "failed"]
     seconds = time.perf_counter() - start
     print(f"{results.finished} of {runs} finished, {len(failures)} failed; {seconds:.1f} s")
-    report = ", report.md, report.html" if results.groups else ""
+    report = ", report.md, report.html" if results.finished else ""
     print(f"saved in {folder.path}: results.csv, results.json, runs/{report}")
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
@@ -212,16 +212,14 @@ def _new_folder(options: argparse.Namespace, sweep: Any) -> Any:
 def _write_results(folder: Any, sweep: Any, records: Any) -> Any:
     """Write and print the comparison of the finished runs, and return it."""
     from sb3_quad.cli.output import console
-    from sb3_quad.sweep.results import summarize, tables, write_report, write_results
+    from sb3_quad.sweep.results import tables, write_report, write_results
 
-    results = summarize(sweep, records)
-    write_results(folder, results)
-    if results.groups:
-        sections = tables(results)
-        for section in sections.values():
-            for table in section:
-                console().print(table)
-        write_report(folder, results, sections)
+    results = write_results(folder, sweep, records)
+    if results.finished:
+        shown = tables(results)
+        for table in shown:
+            console().print(table)
+        write_report(folder, results, shown)
     return results
 
 
