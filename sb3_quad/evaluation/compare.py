@@ -6,6 +6,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
@@ -45,7 +46,7 @@ class Comparison(dict[str, dict[str, Metrics]]):
 
 
 def compare(
-    controllers: Mapping[str, Any],
+    controllers: StrMapping,
     tasks: Sequence[Any] = ("target_tracking", "state_recovery"),
     n_flights: int = 240,
     seed: int | None = None,
@@ -116,12 +117,10 @@ def compare(
     return comparison
 
 
-def _settings(
-    controllers: Mapping[str, Any], env_kwargs: Mapping[str, Any]
-) -> dict[str, FlightSettings]:
+def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, FlightSettings]:
     """Return how each controller flies, the task excepted."""
-    shared: dict[str, Any] = {}
-    own: dict[str, dict[str, Any]] = {}
+    shared: StrDict = {}
+    own: dict[str, StrDict] = {}
     for label, controller in controllers.items():
         known = _own_settings(controller)
         if known is not None:

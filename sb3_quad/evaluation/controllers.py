@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory
@@ -49,7 +49,7 @@ class ControllerSpec:
         return settings
 
     @property
-    def observed(self) -> dict[str, Any]:
+    def observed(self) -> StrDict:
         """Settings that go with the agent wherever it flies.
 
         These are :attr:`FlightSettings.observed` and the layout of the rotors that it knows.
@@ -58,7 +58,7 @@ class ControllerSpec:
             return FlightSettings().observed
         return {**self.own.observed, "rotor_layout": self.own.layout}
 
-    def notice(self, vehicle: str | Path | Vehicle) -> str:
+    def notice(self, vehicle: StrPath | Vehicle) -> str:
         """Return a warning if the agent was trained on another vehicle, or does not say on which.
 
         :return: the warning, in one line; else empty.

@@ -17,6 +17,7 @@ from sb3_quad.base import __version__
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
+from sb3_quad.base.types import Report, StrMapping
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
@@ -85,7 +86,7 @@ def evaluate(
     workers: int = 1,
     overwrite: bool = False,
     progress: Progress = lambda done, total, name: None,
-    report: Callable[[str], None] = lambda line: None,
+    report: Report = lambda line: None,
     executor: str = "local",
     address: str | None = None,
     reward: str | Reward | None = None,
@@ -148,7 +149,7 @@ def evaluate(
 
 
 def _load_controllers(
-    suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]
+    suite: Suite, specs: Sequence[ControllerSpec], report: Report
 ) -> tuple[dict[ControllerSpec, ControllerRecord], list[Failure]]:
     """Load the controllers; report those that fly another vehicle than they were trained on."""
     records: dict[ControllerSpec, ControllerRecord] = {}
@@ -216,7 +217,7 @@ def fly_scenario(
     scenario: Scenario,
     backend: str = "batch",
     recorded: int | None = 0,
-    own: Mapping[str, Any] | None = None,
+    own: StrMapping | None = None,
     reward: Reward | None = None,
 ) -> tuple[Flights, Arrays]:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
@@ -315,9 +316,7 @@ def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
     return first_vehicle(spec.own.vehicle)
 
 
-def _report_vehicles(
-    suite: Suite, specs: Mapping[ControllerSpec, Any], report: Callable[[str], None]
-) -> None:
+def _report_vehicles(suite: Suite, specs: Mapping[ControllerSpec, Any], report: Report) -> None:
     """Report controllers, or a reference, that fly different vehicles in the same scenario."""
     vehicles: dict[str, str] = {}
     for scenario in suite.scenarios:

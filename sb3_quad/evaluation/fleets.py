@@ -3,11 +3,12 @@
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from sb3_quad.base.types import StrDict
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
@@ -53,14 +54,8 @@ class BatchFleet:
         """Fly one control step; only the rows that are ``flying`` have meaning in the result."""
         observation, reward, _ = self._batch.step(actions)
         end = self._batch.outcome
-        return FleetStep(
-            observation,
-            reward.astype(np.float64),
-            ~end["truncated"],
-            end["collision"],
-            end["distance"],
-            end["success"],
-        )
+        outcome = ~end["truncated"], end["collision"], end["distance"], end["success"]
+        return FleetStep(observation, reward.astype(np.float64), *outcome)
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         """Move the targets of some rows, (len(rows), 3); return all observations."""
@@ -100,20 +95,20 @@ class PyBulletFleet:
         self._envs = [QuadcopterEnv(**keywords) for _ in seeds]
         self.vehicle = self._envs[0].vehicle
         self.observation_size = self._envs[0].batch.observation.size
+        self._observation = np.zeros((len(seeds), self.observation_size), np.float32)
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         for row, env in enumerate(self._envs):
             state = {name: values[row] for name, values in start.items()}
             # A target is no part of an environment's state.
-            options: dict[str, Any] = {"target": state.pop("target", None), "state": state}
-            env.reset(seed=self._seeds[row], options=options)
-        self._observation = np.stack([env.observe() for env in self._envs])
+            options: StrDict = {"target": state.pop("target", None), "state": state}
+            self._observation[row] = env.reset(seed=self._seeds[row], options=options)[0]
         return self._observation.copy()
 
     def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
         n = len(actions)
         reward, distance = np.zeros((2, n))
-        lost, collided, success = np.zeros((3, n), np.bool_)
+        lost, collided, success = np.zeros((3, n), bool)
         # The others have ended; their environments may not be stepped.
         for row in np.flatnonzero(flying):
             self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(

@@ -4,7 +4,6 @@ flight.
 docs/reference/evaluation.md lists the arrays.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray
 from sb3_quad.base.files import read_arrays
+from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flights import Flights, Hook
 from sb3_quad.simulation.state import (
     FORCE_BODY,
@@ -57,7 +57,7 @@ class Recorder(Hook):
         self._wrench = np.zeros((m, 6))
         # No action has been given at the start.
         no_actions = np.full((state.n, 4), np.nan, np.float32)
-        self._sample(state, no_actions, np.ones(state.n, dtype=np.bool_))
+        self._sample(state, no_actions, np.ones(state.n, bool))
 
     def before_step(
         self,
@@ -149,7 +149,7 @@ class Track(NamedTuple):
         return np.asarray(self.target[[0, *changed]])
 
 
-def read_tracks(path: str | Path) -> list[Track]:
+def read_tracks(path: StrPath) -> list[Track]:
     """Read the flights of a file whose trajectories were kept.
 
     :raises ConfigError: a missing or damaged file.

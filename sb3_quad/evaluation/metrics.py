@@ -1,17 +1,16 @@
 """Many flights in a few metrics."""
 
-from typing import Any
-
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
 
 
-class Moment(Frozen, use_attribute_docstrings=True):
+class Moment(Frozen):
     """An event that a flight reaches at some time, or never."""
 
     share: Estimate
@@ -31,7 +30,7 @@ class Arrival(Moment):
     """share of the flights that arrived and left the tolerance again"""
 
 
-class Course(Frozen, use_attribute_docstrings=True):
+class Course(Frozen):
     """A course of waypoints."""
 
     reached: Estimate
@@ -42,7 +41,7 @@ class Course(Frozen, use_attribute_docstrings=True):
     """mean time until the last waypoint of those flights, s"""
 
 
-class Metrics(Frozen, use_attribute_docstrings=True):
+class Metrics(Frozen):
     """The metrics of one controller in one scenario; path and errors are means over survivors."""
 
     n: int
@@ -90,7 +89,7 @@ def summarise(flights: Flights) -> Metrics:
     survived = flights.survival
     error = flights.final_error[survived]
     # These need a survivor: a quantile of nothing has no value.
-    errors: dict[str, Any] = dict.fromkeys(
+    errors: StrDict = dict.fromkeys(
         ("final_error_median", "final_error_95", "final_error_max", "final_offset")
     )
     if error.size:
@@ -145,7 +144,7 @@ def _course(waypoint_times: FloatArray) -> Course | None:
     )
 
 
-def _moment(times: FloatArray) -> dict[str, Any]:
+def _moment(times: FloatArray) -> StrDict:
     return {"share": share(np.isfinite(times)), "time": mean(times)}
 
 

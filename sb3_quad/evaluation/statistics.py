@@ -17,7 +17,7 @@ RESAMPLES = 1000
 BLOCK = 2**21  # values that a bootstrap holds at once, 16 MiB
 
 
-class Estimate(Frozen, use_attribute_docstrings=True):
+class Estimate(Frozen):
     """A statistic of a sample with its 95 % interval."""
 
     value: float
@@ -32,7 +32,7 @@ def share(hits: npt.ArrayLike) -> Estimate:
 
     :param hits: bool, (n,), n at least 1.
     """
-    array = np.asarray(hits, dtype=np.bool_)
+    array = np.asarray(hits, bool)
     n = array.size
     p = float(array.mean())
     scale = 1 + Z * Z / n

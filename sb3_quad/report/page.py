@@ -10,6 +10,7 @@ from pathlib import Path
 import jinja2
 
 from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.report.plots import Plot
 
@@ -34,7 +35,7 @@ class Section:
     facts: str = ""
 
 
-def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Section]) -> Path:
+def write_page(folder: StrPath, title: str, facts: str, sections: Sequence[Section]) -> Path:
     """Write ``report.md`` with the tables, ``figures/`` with each plot as PNG, and the page,
     ``report.html``.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing
+from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import (
     SUCCESS,
@@ -45,7 +46,7 @@ SMALL_PRINT = (
 )
 
 
-def write_report(folder: str | Path, overwrite: bool = False) -> Path:
+def write_report(folder: StrPath, overwrite: bool = False) -> Path:
     """Write the report of a folder of results: ``report.html``, its tables as ``report.md``, its
     plots as files.
 
@@ -81,7 +82,7 @@ def facts(results: Results) -> str:
     return " ".join(sentences)
 
 
-def sections(results: Results, folder: str | Path) -> list[Section]:
+def sections(results: Results, folder: StrPath) -> list[Section]:
     """Return all sections of a folder of results.
 
     :raises ConfigError: a missing or damaged file.
@@ -122,7 +123,7 @@ def _scenario_section(
     heading: str,
     scenario: Scenario,
     colours: Mapping[str, str],
-    folder: str | Path,
+    folder: StrPath,
 ) -> Section:
     measured = [measured_cells(results, label, scenario) for label in colours]
     rows = metric_rows(scenario, measured, scenario.reference.values())
@@ -159,7 +160,7 @@ def _conditions(scenario: Scenario) -> str:
 
 
 def _scenario_plots(
-    results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path
+    results: Results, scenario: Scenario, colours: Mapping[str, str], folder: StrPath
 ) -> list[Plot]:
     metrics = {}
     recorded = []

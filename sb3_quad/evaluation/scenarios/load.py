@@ -12,6 +12,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import YamlFolder, parse_yaml
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
@@ -47,7 +48,7 @@ WEIGHTS = {"force": "weights", "torque": "weights × arm length"}
 _SILENT = {"magnitude", "std", "value"}
 
 
-def load_suite(source: str | Path) -> Suite:
+def load_suite(source: StrPath) -> Suite:
     """Read a suite by name (``"thesis"``) or by the path of a YAML file.
 
     :raises ConfigError: an unknown name, a missing or unreadable file, an unknown key (the nearest
@@ -82,7 +83,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     return validate(Suite, {**data, "scenarios": scenarios}, where)
 
 
-def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
+def grid(entry: StrMapping, where: str) -> list[StrDict]:
     """Return the scenarios of one entry: a cell for each combination of the values in ``vary``.
 
     Without ``vary`` it is the entry alone.

@@ -17,7 +17,7 @@ Frame = Literal["world", "body"]
 Factor = Annotated[float, Field(ge=0.1, le=10)]
 
 
-class OneOf(Frozen, use_attribute_docstrings=True):
+class OneOf(Frozen):
     """A part with several ways to give it; a file uses exactly one. A list is the first way."""
 
     ways: ClassVar[tuple[str, ...]]
@@ -107,7 +107,7 @@ class Attitude(OneOf):
         return value
 
 
-class Start(Frozen, use_attribute_docstrings=True):
+class Start(Frozen):
     """Where and how an episode starts; rotors turn at hover speed."""
 
     position: Vector = (0.0, 0.0, 15.0)
@@ -155,7 +155,7 @@ class Target(OneOf):
         return self.waypoints or ()
 
 
-class Wrench(Frozen, use_attribute_docstrings=True):
+class Wrench(Frozen):
     """An external force and torque at the centre of mass for some time; several add up."""
 
     start: NonNegativeFloat = 0.0
@@ -183,7 +183,7 @@ class Wrench(Frozen, use_attribute_docstrings=True):
         return weight, weight * vehicle.arm_length
 
 
-class VehicleChanges(Frozen, use_attribute_docstrings=True):
+class VehicleChanges(Frozen):
     """Differences of the vehicle that flies from the one its controller was made for.
 
     Motors and limits stay as they are.

@@ -9,6 +9,7 @@ from pydantic import Field, PositiveFloat, ValidationError, field_validator, mod
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.randomization import Randomization
@@ -24,7 +25,7 @@ DEFAULT_VEHICLE = "itm"
 NumberOrRange = float | tuple[float, float]
 
 
-class Reference(Frozen, use_attribute_docstrings=True):
+class Reference(Frozen):
     """Metrics that others measured, printed next to our own; a pair is a range."""
 
     success: NumberOrRange | None = None
@@ -55,7 +56,7 @@ class Reference(Frozen, use_attribute_docstrings=True):
         return {f"{key:g}" if type(key) is float else str(key): value[key] for key in value}
 
 
-class Scenario(Frozen, use_attribute_docstrings=True):
+class Scenario(Frozen):
     """One way to judge a controller: the episodes, their number, and others' metrics.
 
     Units m, s, rad, N, N m, kg.
@@ -266,7 +267,7 @@ class Scenario(Frozen, use_attribute_docstrings=True):
             )
 
 
-class Suite(Frozen, use_attribute_docstrings=True):
+class Suite(Frozen):
     """Scenarios that belong together."""
 
     name: str = Field(pattern=NAME)
@@ -310,7 +311,7 @@ class Suite(Frozen, use_attribute_docstrings=True):
         for name in names:
             if name not in known:
                 raise ConfigError(unknown("scenario", name, known))
-        changes: dict[str, Any] = {}
+        changes: StrDict = {}
         flown_by = ""
         if episodes is not None:
             changes["episodes"] = episodes
