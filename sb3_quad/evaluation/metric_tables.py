@@ -31,6 +31,16 @@ CROSS_TRACK_ERROR = Row("cross-track error", "m")
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
 COURSE_TIME = Row("time of the course", "s")
+# Fields of Reference that are numbers, by name.
+REFERENCED = {
+    "success": SUCCESS,
+    "survival": SURVIVAL,
+    "reward": REWARD,
+    "path": PATH,
+    "final_error": MEDIAN,
+    "flown": FLOWN,
+    "recovery_time": RECOVERY_TIME,
+}
 # The names of rows with times begin like this; in them less is better.
 TIME = "mean time to"
 SETTLING = "settling time"
@@ -40,6 +50,8 @@ HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD, OWN_REWARD}
 MOST_TOLERANCES = 6
 MAIN_TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
+
+NOTHING = Cell()
 
 Cells = Mapping[Row, Cell]  # by the rows they stand in
 
@@ -113,18 +125,13 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
 
 def reference_cells(reference: Reference) -> Cells:
     """Return others' metrics."""
-    numbers = {
-        REWARD: reference.reward,
-        PATH: reference.path,
-        MEDIAN: reference.final_error,
-        FLOWN: reference.flown,
-        RECOVERY_TIME: reference.recovery_time,
-    }
-    shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
-    cells = {row: _printed(number) for row, number in numbers.items() if number is not None}
-    for row, share in shares.items():
-        if share is not None:
-            cells[row] = replace(_printed(share, 100.0), note=reference.note)
+    cells = {}
+    for name, row in REFERENCED.items():
+        number = getattr(reference, name)
+        if row.unit == "%" and number is not None:
+            cells[row] = replace(_printed(number, 100.0), note=reference.note)
+        elif number is not None:
+            cells[row] = _printed(number)
     # Here None has a meaning: never within the tolerance.
     for tolerance, time in reference.time_to.items():
         cells[time_row(tolerance)] = _printed(time)
@@ -140,21 +147,24 @@ def metric_rows(
     """
     # A controller that failed has one cell, which says so.
     failed = {SUCCESS: Cell(words="failed")}
-    ours = [failed if cells is None else cells for cells in measured]
+    ours = [cells or failed for cells in measured]
     others = [*map(reference_cells, references)]
-    none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells is not None)
+    none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells)
     rows = []
     for row in _rows_of(scenario):
-        own = [cells.get(row, Cell()) for cells in ours]
+        own = cells_of(row, ours)
         # A row without any number of ours is left out, whatever others measured.
-        if not any(cell != Cell() for cell in own):
+        if own == [NOTHING] * len(own):
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        for cells in others:
-            own.append(cells.get(row, Cell()))
-        rows.append(replace(row, cells=own))
+        rows.append(replace(row, cells=[*own, *cells_of(row, others)]))
     return rows
+
+
+def cells_of(row: Row, columns: Iterable[Cells]) -> list[Cell]:
+    """Return the cells of a row, empty in the columns that have none."""
+    return [cells.get(row, NOTHING) for cells in columns]
 
 
 def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
@@ -165,17 +175,14 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
         sign = -1.0
     else:
         return list(cells)
-    # The intervals, turned so that more is better; without a number a cell cannot win.
-    ends = np.full((2, len(cells)), -np.inf)
-    for number, cell in enumerate(cells):
-        if cell.value is not None:
-            ends[:, number] = sorted(np.multiply(sign, cell.ends or (cell.value, cell.value)))
+    # The intervals, turned so that more is better; NaN without a number, which cannot win.
+    ends = np.array([cell.ends or (cell.value, cell.value) for cell in cells], np.float64)
+    low, high = np.sort(sign * ends, axis=1).T
     marked = []
     for number, cell in enumerate(cells):
-        best_of_others = np.delete(ends[1], number).max(initial=-np.inf)
+        others = np.fmax.reduce(np.delete(high, number), initial=-np.inf)
         # A cell that is alone is not the best.
-        best = bool(ends[0, number] > best_of_others > -np.inf)
-        marked.append(replace(cell, best=best))
+        marked.append(replace(cell, best=bool(low[number] > others > -np.inf)))
     return marked
 
 
@@ -185,36 +192,40 @@ def overview(results: Results, controllers: Sequence[str]) -> Table:
     :param controllers: labels, in the order of their columns.
     """
     columns = [*map(Column, controllers)]
+    if any(scenario.reference for scenario in results.scenarios):
+        columns.append(Column(results.source, align="left"))
     rows = []
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
         for scenario in scenarios:
             rows += _section(results, controllers, scenario)
-            if scenario.reference and len(columns) == len(controllers):
-                columns.append(Column(results.source, align="left"))
     return Table(columns, rows, title=results.suite, caption=CAPTION)
 
 
 def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -> list[Row]:
     """The rows of a scenario in the overview."""
-    measured = [measured_cells(results, label, scenario) for label in controllers]
-    rows = metric_rows(scenario, measured, scenario.reference.values())
+    rows = scenario_rows(results, controllers, scenario)
+    values = [f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items()]
     section = []
     for row in rows:
-        names = [f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items()]
         # The values of a cell are name enough for its only row.
-        if len(rows) > 1 or not names:
-            names.append(row.name)
-        cells = [*row.cells[: len(controllers)]]
+        names = values if values and len(rows) == 1 else [*values, row.name]
         # All references share a column.
         words = []
         for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
-            if cell != Cell():
+            if cell != NOTHING:
                 words.append(f"{who} {replace(cell, note='').text}")
+        cells = [*row.cells[: len(controllers)]]
         if words:
             cells.append(Cell(words="; ".join(words)))
         section.append(Row(f"  {', '.join(names)}", row.unit, cells))
     return section
+
+
+def scenario_rows(results: Results, labels: Iterable[str], scenario: Scenario) -> list[Row]:
+    """Return the :func:`metric_rows` of a scenario: some controllers, then all references."""
+    measured = [measured_cells(results, label, scenario) for label in labels]
+    return metric_rows(scenario, measured, scenario.reference.values())
 
 
 def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:

@@ -11,11 +11,12 @@ A number that does not exist is None, never NaN.
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 
+from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
 from sb3_quad.base.types import StrDict, StrPath
@@ -31,8 +32,8 @@ WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
 # Columns of episodes.csv that are one array each, and those that are several numbers.
 _COLUMNS = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
 _AXES = {
-    "target": ["x", "y", "z"],
-    "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z".split(),
+    "target": "x y z",
+    "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",
 }
 
 
@@ -105,6 +106,11 @@ class Results(Frozen):
     finished: bool = True
     """whether all flights were flown"""
 
+    @property
+    def colours(self) -> dict[str, str]:
+        """The colours of the controllers in plots, ``#rrggbb``, by label."""
+        return colours_of([record.label for record in self.controllers])
+
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """Return the entry of a controller's label and a scenario's name; None if it failed."""
         for entry in self.entries:
@@ -159,10 +165,10 @@ def _table(folder: Path, entry: Entry) -> pd.DataFrame:
     waypoints = arrays["episode_waypoints"]
     columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
     # Arrays of several numbers become a column for each of them.
-    tolerances = [*map("{:g}".format, arrays["episode_tolerances"])]
+    tolerances = " ".join(map("{:g}".format, arrays["episode_tolerances"]))
     titles = {**_AXES, "time_to": tolerances, "settling_time": tolerances}
     for name, parts in titles.items():
-        for part, values in zip(parts, arrays[f"episode_{name}"].T, strict=True):
+        for part, values in zip(parts.split(), arrays[f"episode_{name}"].T, strict=True):
             columns[f"{name}_{part}"] = values
     columns["overshoot"] = arrays["episode_overshoot"]
     for number, values in enumerate(waypoints.T, 1):
