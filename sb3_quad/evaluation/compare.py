@@ -11,7 +11,7 @@ from sb3_quad.base.validate import validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
-from sb3_quad.evaluation.flights import Reward, fly_settings
+from sb3_quad.evaluation.flights import OwnReward, fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
@@ -50,7 +50,7 @@ def compare(
     tasks: Sequence[Any] = ("target_tracking", "state_recovery"),
     n_flights: int = 240,
     seed: int | None = None,
-    reward: str | Reward | None = None,
+    reward: OwnReward = None,
     thesis_columns: Iterable[str] = (),
     **env_kwargs: Any,
 ) -> Comparison:

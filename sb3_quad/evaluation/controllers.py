@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
@@ -13,7 +14,7 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory
 from sb3_quad.controllers.zips import saved_algorithm
-from sb3_quad.evaluation.flights import Reward
+from sb3_quad.evaluation.flights import OwnReward, Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
@@ -35,6 +36,13 @@ class ControllerSpec:
         """Whether it is an agent in a zip."""
         return self.spec.endswith(".zip")
 
+    @property
+    def kind(self) -> Literal["expert", "model", "factory"]:
+        """What it is, as :class:`~sb3_quad.evaluation.results.ControllerRecord` has it."""
+        if self.is_zip:
+            return "model"
+        return "expert" if self.spec in EXPERTS else "factory"
+
     @cached_property
     def own(self) -> FlightSettings | None:
         """The settings that the agent's zip holds; None: experts, factories, and zips without any.
@@ -44,9 +52,7 @@ class ControllerSpec:
         if not self.is_zip:
             return None
         settings, source = agent_settings(self.spec)
-        if source is None:
-            return None
-        return settings
+        return None if source is None else settings
 
     @property
     def observed(self) -> StrDict:
@@ -119,25 +125,19 @@ def controller_record(spec: ControllerSpec) -> ControllerRecord:
 
     :raises ConfigError: an unknown name, a missing file, a module that cannot be imported.
     """
-    if spec.is_zip:
-        path = Path(spec.spec)
-        return ControllerRecord(
-            label=spec.label,
-            spec=path.name,
-            kind="model",
-            algorithm=saved_algorithm(path),
-            content=hashlib.sha256(path.read_bytes()).hexdigest(),
-        )
-    # Import it now, so that an error shows before anything flies.
-    import_factory(spec.spec, "controller")
-    return ControllerRecord(
-        label=spec.label,
-        spec=spec.spec,
-        kind="expert" if spec.spec in EXPERTS else "factory",
-    )
+    record = ControllerRecord(label=spec.label, spec=spec.spec, kind=spec.kind)
+    if not spec.is_zip:
+        # Import it now, so that an error shows before anything flies.
+        import_factory(spec.spec, "controller")
+        return record
+    path = Path(spec.spec)
+    algorithm = saved_algorithm(path)
+    content = hashlib.sha256(path.read_bytes()).hexdigest()
+    changes = {"spec": path.name, "algorithm": algorithm, "content": content}
+    return record.model_copy(update=changes)
 
 
-def load_reward(reward: str | Reward | None) -> Reward | None:
+def load_reward(reward: OwnReward) -> Reward | None:
     """Return a reward of the user's own.
 
     :param reward: a function, returned as it is; or ``package.module:function``.

@@ -42,6 +42,10 @@ rewards (n,).
 """
 
 
+OwnReward: TypeAlias = str | Reward | None
+"""A reward of your own as it is given: a function, ``package.module:function``, or None: none."""
+
+
 @dataclass(frozen=True, eq=False)
 class Flights:
     """The metrics of n episodes, one per row."""

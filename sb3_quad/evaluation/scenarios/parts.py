@@ -13,6 +13,7 @@ from sb3_quad.base.validate import Frozen
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 Frame = Literal["world", "body"]
 Factor = Annotated[float, Field(ge=0.1, le=10)]
 
@@ -56,17 +57,6 @@ class VectorDistribution(OneOf):
     magnitude: NonNegativeFloat | None = None
     """length, in the same unit; the direction is random"""
 
-    @property
-    def largest(self) -> float:
-        """The greatest length that is likely: for ``std``, three standard deviations in each
-        component.
-        """
-        if self.value is not None:
-            return math.hypot(*self.value)
-        if self.magnitude is not None:
-            return self.magnitude
-        return 3.0 * math.sqrt(3.0) * (self.std or 0.0)
-
 
 ZERO = VectorDistribution(value=(0.0, 0.0, 0.0))
 
@@ -78,7 +68,7 @@ class Attitude(OneOf):
 
     ways = ("quaternion", "tilt", "distribution")
 
-    quaternion: tuple[float, float, float, float] | None = None
+    quaternion: Quaternion | None = None
     """w, x, y, z, body to world; is normalised"""
     tilt: Annotated[float, Field(ge=0, le=180)] | None = None
     """angle between body z and world z, deg; about a random horizontal axis"""
@@ -99,9 +89,7 @@ class Attitude(OneOf):
 
     @field_validator("quaternion")
     @classmethod
-    def _not_zero(
-        cls, value: tuple[float, float, float, float] | None
-    ) -> tuple[float, float, float, float] | None:
+    def _not_zero(cls, value: Quaternion | None) -> Quaternion | None:
         if value is not None and math.hypot(*value) < 1e-6:
             raise ValueError("must not be zero")
         return value
