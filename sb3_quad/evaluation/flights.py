@@ -230,7 +230,7 @@ def _fly_fleet(
     observation = fleet.reset(plan.start)
     control_step = fleet.vehicle.control_step
     state = fleet.true_state()
-    position = state.position.copy()
+    position = state.position
     course = Waypoints(plan, state.n)
     arrivals = Arrivals(tolerances, course.to_last(state.distance))
     motion = Motion(state, control_step)
@@ -252,33 +252,33 @@ def _fly_fleet(
             raise ControllerError(f"{error}, after {(step - 1) * control_step:.2f} s") from error
         for hook in hooks:
             hook.before_step(state, observation, fleet.wrench, flying)
-        result = fleet.step(actions, flying)
-        observation = result.observation
+        observation, rewards = fleet.step(actions, flying)
+        outcome = fleet.outcome
         state = fleet.true_state()
 
         # Sums and last values count also for the flights that this step has ended.
-        flights.reward[flying] += result.reward[flying]
+        flights.reward[flying] += rewards[flying]
         if reward is not None:
             flights.own_reward[flying] += _ask_reward(reward, state, actions)[flying]
         way = np.linalg.norm(state.position - position, axis=1)
         flights.path_length[flying] += way[flying]
-        position = state.position.copy()
-        flights.final_error[flying] = result.distance[flying]
-        flights.success[flying] = result.success[flying]
+        position = state.position
+        flights.final_error[flying] = outcome["distance"][flying]
+        flights.success[flying] = outcome["success"][flying]
+        flights.collision[flying] = outcome["collision"][flying]
         flights.length[flying] = step
         flights.flown[flying] = time
-        arrivals.see(time, course.to_last(result.distance), flying)
-        flights.collision[flying & result.lost & result.collided] = True
+        arrivals.see(time, course.to_last(outcome["distance"]), flying)
 
         # From here on, only the flights that continue count.
-        flying &= ~result.lost
+        flying &= outcome["truncated"]
         motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
         # Whoever has reached a waypoint sees the next one from the next step on.
-        onward = course.see(time, result.distance, flying)
+        onward = course.see(time, outcome["distance"], flying)
         if onward.size:
             observation = fleet.set_targets(onward, course.targets(onward))
 
