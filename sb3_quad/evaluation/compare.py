@@ -30,19 +30,14 @@ class Comparison(dict[str, dict[str, Metrics]]):
     ``tables`` (one :class:`~sb3_quad.evaluation.tables.Table` for each task) are what is shown.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.tables: list[Table] = []
+    tables: list[Table]
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.tables))
 
     def _repr_markdown_(self) -> str:
         # Notebooks render this; a table in Markdown has no title of its own.
-        parts = []
-        for table in self.tables:
-            parts += [f"**{table.title}**", table.markdown()]
-        return "\n\n".join(parts)
+        return "\n\n".join(f"**{table.title}**\n\n{table.markdown()}" for table in self.tables)
 
 
 def compare(
@@ -105,22 +100,23 @@ def compare(
             controller, flown.vehicle, "controller", layout=flown.rotor_layout
         )
 
-    comparison = Comparison()
+    comparison = Comparison({label: {} for label in pilots})
+    comparison.tables = []
     for task in tasks:
         name = in_words(task)
         metrics = {}
         for label, pilot in pilots.items():
             how = settings[label].with_changes(task=task)
             metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
-            comparison.setdefault(label, {})[name] = metrics[label]
-        comparison.tables.append(_task_table(name, metrics, settings, thesis_columns))
+            comparison[label][name] = metrics[label]
+        comparison.tables.append(_task_table(name, metrics, settings, thesis_columns, n_flights))
     return comparison
 
 
 def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, FlightSettings]:
     """Return how each controller flies, the task excepted."""
     shared: StrDict = {}
-    own: dict[str, StrDict] = {}
+    own = {}
     for label, controller in controllers.items():
         known = _own_settings(controller)
         if known is not None:
@@ -157,13 +153,10 @@ def _task_table(
     metrics: Mapping[str, Metrics],
     settings: Mapping[str, FlightSettings],
     thesis_columns: Iterable[str],
+    n_flights: int,
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task."""
-    vehicles = {}
-    true_state = True
-    for label, how in settings.items():
-        vehicles[label] = first_vehicle(how.vehicle)
-        true_state &= not how.noise
+    vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
     first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
     scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
@@ -176,9 +169,8 @@ def _task_table(
                 references.append(scenario.reference[name])
     rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
 
-    n_flights = next(iter(metrics.values())).n
     title = f"{task}: {n_flights} fresh episodes, the same for all"
-    if true_state:
+    if not any(how.noise for how in settings.values()):
         title += ", true state"
     caption = CAPTION
     if any(vehicle != first for vehicle in others):

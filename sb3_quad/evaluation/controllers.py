@@ -160,14 +160,15 @@ def load_reward(reward: OwnReward) -> Reward | None:
 def _parse(text: str) -> ControllerSpec:
     label, equals, spec = text.partition("=")
     # An equals sign after a slash belongs to the path.
-    if equals and "/" not in label and "\\" not in label:
+    if equals and not {"/", "\\"} & {*label}:
         if not label or not spec:
             raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
         return ControllerSpec(label, agent_path(spec))
-    path = agent_path(text)
+    spec = agent_path(text)
+    label = spec
     # A name or a run folder has become a path: its last part is the label.
-    if path != text:
-        return ControllerSpec(Path(text).name, path)
-    if path.endswith(".zip"):
-        return ControllerSpec(Path(path).stem, path)
-    return ControllerSpec(path, path)
+    if spec != text:
+        label = Path(text).name
+    elif spec.endswith(".zip"):
+        label = Path(spec).stem
+    return ControllerSpec(label, spec)

@@ -310,13 +310,13 @@ def _at_start(
         settling_time=dict(zip(arrivals.tolerances, arrivals.settling_time, strict=True)),
         overshoot=arrivals.overshoot,
         path_length=np.zeros(n),
-        final_error=state.distance.copy(),
+        final_error=state.distance,
         final_offset=np.full((n, 3), np.nan),
         recovery_time=motion.recovery_time,
         cross_track_error=motion.cross_track_error,
         waypoint_times=course.times,
-        start=state.array[:13].T.copy(),
-        target=state.target.copy(),
+        start=state.array[:13].T,
+        target=state.target,
     )
 
 
@@ -417,7 +417,7 @@ class Motion:
         way = state.target - state.position
         length = np.linalg.norm(way, axis=1, keepdims=True)
         self._control_step = control_step
-        self._start = state.position.copy()
+        self._start = state.position
         self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
         self._since = np.zeros(state.n)  # when the present stable time began
         self._stable = np.ones(state.n, bool)

@@ -89,7 +89,7 @@ class Failure(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[5] = 5
+    schema_version: Literal[6] = 6
     suite: str
     description: str
     source: str = "reference"
@@ -113,10 +113,8 @@ class Results(Frozen):
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """Return the entry of a controller's label and a scenario's name; None if it failed."""
-        for entry in self.entries:
-            if entry.name == (scenario, controller):
-                return entry
-        return None
+        entries = {entry.name: entry for entry in self.entries}
+        return entries.get((scenario, controller))
 
 
 def load_results(folder: StrPath) -> Results:
