@@ -234,7 +234,8 @@ def _fly_fleet(
     course = Waypoints(plan, state.n)
     arrivals = Arrivals(tolerances, course.to_last(state.distance))
     motion = Motion(state, control_step)
-    flights = _at_start(state, plan, arrivals, motion, course)
+    last = np.zeros_like(fleet.outcome)
+    flights = _at_start(state, last, plan, arrivals, motion, course)
     if reward is not None:
         flights.own_reward[:] = 0.0
     flying = flights.survival  # the same array: a flight survives until it is lost
@@ -263,10 +264,7 @@ def _fly_fleet(
         way = np.linalg.norm(state.position - position, axis=1)
         flights.path_length[flying] += way[flying]
         position = state.position
-        flights.final_error[flying] = outcome["distance"][flying]
-        flights.success[flying] = outcome["success"][flying]
-        flights.collision[flying] = outcome["collision"][flying]
-        flights.length[flying] = step
+        last[flying] = outcome[flying]
         flights.flown[flying] = time
         arrivals.see(time, course.to_last(outcome["distance"]), flying)
 
@@ -291,26 +289,31 @@ def _fly_fleet(
 
 
 def _at_start(
-    state: QuadcopterState, plan: Plan, arrivals: "Arrivals", motion: "Motion", course: "Waypoints"
+    state: QuadcopterState,
+    last: Any,
+    plan: Plan,
+    arrivals: "Arrivals",
+    motion: "Motion",
+    course: "Waypoints",
 ) -> Flights:
-    """The metrics before the first step; arrivals, motion and course update theirs in place."""
+    """The metrics before the first step; the other arguments update theirs in place."""
     n = state.n
     # A course has no single straight line to deviate from.
     if len(plan.waypoints):
         motion.cross_track_error = np.full(n, np.nan)
     return Flights(
-        success=np.zeros(n, bool),
+        success=last["success"],
         survival=np.ones(n, bool),
-        collision=np.zeros(n, bool),
+        collision=last["collision"],
         reward=np.zeros(n),
         own_reward=np.full(n, np.nan),
-        length=np.zeros(n, dtype=np.int64),
+        length=last["length"],
         flown=np.zeros(n),
         time_to=dict(zip(arrivals.tolerances, arrivals.time_to, strict=True)),
         settling_time=dict(zip(arrivals.tolerances, arrivals.settling_time, strict=True)),
         overshoot=arrivals.overshoot,
         path_length=np.zeros(n),
-        final_error=state.distance,
+        final_error=last["distance"],
         final_offset=np.full((n, 3), np.nan),
         recovery_time=motion.recovery_time,
         cross_track_error=motion.cross_track_error,

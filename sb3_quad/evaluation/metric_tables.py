@@ -31,7 +31,7 @@ RECOVERY_TIME = Row("recovery time", "s", verb="recover")
 CROSS_TRACK_ERROR = Row("cross-track error", "m")
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
-COURSE_TIME = Row("time of the course", "s")
+COURSE_TIME = Row("time of the course", "s", verb="complete")
 # The rows of fields of Metrics; those of Reference have the same names.
 ROWS = {
     "success": SUCCESS,
@@ -46,9 +46,6 @@ ROWS = {
     "final_error_95": QUANTILE,
     "recovery_time": RECOVERY_TIME,
 }
-# The names of rows with times begin like this; in them less is better.
-TIME = "mean time to"
-SETTLING = "settling time"
 # Flights that are lost end early, which makes other rows incomparable.
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD, OWN_REWARD}
@@ -63,12 +60,12 @@ Cells = Mapping[Row, Cell]  # by the rows they stand in
 
 def time_row(tolerance: float | str) -> Row:
     """Return the row with the time to a tolerance, m."""
-    return Row(f"{TIME} {float(tolerance):g} m", "s", verb="arrive")
+    return Row(f"mean time to {float(tolerance):g} m", "s", verb="arrive")
 
 
 def settling_row(tolerance: float) -> Row:
     """Return the row with the settling time of a tolerance, m."""
-    return Row(f"{SETTLING} ({tolerance:g} m)", "s", verb="settle")
+    return Row(f"settling time ({tolerance:g} m)", "s", verb="settle")
 
 
 def estimate_cell(
@@ -173,7 +170,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a row, the best marked if its interval is apart from all others'."""
     if row in HIGHER_IS_BETTER:
         sign = 1.0
-    elif row == COURSE_TIME or row.name.startswith((TIME, SETTLING)):
+    elif row.verb:
         sign = -1.0
     else:
         return list(cells)

@@ -89,7 +89,7 @@ class Row:
     """A metric with its unit, and a cell for each column; without cells it is a heading.
 
     :param decimals: of its cells.
-    :param verb: what the flights do whose mean time it holds.
+    :param verb: what the flights do whose mean time it holds, of which less is better.
     """
 
     name: str

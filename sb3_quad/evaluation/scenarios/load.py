@@ -14,7 +14,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import validate
-from sb3_quad.base.yaml_files import YamlFolder, parse_yaml
+from sb3_quad.base.yaml_files import YamlFolder, parse_keys
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 from sb3_quad.vehicles.vehicle import VEHICLES
 
@@ -67,8 +67,8 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     :param folder: what the paths of vehicle files are relative to.
     :raises ConfigError: see :func:`load_suite`.
     """
-    data = parse_yaml(content, where)
-    entries = data.get("scenarios") if isinstance(data, dict) else None
+    data = parse_keys(content, where)
+    entries = data.get("scenarios")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise ConfigError(
             f"{where}: must hold 'name' and a list 'scenarios', each with keys and values"

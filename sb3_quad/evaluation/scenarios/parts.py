@@ -78,14 +78,13 @@ class Attitude(OneOf):
     @model_validator(mode="before")
     @classmethod
     def _from_word(cls, data: Any) -> Any:
-        if data == "level":
-            return {"tilt": 0.0}
-        if data == "uniform":
-            return {"distribution": "uniform"}
-        if isinstance(data, str):
-            names = unknown("attitude", data, ("level", "uniform"))
+        words = {"level": {"tilt": 0.0}, "uniform": {"distribution": "uniform"}}
+        if not isinstance(data, str):
+            return data
+        if data not in words:
+            names = unknown("attitude", data, words)
             raise ValueError(f"{names}, or {{quaternion: …}}, or {{tilt: …}}")
-        return data
+        return words[data]
 
     @field_validator("quaternion")
     @classmethod
@@ -197,12 +196,13 @@ class VehicleChanges(Frozen):
         """
         if self == VehicleChanges():
             return vehicle
-        low, high = vehicle.thrust_limits
+        inertia = np.multiply(vehicle.inertia, self.inertia)
+        thrust_limits = np.divide(vehicle.thrust_limits, self.mass)
         return vehicle.model_copy(
             update={
                 "mass": vehicle.mass * self.mass,
-                "inertia": tuple((np.array(vehicle.inertia) * self.inertia).tolist()),
-                "thrust_limits": (low / self.mass, high / self.mass),
+                "inertia": tuple(inertia.tolist()),
+                "thrust_limits": tuple(thrust_limits.tolist()),
                 "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
                 "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,
                 "delay": vehicle.delay if self.delay is None else self.delay,
