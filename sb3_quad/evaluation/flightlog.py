@@ -145,7 +145,7 @@ class Track(NamedTuple):
         """The targets, one after the other, (n, 3), m."""
         # The first sample of each target.
         changed = np.diff(self.target, axis=0).any(axis=1)
-        return self.target[np.append(True, changed)]
+        return np.compress(np.append(True, changed), self.target, axis=0)
 
 
 def read_tracks(path: StrPath) -> list[Track]:
@@ -156,7 +156,13 @@ def read_tracks(path: StrPath) -> list[Track]:
     arrays = read_arrays(path)
     tracks = []
     for number, samples in enumerate(arrays.get("samples", ())):
-        rows = [arrays[name][number, :samples] for name in ("position", "target", "wrench")]
-        lost = LOST.get(str(arrays["episode_outcome"][number]), "")
-        tracks.append(Track(arrays["time"][:samples], *rows, lost))
+        flown = slice(samples)
+        track = Track(
+            arrays["time"][flown],
+            arrays["position"][number, flown],
+            arrays["target"][number, flown],
+            arrays["wrench"][number, flown],
+            LOST.get(str(arrays["episode_outcome"][number]), ""),
+        )
+        tracks.append(track)
     return tracks

@@ -80,7 +80,7 @@ def _measures(curves: Sequence[Curve], show: Sequence[str]) -> list[str]:
     losses = [name for name in present if name.endswith("loss")]
     if not show:
         show = ["success", "reward"] if "success" in present else ["reward"]
-    measures = []
+    measures: list[str] = []
     for name in show:
         chosen = losses if name == "losses" else [name]
         if not chosen or not {*chosen} <= {*present}:

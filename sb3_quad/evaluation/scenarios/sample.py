@@ -108,8 +108,8 @@ def _vectors(distribution: VectorDistribution, generators: Generators) -> FloatA
 def _quaternions(attitude: Attitude, generators: Generators) -> FloatArray:
     n = len(generators)
     if attitude.quaternion is not None:
-        length = np.linalg.norm(attitude.quaternion)
-        return np.tile(attitude.quaternion / length, (n, 1))
+        quaternion = np.array(attitude.quaternion)
+        return np.tile(quaternion / np.linalg.norm(quaternion), (n, 1))
     if not attitude.tilt:
         return np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     # A turn by the tilt about a random horizontal axis.

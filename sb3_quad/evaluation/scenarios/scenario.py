@@ -241,7 +241,7 @@ class Scenario(Frozen):
         vectors = [self.start.velocity, self.start.body_rates]
         for wrench in self.wrenches:
             vectors += [wrench.force, wrench.torque]
-        random = [vector.std or vector.magnitude for vector in vectors]
+        random: list[Any] = [vector.std or vector.magnitude for vector in vectors]
         attitude = self.start.attitude
         random += [attitude.distribution, attitude.tilt, self.target.distance]
         return not any([*random, self.randomize, self.vehicles])
