@@ -100,7 +100,7 @@ def compare(
             controller, flown.vehicle, "controller", layout=flown.rotor_layout
         )
 
-    comparison = Comparison({label: {} for label in pilots})
+    comparison = Comparison()
     comparison.tables = []
     for task in tasks:
         name = in_words(task)
@@ -108,7 +108,7 @@ def compare(
         for label, pilot in pilots.items():
             how = settings[label].with_changes(task=task)
             metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
-            comparison[label][name] = metrics[label]
+            comparison.setdefault(label, {})[name] = metrics[label]
         comparison.tables.append(_task_table(name, metrics, settings, thesis_columns, n_flights))
     return comparison
 
@@ -124,7 +124,11 @@ def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, Flig
             own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
             # The first agent decides for all that do not say how they fly.
             if not shared:
-                shared = {key: getattr(known, key) for key in ("vehicle", "vehicles", "noise")}
+                shared = {
+                    "vehicle": known.vehicle,
+                    "vehicles": known.vehicles,
+                    "noise": known.noise,
+                }
     settings = {}
     for label in controllers:
         how = FlightSettings(**own.get(label, shared))
@@ -156,7 +160,11 @@ def _task_table(
     n_flights: int,
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task."""
-    vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
+    vehicles = {}
+    true_state = True
+    for label, how in settings.items():
+        vehicles[label] = first_vehicle(how.vehicle)
+        true_state &= not how.noise
     first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
     scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
@@ -170,10 +178,10 @@ def _task_table(
     rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
 
     title = f"{task}: {n_flights} fresh episodes, the same for all"
-    if not any(how.noise for how in settings.values()):
+    if true_state:
         title += ", true state"
     caption = CAPTION
-    if any(vehicle != first for vehicle in others):
+    if others.count(first) < len(others):
         for label, vehicle in vehicles.items():
             caption += f"; {label} flies {vehicle.name}"
     return Table(columns, rows, title=title, caption=caption)

@@ -52,7 +52,9 @@ class ControllerSpec:
         if not self.is_zip:
             return None
         settings, source = agent_settings(self.spec)
-        return None if source is None else settings
+        if source is None:
+            return None
+        return settings
 
     @property
     def observed(self) -> StrDict:

@@ -3,6 +3,7 @@
 """
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -67,16 +68,16 @@ class Fleet:
     @property
     def outcome(self) -> Any:
         """How the rows are, (n,), see :data:`~sb3_quad.simulation.kernel.OUTCOME`."""
-        return np.concatenate([batch.outcome for batch in self._batches])
+        return np.concatenate([*map(attrgetter("outcome"), self._batches)])
 
     @property
     def wrench(self) -> FloatArray:
         """The external wrench on all rows in this control step, without drag, (n, WRENCH_SIZE)."""
-        return np.hstack([batch.total_wrench() for batch in self._batches]).T
+        return np.hstack([*map(QuadcopterBatch.total_wrench, self._batches)]).T
 
     def true_state(self) -> QuadcopterState:
         """The true state of all rows, of its own memory."""
-        return QuadcopterState.concatenate([batch.true_state() for batch in self._batches])
+        return QuadcopterState.concatenate([*map(QuadcopterBatch.true_state, self._batches)])
 
     def close(self) -> None:
         """Release the environments, where they hold anything."""
@@ -94,7 +95,7 @@ class PyBulletFleet(Fleet):
 
         self._seeds = seeds
         self._envs = [QuadcopterEnv(**dict(settings)) for _ in seeds]
-        return [env.batch for env in self._envs]
+        return [*map(attrgetter("batch"), self._envs)]
 
     def reset(self, start: Start) -> Float32Array:
         for row, env in enumerate(self._envs):

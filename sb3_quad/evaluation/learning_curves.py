@@ -12,7 +12,7 @@ import pandas as pd
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line, read_arrays
-from sb3_quad.base.types import StrPath
+from sb3_quad.base.types import StrDict, StrPath
 
 # The arrays of a file, (k, episodes), by what they are called here. Environments of others may not
 # report the last two.
@@ -53,7 +53,7 @@ def read_curve(run: StrPath, task: str | None = None) -> Curve:
     arrays = read_arrays(path)
     # A file of another program may hold anything, which pandas refuses to put into one table.
     try:
-        columns = {name: arrays[name].astype(np.float64) for name in ("timesteps", "seconds")}
+        columns: StrDict = {"timesteps": arrays["timesteps"], "seconds": arrays["seconds"]}
         for name, key in EPISODES.items():
             if key in arrays or name == "reward":
                 columns[name] = arrays[key].mean(axis=1)
@@ -67,5 +67,5 @@ def read_curve(run: StrPath, task: str | None = None) -> Curve:
         raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
     if table.empty:
         raise ConfigError(f"{path}: cannot be read (it holds no evaluations)")
-    measures = {name: table[name].to_numpy() for name in table}
+    measures = dict(zip(table, table.to_numpy().T, strict=True))
     return Curve(measures.pop("timesteps"), measures.pop("seconds"), measures)

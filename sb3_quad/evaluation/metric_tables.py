@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,7 @@ def metric_cells(metrics: Metrics) -> Cells:
     What does not exist of these flights, such as the error of survivors without any, has no cell.
     """
     values: dict[Row, Any] = {row: getattr(metrics, name) for name, row in ROWS.items()}
-    near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
+    near = arrival_tolerance(map(attrgetter("tolerance"), metrics.arrivals))
     for arrival in metrics.arrivals:
         values[time_row(arrival.tolerance)] = arrival
         # Settling and overshoot are shown of one tolerance only.
@@ -191,7 +192,7 @@ def overview(results: Results, controllers: Sequence[str]) -> Table:
     :param controllers: labels, in the order of their columns.
     """
     columns = [*map(Column, controllers)]
-    if any(scenario.reference for scenario in results.scenarios):
+    if any(map(attrgetter("reference"), results.scenarios)):
         columns.append(Column(results.source, align="left"))
     rows = []
     for heading, scenarios in scenario_groups(results):

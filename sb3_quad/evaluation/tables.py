@@ -5,6 +5,7 @@ intervals, or words.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape as escape_html
+from operator import attrgetter
 from typing import Literal
 
 import rich.console
@@ -127,13 +128,16 @@ class Table:
         for row in self.rows:
             texts = [f"**{cell.text}**" if cell.best else cell.text for cell in row.cells]
             rows.append([row.heading, *texts])
-        # The bar that divides cells may not be in them.
-        lines = [" | ".join(text.replace("|", "/") for text in row) for row in rows]
-        return escape_html("\n".join(f"| {line} |" for line in lines), quote=False)
+        lines = []
+        for texts in rows:
+            # The bar that divides cells may not be in them.
+            line = "\t".join(texts).replace("|", "/").replace("\t", " | ")
+            lines.append(f"| {line} |")
+        return escape_html("\n".join(lines), quote=False)
 
     @property
     def _headings(self) -> list[str]:
-        return [column.heading for column in self.columns]
+        return [*map(attrgetter("heading"), self.columns)]
 
     def __str__(self) -> str:
         """The table as plain text."""

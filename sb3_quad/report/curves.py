@@ -76,14 +76,14 @@ def _measures(curves: Sequence[Curve], show: Sequence[str]) -> list[str]:
     """The measures that get a row of panels."""
     # Runs of different algorithms have different losses: all of them are shown.
     table = pd.concat([pd.DataFrame(dict(curve.measures)) for curve in curves])
-    present = [*table.dropna(axis="columns", how="all")]
-    losses = [name for name in present if name.endswith("loss")]
+    present = table.dropna(axis="columns", how="all")
+    losses = [*present.filter(regex="loss$")]
     if not show:
         show = ["success", "reward"] if "success" in present else ["reward"]
     measures: list[str] = []
     for name in show:
         chosen = losses if name == "losses" else [name]
-        if not chosen or not {*chosen} <= {*present}:
+        if not chosen or not {*chosen} <= {*present.columns}:
             raise ConfigError(f"{name}: the runs' evaluations hold none")
         measures += chosen
     return measures

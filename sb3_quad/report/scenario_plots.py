@@ -1,6 +1,7 @@
 """The plots of a scenario: paths, times to its target, distances from it, what ``vary`` changes."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ def arrivals_plot(
     width = 0.75 / len(metrics)
     # A group of bars at each tolerance, one for each controller.
     for number, (label, measured) in enumerate(metrics.items()):
-        value, low, high = interval_ends([arrival.time for arrival in measured.arrivals])
+        value, low, high = interval_ends([*map(attrgetter("time"), measured.arrivals)])
         axes.bar(
             places + (number - 0.5 * (len(metrics) - 1)) * width,
             value,
@@ -65,7 +66,7 @@ def arrivals_plot(
             yerr=np.stack([value - low, high - value]),
             error_kw={"ecolor": INK, "elinewidth": 0.9, "capsize": 2},
         )
-    axes.set_xticks(places, [f"{tolerance:g}" for tolerance in scenario.tolerances])
+    axes.set_xticks(places, [*map("{:g}".format, scenario.tolerances)])
     axes.grid(axis="x", visible=False)
     legend(figure)
     caption = (
@@ -136,7 +137,7 @@ def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
     """Times, (k,), and the median, least and greatest error, (3, k); NaN where it is infinite."""
     longest = max(tracks, key=lambda track: len(track.times))
     # A flight that has ended early is lost, infinitely far away.
-    errors = pd.DataFrame([track.error for track in tracks]).fillna(np.inf)
+    errors = pd.DataFrame(map(attrgetter("error"), tracks)).fillna(np.inf)
     stride = -(-errors.shape[1] // LINE_POINTS)
     ends = np.quantile(errors, (0.5, 0.0, 1.0), axis=0, method="higher")[:, ::stride]
     return longest.times[::stride], np.where(np.isinf(ends), np.nan, ends)
@@ -155,7 +156,9 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
         spread = "mean, least and greatest over the other quantities"
     plots = []
     for number, key in enumerate(keys):
-        name = f"{group}_success" if len(keys) == 1 else f"{group}_{number}_success"
+        name = f"{group}_success"
+        if len(keys) > 1:
+            name = f"{group}_{number}_success"
         figure, axes = new_axes(axis_label(key, scenarios[0]), "success (%)")
         for label, flown in table.groupby("label", sort=False):
             shares = flown.groupby(key).agg({"success": "mean", "low": "min", "high": "max"})

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
+from operator import attrgetter
 from typing import Annotated, Any
 
 from pydantic import Field, PositiveFloat, ValidationError, field_validator, model_validator
@@ -323,7 +324,7 @@ class Suite(Frozen):
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = Counter(scenario.name for scenario in self.scenarios)
+        names = Counter(map(attrgetter("name"), self.scenarios))
         for name, times in names.items():
             if times > 1:
                 raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
