@@ -355,8 +355,10 @@ class Arrivals:
         self._limits = np.array(tolerances)[:, None]
         self.time_to = np.where(distance <= self._limits, 0.0, np.nan)
         self.settling_time = self.time_to.copy()
-        # A view, which shows the arrivals that follow.
-        self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
+        self._first = np.full(len(distance), np.nan)
+        if tolerances:
+            # A view, which shows the arrivals that follow.
+            self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
         self.overshoot = np.where(np.isnan(self._first), np.nan, distance)
 
     def see(self, time: float, distance: FloatArray, flying: BoolArray) -> None:
