@@ -3,7 +3,7 @@ backend.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -14,11 +14,11 @@ from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices
 from sb3_quad.vehicles.vehicle import Vehicle
 
-RADIUS = 0.5  # m
 Generators = Sequence[np.random.Generator]  # one for each episode
 
 
-class Plan(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Plan:
     """The events of n episodes, whoever flies them.
 
     :param start: replaces the environments' own sample: any of position, quaternion, velocity,
@@ -29,10 +29,10 @@ class Plan(NamedTuple):
     :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
     """
 
-    start: Mapping[str, FloatArray] = {}
-    wrenches: Mapping[int, FloatArray] = {}
-    waypoints: FloatArray = np.zeros((0, 3))
-    radius: float = RADIUS
+    start: Mapping[str, FloatArray] = field(default_factory=dict)
+    wrenches: Mapping[int, FloatArray] = field(default_factory=dict)
+    waypoints: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    radius: float = 0.5
 
 
 def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
@@ -59,7 +59,7 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     vehicle = scenario.nominal_vehicle()
     wrenches = sample_wrenches(scenario.wrenches, vehicle, scenario.steps, generators)
     waypoints = np.array(target.waypoints or ()).reshape(-1, 3)
-    return Plan(start, wrenches, waypoints, target.radius or RADIUS)
+    return Plan(start, wrenches, waypoints, target.radius or Plan.radius)
 
 
 def sample_wrenches(
