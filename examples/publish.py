@@ -330,7 +330,7 @@ def write_card(
         # A recovery begins at its target, so times to it say nothing.
         if task == RECOVERY:
             cells |= dict.fromkeys(TIMES, Cell(words="–"))
-        rows.append(Row(task, "", [cells[row] for row in SHOWN]))
+        rows.append(Row(task, "", [cells.get(row, Cell(words="–")) for row in SHOWN]))
     columns = [Column(row.heading) for row in SHOWN]
     known = {key: settings[key] for key in ObservationSettings.model_fields if key in settings}
     seen = ObservationSettings.model_validate(known).model_dump(exclude_defaults=True)

@@ -19,7 +19,7 @@ import sb3_quad
 
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
-DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
+DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".mplstyle", ".js", ".md", ".zip"}
 # Extras in the environments of make test-zoo and make docs, and one that most have anyway.
 APART = {"zoo", "ray", "track", "docs", "pybullet"}
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")

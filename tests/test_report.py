@@ -181,7 +181,8 @@ def test_the_page_is_small_and_says_what_was_flown_when_and_by_which_version(fol
     flown = results.model_copy(
         update={"controllers": [agent, *results.controllers[1:]], "failures": [failure]}
     )
-    text = render("title", facts(flown), sections(flown, folder))
+    content = {"title": "title", "facts": facts(flown), "sections": sections(flown, folder)}
+    text = render("page.html.j2", **content, pictures="figures")
     (day,) = {datetime.date.fromisoformat(entry.date) for entry in results.entries}
     assert (
         f"flown {day} by sb3_quad {results.package_version}" in text and agent.content[:12] in text

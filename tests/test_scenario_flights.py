@@ -271,4 +271,4 @@ def test_intervals_hold_the_value_and_narrow_with_n():
     wide, narrow = mean(values[:40]), mean(values)
     assert wide.high - wide.low > narrow.high - narrow.low
     assert (narrow.high - narrow.low) / 2 == pytest.approx(1.96 * values.std() / 20, rel=0.1)
-    assert mean([np.nan, 2.0]).n == 1 and mean([np.nan]) is None
+    assert mean(np.array([np.nan, 2.0])).n == 1 and mean(np.array([np.nan])) is None

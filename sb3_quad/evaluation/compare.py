@@ -6,11 +6,12 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
-from sb3_quad.evaluation.flights import Reward, fly_settings
+from sb3_quad.evaluation.flights import OwnReward, fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
@@ -29,27 +30,22 @@ class Comparison(dict[str, dict[str, Metrics]]):
     ``tables`` (one :class:`~sb3_quad.evaluation.tables.Table` for each task) are what is shown.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.tables: list[Table] = []
+    tables: list[Table]
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.tables))
 
     def _repr_markdown_(self) -> str:
         # Notebooks render this; a table in Markdown has no title of its own.
-        parts = []
-        for table in self.tables:
-            parts += [f"**{table.title}**", table.markdown()]
-        return "\n\n".join(parts)
+        return "\n\n".join(f"**{table.title}**\n\n{table.markdown()}" for table in self.tables)
 
 
 def compare(
-    controllers: Mapping[str, Any],
+    controllers: StrMapping,
     tasks: Sequence[Any] = ("target_tracking", "state_recovery"),
     n_flights: int = 240,
     seed: int | None = None,
-    reward: str | Reward | None = None,
+    reward: OwnReward = None,
     thesis_columns: Iterable[str] = (),
     **env_kwargs: Any,
 ) -> Comparison:
@@ -105,6 +101,7 @@ def compare(
         )
 
     comparison = Comparison()
+    comparison.tables = []
     for task in tasks:
         name = in_words(task)
         metrics = {}
@@ -112,16 +109,14 @@ def compare(
             how = settings[label].with_changes(task=task)
             metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
             comparison.setdefault(label, {})[name] = metrics[label]
-        comparison.tables.append(_task_table(name, metrics, settings, thesis_columns))
+        comparison.tables.append(_task_table(name, metrics, settings, thesis_columns, n_flights))
     return comparison
 
 
-def _settings(
-    controllers: Mapping[str, Any], env_kwargs: Mapping[str, Any]
-) -> dict[str, FlightSettings]:
+def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, FlightSettings]:
     """Return how each controller flies, the task excepted."""
-    shared: dict[str, Any] = {}
-    own: dict[str, dict[str, Any]] = {}
+    shared: StrDict = {}
+    own = {}
     for label, controller in controllers.items():
         known = _own_settings(controller)
         if known is not None:
@@ -129,7 +124,11 @@ def _settings(
             own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
             # The first agent decides for all that do not say how they fly.
             if not shared:
-                shared = {key: getattr(known, key) for key in ("vehicle", "vehicles", "noise")}
+                shared = {
+                    "vehicle": known.vehicle,
+                    "vehicles": known.vehicles,
+                    "noise": known.noise,
+                }
     settings = {}
     for label in controllers:
         how = FlightSettings(**own.get(label, shared))
@@ -158,6 +157,7 @@ def _task_table(
     metrics: Mapping[str, Metrics],
     settings: Mapping[str, FlightSettings],
     thesis_columns: Iterable[str],
+    n_flights: int,
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task."""
     vehicles = {}
@@ -177,12 +177,11 @@ def _task_table(
                 references.append(scenario.reference[name])
     rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
 
-    n_flights = next(iter(metrics.values())).n
     title = f"{task}: {n_flights} fresh episodes, the same for all"
     if true_state:
         title += ", true state"
     caption = CAPTION
-    if any(vehicle != first for vehicle in others):
+    if others.count(first) < len(others):
         for label, vehicle in vehicles.items():
             caption += f"; {label} flies {vehicle.name}"
     return Table(columns, rows, title=title, caption=caption)

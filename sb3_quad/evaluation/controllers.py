@@ -5,15 +5,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory
 from sb3_quad.controllers.zips import saved_algorithm
-from sb3_quad.evaluation.flights import Reward
+from sb3_quad.evaluation.flights import OwnReward, Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
@@ -35,6 +36,13 @@ class ControllerSpec:
         """Whether it is an agent in a zip."""
         return self.spec.endswith(".zip")
 
+    @property
+    def kind(self) -> Literal["expert", "model", "factory"]:
+        """What it is, as :class:`~sb3_quad.evaluation.results.ControllerRecord` has it."""
+        if self.is_zip:
+            return "model"
+        return "expert" if self.spec in EXPERTS else "factory"
+
     @cached_property
     def own(self) -> FlightSettings | None:
         """The settings that the agent's zip holds; None: experts, factories, and zips without any.
@@ -49,7 +57,7 @@ class ControllerSpec:
         return settings
 
     @property
-    def observed(self) -> dict[str, Any]:
+    def observed(self) -> StrDict:
         """Settings that go with the agent wherever it flies.
 
         These are :attr:`FlightSettings.observed` and the layout of the rotors that it knows.
@@ -58,7 +66,7 @@ class ControllerSpec:
             return FlightSettings().observed
         return {**self.own.observed, "rotor_layout": self.own.layout}
 
-    def notice(self, vehicle: str | Path | Vehicle) -> str:
+    def notice(self, vehicle: StrPath | Vehicle) -> str:
         """Return a warning if the agent was trained on another vehicle, or does not say on which.
 
         :return: the warning, in one line; else empty.
@@ -119,25 +127,19 @@ def controller_record(spec: ControllerSpec) -> ControllerRecord:
 
     :raises ConfigError: an unknown name, a missing file, a module that cannot be imported.
     """
-    if spec.is_zip:
-        path = Path(spec.spec)
-        return ControllerRecord(
-            label=spec.label,
-            spec=path.name,
-            kind="model",
-            algorithm=saved_algorithm(path),
-            content=hashlib.sha256(path.read_bytes()).hexdigest(),
-        )
-    # Import it now, so that an error shows before anything flies.
-    import_factory(spec.spec, "controller")
-    return ControllerRecord(
-        label=spec.label,
-        spec=spec.spec,
-        kind="expert" if spec.spec in EXPERTS else "factory",
-    )
+    record = ControllerRecord(label=spec.label, spec=spec.spec, kind=spec.kind)
+    if not spec.is_zip:
+        # Import it now, so that an error shows before anything flies.
+        import_factory(spec.spec, "controller")
+        return record
+    path = Path(spec.spec)
+    algorithm = saved_algorithm(path)
+    content = hashlib.sha256(path.read_bytes()).hexdigest()
+    changes = {"spec": path.name, "algorithm": algorithm, "content": content}
+    return record.model_copy(update=changes)
 
 
-def load_reward(reward: str | Reward | None) -> Reward | None:
+def load_reward(reward: OwnReward) -> Reward | None:
     """Return a reward of the user's own.
 
     :param reward: a function, returned as it is; or ``package.module:function``.
@@ -160,14 +162,15 @@ def load_reward(reward: str | Reward | None) -> Reward | None:
 def _parse(text: str) -> ControllerSpec:
     label, equals, spec = text.partition("=")
     # An equals sign after a slash belongs to the path.
-    if equals and "/" not in label and "\\" not in label:
+    if equals and not {"/", "\\"} & {*label}:
         if not label or not spec:
             raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
         return ControllerSpec(label, agent_path(spec))
-    path = agent_path(text)
+    spec = agent_path(text)
+    label = spec
     # A name or a run folder has become a path: its last part is the label.
-    if path != text:
-        return ControllerSpec(Path(text).name, path)
-    if path.endswith(".zip"):
-        return ControllerSpec(Path(path).stem, path)
-    return ControllerSpec(path, path)
+    if spec != text:
+        label = Path(text).name
+    elif spec.endswith(".zip"):
+        label = Path(spec).stem
+    return ControllerSpec(label, spec)

@@ -17,12 +17,13 @@ from sb3_quad.base import __version__
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
+from sb3_quad.base.types import Report, StrMapping
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
-from sb3_quad.evaluation.flights import Flights, Reward, fly_settings
+from sb3_quad.evaluation.flights import Flights, OwnReward, Reward, fly_settings
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
     FLIGHTS,
@@ -58,15 +59,14 @@ class Job:
     """
 
     spec: ControllerSpec
-    record: ControllerRecord
     scenario: Scenario
     backend: str
-    reward: str | Reward | None
+    reward: OwnReward
 
     @property
     def name(self) -> Name:
         """Scenario and controller, as :class:`~sb3_quad.evaluation.results.Entry` has it."""
-        return self.scenario.name, self.record.label
+        return self.scenario.name, self.spec.label
 
     @property
     def repeats(self) -> bool:
@@ -74,7 +74,7 @@ class Job:
 
         Code outside of this package may have changed: a factory's, and that of an own reward.
         """
-        return self.record.kind != "factory" and self.reward is None
+        return self.spec.kind != "factory" and self.reward is None
 
 
 def evaluate(
@@ -85,10 +85,10 @@ def evaluate(
     workers: int = 1,
     overwrite: bool = False,
     progress: Progress = lambda done, total, name: None,
-    report: Callable[[str], None] = lambda line: None,
+    report: Report = lambda line: None,
     executor: str = "local",
     address: str | None = None,
-    reward: str | Reward | None = None,
+    reward: OwnReward = None,
 ) -> Results:
     """Fly all scenarios of a suite by all controllers, on the same episodes.
 
@@ -123,8 +123,8 @@ def evaluate(
     # Scenario by scenario, so that a suite that is interrupted compares all controllers.
     jobs = []
     for scenario in suite.scenarios:
-        for spec, record in records.items():
-            jobs.append(Job(spec, record, scenario, backend, reward))
+        for spec in records:
+            jobs.append(Job(spec, scenario, backend, reward))
     results = Results(
         suite=suite.name,
         description=suite.description,
@@ -135,7 +135,7 @@ def evaluate(
         scenarios=[*suite.scenarios],
         entries=[],
         failures=failures,
-        digest=_digest(jobs),
+        digest=_digest(jobs, records),
     )
     place = Path(folder)
     # Without a controller there is nothing to write, and no folder.
@@ -148,24 +148,34 @@ def evaluate(
 
 
 def _load_controllers(
-    suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]
+    suite: Suite, specs: Sequence[ControllerSpec], report: Report
 ) -> tuple[dict[ControllerSpec, ControllerRecord], list[Failure]]:
     """Load the controllers; report those that fly another vehicle than they were trained on."""
-    records: dict[ControllerSpec, ControllerRecord] = {}
+    records = {}
     failures = []
+    vehicles: dict[str, str] = {}
     for spec in specs:
         try:
             record = controller_record(spec)
             notices: dict[str, None] = {}
             for scenario in suite.scenarios:
                 notices[spec.notice(_vehicle(spec, scenario))] = None
-            # Several scenarios give the same notice, or an empty one: report it once.
-            for notice in filter(None, notices):
-                report(notice)
-            records[spec] = record
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
-    _report_vehicles(suite, records, report)
+            continue
+        records[spec] = record
+        # Several scenarios give the same notice, or an empty one: report it once.
+        for notice in filter(None, notices):
+            report(notice)
+        # All fly the vehicle that a scenario names.
+        for scenario in suite.scenarios:
+            if scenario.vehicle is None:
+                vehicles[spec.label] = _vehicle(spec, scenario).name
+    if any(scenario.reference and scenario.vehicle is None for scenario in suite.scenarios):
+        vehicles["the reference"] = DEFAULT_VEHICLE
+    if len({*vehicles.values()}) > 1:
+        flown = ", ".join(map(" flies ".join, vehicles.items()))
+        report(f"not all fly the same vehicle: {flown}; --vehicle gives all of them one")
     return records, failures
 
 
@@ -182,18 +192,6 @@ def _fly_missing(
     """Fly the jobs that are not done, and write everything into the folder."""
     missing = [job for job in jobs if job.name not in done]
     failures = [*results.failures]
-
-    def write(finished: bool) -> Results:
-        # Workers finish in any order; the entries stand in that of the suite.
-        entries = [done[job.name] for job in jobs if job.name in done]
-        changes = {"entries": entries, "failures": failures, "finished": finished}
-        current = results.model_copy(update=changes)
-        if finished and entries:
-            write_episodes(place, entries)
-        if entries:
-            write_text(place / RESULTS, current.model_dump_json(indent=2))
-        return current
-
     progress(len(done), len(jobs), "")
     pool: Any = nullcontext()
     if executor != "local" or min(workers, len(missing)) > 1:
@@ -206,9 +204,23 @@ def _fly_missing(
                 done[job.name], arrays = outcome
                 write_arrays(place / done[job.name].flights, compressed=True, **arrays)
             # After each job, so that an interrupted evaluation can resume.
-            write(finished=False)
-            progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
-    return write(finished=True)
+            _write(place, results, jobs, done, finished=False)
+            progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
+    results = results.model_copy(update={"failures": failures})
+    return _write(place, results, jobs, done, finished=True)
+
+
+def _write(
+    place: Path, results: Results, jobs: Sequence[Job], done: Mapping[Name, Entry], finished: bool
+) -> Results:
+    # Workers finish in any order; the entries stand in that of the suite.
+    entries = [done[job.name] for job in jobs if job.name in done]
+    results = results.model_copy(update={"entries": entries, "finished": finished})
+    if entries:
+        if finished:
+            write_episodes(place, entries)
+        write_text(place / RESULTS, results.model_dump_json(indent=2))
+    return results
 
 
 def fly_scenario(
@@ -216,7 +228,7 @@ def fly_scenario(
     scenario: Scenario,
     backend: str = "batch",
     recorded: int | None = 0,
-    own: Mapping[str, Any] | None = None,
+    own: StrMapping | None = None,
     reward: Reward | None = None,
 ) -> tuple[Flights, Arrays]:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
@@ -234,22 +246,14 @@ def fly_scenario(
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
     recorder = Recorder(recorded)
-    hooks = [recorder] if recorded else []
+    hooks = [recorder]
     parts = []
     size = PART_SIZES.get(backend, 1)
     for first in range(0, len(seeds), size):
         part = seeds[first : first + size]
-        flights = fly_settings(
-            controller,
-            settings,
-            part,
-            backend,
-            scenario.tolerances,
-            hooks,
-            plan=sample_plan(scenario, part),
-            reward=reward,
-        )
-        parts.append(flights)
+        plan = sample_plan(scenario, part)
+        how = (settings, part, backend, scenario.tolerances, hooks, plan)
+        parts.append(fly_settings(controller, *how, reward=reward))
         # Only flights of the first part are recorded.
         hooks = []
     return Flights.concatenate(parts), recorder.arrays()
@@ -275,9 +279,9 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
             reward=load_reward(job.reward),
         )
     except SB3QuadError as error:
-        return _failure(job.record.label, job.scenario.name, error)
+        return _failure(job.spec.label, job.scenario.name, error)
     entry = Entry(
-        controller=job.record.label,
+        controller=job.spec.label,
         scenario=scenario.name,
         seed=scenario.seed,
         backend=job.backend,
@@ -285,7 +289,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         metrics=summarise(flights),
         physical_limit=scenario.physical_limit,
-        flights=flights_path(job.record.label, scenario.name),
+        flights=flights_path(job.spec.label, scenario.name),
     )
     return entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories}
 
@@ -305,7 +309,7 @@ def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tupl
         try:
             yield job, future.result()
         except WorkerDied as error:
-            yield job, _failure(job.record.label, job.scenario.name, error)
+            yield job, _failure(job.spec.label, job.scenario.name, error)
 
 
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
@@ -313,24 +317,6 @@ def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
     if scenario.vehicle is not None or spec.own is None:
         return scenario.nominal_vehicle()
     return first_vehicle(spec.own.vehicle)
-
-
-def _report_vehicles(
-    suite: Suite, specs: Mapping[ControllerSpec, Any], report: Callable[[str], None]
-) -> None:
-    """Report controllers, or a reference, that fly different vehicles in the same scenario."""
-    vehicles: dict[str, str] = {}
-    for scenario in suite.scenarios:
-        # All fly the vehicle that a scenario names.
-        if scenario.vehicle is not None:
-            continue
-        for spec in specs:
-            vehicles[spec.label] = _vehicle(spec, scenario).name
-        if scenario.reference:
-            vehicles["the reference"] = DEFAULT_VEHICLE
-    if len({*vehicles.values()}) > 1:
-        flown = ", ".join(map(" flies ".join, vehicles.items()))
-        report(f"not all fly the same vehicle: {flown}; --vehicle gives all of them one")
 
 
 def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> dict[Name, Entry]:
@@ -349,8 +335,8 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
     before = load_results(folder)
     if not overwrite:
         kept = {job.name for job in jobs if job.repeats}
-        can_resume = len(kept) == len(jobs) or not before.finished
-        if before.digest != digest or not can_resume:
+        must_repeat = before.finished and len(kept) < len(jobs)
+        if before.digest != digest or must_repeat:
             raise ConfigError(
                 f"{folder}: holds results already; give another folder with -o,"
                 " or remove them with --overwrite"
@@ -363,7 +349,7 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
     return {}
 
 
-def _digest(jobs: Sequence[Job]) -> str:
+def _digest(jobs: Sequence[Job], records: Mapping[ControllerSpec, ControllerRecord]) -> str:
     """Hash all inputs of the flights, the sources of this package included (SHA-256)."""
     digest = hashlib.sha256()
     # The environments lie next to the package in a checkout, inside it when installed.
@@ -371,7 +357,7 @@ def _digest(jobs: Sequence[Job]) -> str:
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
             digest.update(path.read_bytes())
     for job in jobs:
-        inputs = job, job.spec.own, _vehicle(job.spec, job.scenario)
+        inputs = job, records[job.spec], job.spec.own, _vehicle(job.spec, job.scenario)
         digest.update(repr(inputs).encode())
     return digest.hexdigest()
 

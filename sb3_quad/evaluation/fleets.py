@@ -3,126 +3,115 @@
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from sb3_quad.base.types import StrDict
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
 
-
-class FleetStep(NamedTuple):
-    """The outcome of a control step, by row."""
-
-    observation: Float32Array  # (n, 18), or the size that the agent observes
-    reward: FloatArray  # (n,)
-    lost: BoolArray  # (n,), crashed or out of range
-    collided: BoolArray  # (n,), touches the ground
-    distance: FloatArray  # (n,), |r - r_T|, m
-    success: BoolArray  # (n,), would be a success if it ended now
+Start = Mapping[str, FloatArray]
 
 
-class BatchFleet:
+class Fleet:
     """n vehicles in their first episodes, in one batched environment; a row that is lost stays so.
 
     :param seeds: of the episodes, (n,).
-    :param settings: how they fly; ``max_episode_steps`` has no meaning here.
+    :param settings: how they fly; ``max_episode_steps`` has no meaning here, since flights end by
+        their plan.
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
         endless = settings.with_changes(max_episode_steps=ENDLESS)
-        self._batch = QuadcopterBatch(len(seeds), endless, autoreset=False)
-        self._batch.seed(seeds)
-        self.vehicle = self._batch.vehicle_list[0]
-        self.observation_size = self._batch.observation.size
+        self._batches = self._open(seeds, endless)
+        self.vehicle = self._batches[0].vehicle_list[0]
+        self.observation_size = self._batches[0].observation.size
 
-    def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
+    def _open(self, seeds: Sequence[int], settings: FlightSettings) -> list[QuadcopterBatch]:
+        batch = QuadcopterBatch(len(seeds), settings, autoreset=False)
+        batch.seed(seeds)
+        return [batch]
+
+    def reset(self, start: Start) -> Float32Array:
         """Begin the episodes; return the observations, (n, observation_size).
 
         :param start: replaces the episodes' own sample: any of position, velocity, body_rates,
             target (n, 3) and quaternion (n, 4).
         """
-        self._batch.reset()
+        (batch,) = self._batches
+        batch.reset()
         for name, values in start.items():
-            self._batch.state[row_slices(STATE)[name]] = values.T
-        return self._batch.observe()
+            batch.state[row_slices(STATE)[name]] = values.T
+        return batch.observe()
 
-    def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
-        """Fly one control step; only the rows that are ``flying`` have meaning in the result."""
-        observation, reward, _ = self._batch.step(actions)
-        end = self._batch.outcome
-        return FleetStep(
-            observation,
-            reward.astype(np.float64),
-            ~end["truncated"],
-            end["collision"],
-            end["distance"],
-            end["success"],
-        )
+    def step(self, actions: Float32Array, flying: BoolArray) -> tuple[Float32Array, FloatArray]:
+        """Fly one control step; return the observations and the rewards, (n,).
+
+        Only the rows that are ``flying`` have meaning in them and in :attr:`outcome`.
+        """
+        observation, reward, _ = self._batches[0].step(actions)
+        return observation, reward.astype(np.float64)
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         """Move the targets of some rows, (len(rows), 3); return all observations."""
-        self._batch.set_target(targets, rows)
-        return self._batch.observe()
+        self._batches[0].set_target(targets, rows)
+        return self._batches[0].observe()
 
     def set_wrench(self, wrench: FloatArray) -> None:
         """Set the wrench from now on, (n, WRENCH_SIZE), see :mod:`sb3_quad.simulation.state`."""
-        self._batch.wrench[:] = wrench.T
+        self._batches[0].wrench[:] = wrench.T
+
+    @property
+    def outcome(self) -> Any:
+        """How the rows are, (n,), see :data:`~sb3_quad.simulation.kernel.OUTCOME`."""
+        return np.concatenate([*map(attrgetter("outcome"), self._batches)])
 
     @property
     def wrench(self) -> FloatArray:
         """The external wrench on all rows in this control step, without drag, (n, WRENCH_SIZE)."""
-        return self._batch.total_wrench().T
+        return np.hstack([*map(QuadcopterBatch.total_wrench, self._batches)]).T
 
     def true_state(self) -> QuadcopterState:
-        """The true state of all rows, fresh or live."""
-        return self._batch.true_state()
+        """The true state of all rows, of its own memory."""
+        return QuadcopterState.concatenate([*map(QuadcopterBatch.true_state, self._batches)])
 
     def close(self) -> None:
         """Release the environments, where they hold anything."""
 
 
-class PyBulletFleet:
-    """Flies as :class:`BatchFleet`, with a PyBullet environment per row, one after the other.
+class PyBulletFleet(Fleet):
+    """Flies with a PyBullet environment per row, one after the other.
 
     The controller still sees them as one batch.
     """
 
-    def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
+    def _open(self, seeds: Sequence[int], settings: FlightSettings) -> list[QuadcopterBatch]:
         # PyBullet may be missing, which matters here only.
         from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 
-        # Flights end by their plan; none is truncated by its environment.
-        keywords = dict(settings.with_changes(max_episode_steps=ENDLESS))
         self._seeds = seeds
-        self._envs = [QuadcopterEnv(**keywords) for _ in seeds]
-        self.vehicle = self._envs[0].vehicle
-        self.observation_size = self._envs[0].batch.observation.size
+        self._envs = [QuadcopterEnv(**dict(settings)) for _ in seeds]
+        return [*map(attrgetter("batch"), self._envs)]
 
-    def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
+    def reset(self, start: Start) -> Float32Array:
         for row, env in enumerate(self._envs):
             state = {name: values[row] for name, values in start.items()}
             # A target is no part of an environment's state.
-            options: dict[str, Any] = {"target": state.pop("target", None), "state": state}
+            options: StrDict = {"target": state.pop("target", None), "state": state}
             env.reset(seed=self._seeds[row], options=options)
         self._observation = np.stack([env.observe() for env in self._envs])
         return self._observation.copy()
 
-    def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
-        n = len(actions)
-        reward, distance = np.zeros((2, n))
-        lost, collided, success = np.zeros((3, n), np.bool_)
+    def step(self, actions: Float32Array, flying: BoolArray) -> tuple[Float32Array, FloatArray]:
+        reward = np.zeros(len(actions))
         # The others have ended; their environments may not be stepped.
         for row in np.flatnonzero(flying):
-            self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(
-                actions[row]
-            )
-            collided[row] = info["collision"]
-            distance[row] = info["distance"]
-            success[row] = info["is_success"]
-        return FleetStep(self._observation.copy(), reward, lost, collided, distance, success)
+            self._observation[row], reward[row], *_ = self._envs[row].step(actions[row])
+        return self._observation.copy(), reward
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         for row, target in zip(rows, targets, strict=True):
@@ -134,17 +123,9 @@ class PyBulletFleet:
         for env, values in zip(self._envs, wrench, strict=True):
             env.batch.wrench[:, 0] = values
 
-    @property
-    def wrench(self) -> FloatArray:
-        return np.stack([env.batch.total_wrench()[:, 0] for env in self._envs])
-
-    def true_state(self) -> QuadcopterState:
-        return QuadcopterState.concatenate([env.true_state() for env in self._envs])
-
     def close(self) -> None:
         for env in self._envs:
             env.close()
 
 
-Fleet: TypeAlias = BatchFleet | PyBulletFleet
-FLEETS: Mapping[str, type[Fleet]] = {"batch": BatchFleet, "pybullet": PyBulletFleet}
+FLEETS: Mapping[str, type[Fleet]] = {"batch": Fleet, "pybullet": PyBulletFleet}

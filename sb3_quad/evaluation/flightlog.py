@@ -4,14 +4,14 @@ flight.
 docs/reference/evaluation.md lists the arrays.
 """
 
-from pathlib import Path
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray
 from sb3_quad.base.files import read_arrays
+from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flights import Flights, Hook
 from sb3_quad.simulation.state import (
     FORCE_BODY,
@@ -57,7 +57,7 @@ class Recorder(Hook):
         self._wrench = np.zeros((m, 6))
         # No action has been given at the start.
         no_actions = np.full((state.n, 4), np.nan, np.float32)
-        self._sample(state, no_actions, np.ones(state.n, dtype=np.bool_))
+        self._sample(state, no_actions, np.ones(state.n, bool))
 
     def before_step(
         self,
@@ -70,10 +70,9 @@ class Recorder(Hook):
             return
         # Sum forces in the world frame and torques in the body frame until the next sample.
         rows = wrench[: self._m]
-        rotation = QuadcopterState(state.array[:, : self._m]).rotation
-        self._wrench[:, :3] += rows[:, FORCE_WORLD]
+        rotation = state.rotation[: self._m]
+        self._wrench += np.hstack([rows[:, FORCE_WORLD], rows[:, TORQUE_BODY]])
         self._wrench[:, :3] += np.einsum("nij,nj->ni", rotation, rows[:, FORCE_BODY])
-        self._wrench[:, 3:] += rows[:, TORQUE_BODY]
         # World to body: the transposed rotation.
         self._wrench[:, 3:] += np.einsum("nji,nj->ni", rotation, rows[:, TORQUE_WORLD])
 
@@ -108,12 +107,12 @@ class Recorder(Hook):
         return arrays
 
 
-def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
+def episode_arrays(flights: Flights, seeds: Sequence[int]) -> Arrays:
     """Return the ``episode_`` arrays, of all flights."""
     arrays: Arrays = {f"episode_{name}": getattr(flights, name) for name in EPISODES}
     # The first condition that holds decides.
     conditions = [flights.success, flights.survival, flights.collision]
-    arrays["episode_seed"] = np.asarray(seeds, dtype=np.int64)
+    arrays["episode_seed"] = np.array(seeds, np.int64)
     arrays["episode_outcome"] = np.select(conditions, OUTCOMES[:3], OUTCOMES[3])
     arrays["episode_path"] = flights.path_length
     arrays["episode_tolerances"] = np.array([*flights.time_to])
@@ -130,10 +129,10 @@ class Track(NamedTuple):
     """One flight, k samples."""
 
     times: FloatArray  # (k,), s
-    position: FloatArray  # (k, 3), world frame, m; target likewise
-    target: FloatArray
+    position: Float32Array  # (k, 3), world frame, m; target likewise
+    target: Float32Array
     # (k, 6), mean since the sample before: force, world frame, N; torque, body frame, N m
-    wrench: FloatArray
+    wrench: Float32Array
     lost: str  # how it was lost, empty if it was not
 
     @property
@@ -142,14 +141,14 @@ class Track(NamedTuple):
         return np.asarray(np.linalg.norm(self.position - self.target, axis=1))
 
     @property
-    def targets(self) -> FloatArray:
+    def targets(self) -> Float32Array:
         """The targets, one after the other, (n, 3), m."""
         # The first sample of each target.
-        changed = np.flatnonzero((np.diff(self.target, axis=0) != 0).any(axis=1)) + 1
-        return np.asarray(self.target[[0, *changed]])
+        changed = np.diff(self.target, axis=0).any(axis=1)
+        return np.compress(np.append(True, changed), self.target, axis=0)
 
 
-def read_tracks(path: str | Path) -> list[Track]:
+def read_tracks(path: StrPath) -> list[Track]:
     """Read the flights of a file whose trajectories were kept.
 
     :raises ConfigError: a missing or damaged file.
@@ -157,12 +156,13 @@ def read_tracks(path: str | Path) -> list[Track]:
     arrays = read_arrays(path)
     tracks = []
     for number, samples in enumerate(arrays.get("samples", ())):
+        flown = slice(samples)
         track = Track(
-            times=arrays["time"][:samples],
-            position=arrays["position"][number, :samples].astype(np.float64),
-            target=arrays["target"][number, :samples].astype(np.float64),
-            wrench=arrays["wrench"][number, :samples].astype(np.float64),
-            lost=LOST.get(str(arrays["episode_outcome"][number]), ""),
+            arrays["time"][flown],
+            arrays["position"][number, flown],
+            arrays["target"][number, flown],
+            arrays["wrench"][number, flown],
+            LOST.get(str(arrays["episode_outcome"][number]), ""),
         )
         tracks.append(track)
     return tracks

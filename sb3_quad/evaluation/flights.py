@@ -5,10 +5,10 @@ the end of the first control step after which |r - r_T| is within it. The path i
 episode, 15 s, not only of the way until arrival.
 """
 
-import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from operator import attrgetter, itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, unknown
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import StrDict
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
@@ -39,6 +40,10 @@ Reward: TypeAlias = Callable[[QuadcopterState, Float32Array], npt.ArrayLike]
 """A reward of your own: the state after a control step and the actions (n, 4) that led to it, to
 rewards (n,).
 """
+
+
+OwnReward: TypeAlias = str | Reward | None
+"""A reward of your own as it is given: a function, ``package.module:function``, or None: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,23 +88,22 @@ class Flights:
     @staticmethod
     def concatenate(parts: Sequence["Flights"]) -> "Flights":
         """Join several parts in their order."""
-        columns: dict[str, Any] = {}
-        for field in dataclasses.fields(Flights):
-            values: list[Any] = [getattr(part, field.name) for part in parts]
-            if isinstance(values[0], Mapping):
-                columns[field.name] = {
-                    tolerance: np.concatenate([value[tolerance] for value in values])
-                    for tolerance in values[0]
-                }
+        columns: StrDict = {}
+        for name, first in vars(parts[0]).items():
+            values = [*map(attrgetter(name), parts)]
+            if isinstance(first, Mapping):
+                columns[name] = {}
+                for tolerance in first:
+                    arrays = [*map(itemgetter(tolerance), values)]
+                    columns[name][tolerance] = np.concatenate(arrays)
             else:
-                columns[field.name] = np.concatenate(values)
+                columns[name] = np.concatenate(values)
         return Flights(**columns)
 
 
 def arrival_tolerance(tolerances: Iterable[float]) -> float:
     """Return the tolerance, m, by which overshoot and the settling time are judged."""
-    known = {*tolerances}
-    return NEAR if NEAR in known else min(known)
+    return min(tolerances, key=lambda tolerance: (tolerance != NEAR, tolerance))
 
 
 class Hook:
@@ -210,10 +214,8 @@ def fly_settings(
         if isinstance(reward, type):
             # A reward that remembers, such as the last actions, begins afresh with these episodes.
             reward = reward()
-        plan = plan or Plan()
-        return _fly_fleet(
-            fleet, pilot, plan, settings.longest_episode, tolerances, [*hooks], reward
-        )
+        steps = settings.longest_episode
+        return _fly_fleet(fleet, pilot, plan or Plan(), steps, tolerances, hooks, reward)
 
 
 def _fly_fleet(
@@ -228,11 +230,12 @@ def _fly_fleet(
     observation = fleet.reset(plan.start)
     control_step = fleet.vehicle.control_step
     state = fleet.true_state()
-    position = state.position.copy()
+    position = state.position
     course = Waypoints(plan, state.n)
     arrivals = Arrivals(tolerances, course.to_last(state.distance))
     motion = Motion(state, control_step)
-    flights = _at_start(state, plan, arrivals, motion, course)
+    last = np.zeros_like(fleet.outcome)
+    flights = _at_start(state, last, plan, arrivals, motion, course)
     if reward is not None:
         flights.own_reward[:] = 0.0
     flying = flights.survival  # the same array: a flight survives until it is lost
@@ -250,33 +253,30 @@ def _fly_fleet(
             raise ControllerError(f"{error}, after {(step - 1) * control_step:.2f} s") from error
         for hook in hooks:
             hook.before_step(state, observation, fleet.wrench, flying)
-        result = fleet.step(actions, flying)
-        observation = result.observation
+        observation, rewards = fleet.step(actions, flying)
+        outcome = fleet.outcome
         state = fleet.true_state()
 
         # Sums and last values count also for the flights that this step has ended.
-        flights.reward[flying] += result.reward[flying]
+        flights.reward[flying] += rewards[flying]
         if reward is not None:
             flights.own_reward[flying] += _ask_reward(reward, state, actions)[flying]
         way = np.linalg.norm(state.position - position, axis=1)
         flights.path_length[flying] += way[flying]
-        position = state.position.copy()
-        flights.final_error[flying] = result.distance[flying]
-        flights.success[flying] = result.success[flying]
-        flights.length[flying] = step
+        position = state.position
+        last[flying] = outcome[flying]
         flights.flown[flying] = time
-        arrivals.see(time, course.to_last(result.distance), flying)
-        flights.collision[flying & result.lost & result.collided] = True
+        arrivals.see(time, course.to_last(outcome["distance"]), flying)
 
         # From here on, only the flights that continue count.
-        flying &= ~result.lost
+        flying &= outcome["truncated"]
         motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
         # Whoever has reached a waypoint sees the next one from the next step on.
-        onward = course.see(time, result.distance, flying)
+        onward = course.see(time, outcome["distance"], flying)
         if onward.size:
             observation = fleet.set_targets(onward, course.targets(onward))
 
@@ -289,40 +289,41 @@ def _fly_fleet(
 
 
 def _at_start(
-    state: QuadcopterState, plan: Plan, arrivals: "Arrivals", motion: "Motion", course: "Waypoints"
+    state: QuadcopterState,
+    last: Any,
+    plan: Plan,
+    arrivals: "Arrivals",
+    motion: "Motion",
+    course: "Waypoints",
 ) -> Flights:
-    """The metrics before the first step; arrivals, motion and course update theirs in place."""
+    """The metrics before the first step; the other arguments update theirs in place."""
     n = state.n
-    undefined = np.full(n, np.nan)
-    cross_track_error = motion.cross_track_error
+    # A course has no single straight line to deviate from.
     if len(plan.waypoints):
-        # A course has no single straight line to deviate from.
-        cross_track_error = undefined
+        motion.cross_track_error = np.full(n, np.nan)
     return Flights(
-        success=np.zeros(n, dtype=np.bool_),
-        survival=np.ones(n, dtype=np.bool_),
-        collision=np.zeros(n, dtype=np.bool_),
+        success=last["success"],
+        survival=np.ones(n, bool),
+        collision=last["collision"],
         reward=np.zeros(n),
-        own_reward=undefined.copy(),
-        length=np.zeros(n, dtype=np.int64),
+        own_reward=np.full(n, np.nan),
+        length=last["length"],
         flown=np.zeros(n),
         time_to=dict(zip(arrivals.tolerances, arrivals.time_to, strict=True)),
         settling_time=dict(zip(arrivals.tolerances, arrivals.settling_time, strict=True)),
         overshoot=arrivals.overshoot,
         path_length=np.zeros(n),
-        final_error=state.distance.copy(),
+        final_error=last["distance"],
         final_offset=np.full((n, 3), np.nan),
         recovery_time=motion.recovery_time,
-        cross_track_error=cross_track_error,
+        cross_track_error=motion.cross_track_error,
         waypoint_times=course.times,
-        start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
-        target=state.target.copy(),
+        start=state.array[:13].T,
+        target=state.target,
     )
 
 
-def _ask_reward(
-    reward: Reward, state: QuadcopterState, actions: Float32Array
-) -> npt.NDArray[np.float64]:
+def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -> FloatArray:
     """Return the rewards of a function of the user's, which may do anything, as (n,) numbers."""
     # Instances of a class have no name of their own.
     name = f"reward {getattr(reward, '__name__', type(reward).__name__)}"
@@ -332,9 +333,9 @@ def _ask_reward(
         raise ControllerError(f"{name}: fails with {type(error).__name__}: {error}") from error
     if values.shape != (state.n,):
         raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
-    if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise ControllerError(f"{name}: gives {values[row]} in row {row}, must be finite")
+    wrong = np.flatnonzero(~np.isfinite(values))
+    if wrong.size:
+        raise ControllerError(f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite")
     return values
 
 
@@ -388,10 +389,8 @@ class Waypoints:
     def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
         count = len(self._plan.waypoints)
-        if count == 0:
-            return np.zeros(0, dtype=np.int64)
         near = distance <= self._plan.radius
-        reached = np.flatnonzero(flying & (self._next < count) & near)
+        reached = np.flatnonzero(flying & near & (self._next < count))
         self.times[reached, self._next[reached]] = time
         self._next[reached] += 1
         self.on_last |= self._next >= count - 1
@@ -399,8 +398,6 @@ class Waypoints:
 
     def to_last(self, distance: FloatArray) -> FloatArray:
         """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
-        if not len(self._plan.waypoints):
-            return distance
         return np.where(self.on_last, distance, np.inf)
 
     def targets(self, rows: IntArray) -> FloatArray:
@@ -425,13 +422,13 @@ class Motion:
         way = state.target - state.position
         length = np.linalg.norm(way, axis=1, keepdims=True)
         self._control_step = control_step
-        self._start = state.position.copy()
+        self._start = state.position
         self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
         self._since = np.zeros(state.n)  # when the present stable time began
-        self._stable = np.ones(state.n, dtype=np.bool_)
+        self._stable = np.ones(state.n, bool)
         self.recovery_time = np.full(state.n, np.nan)
         self.cross_track_error = np.where(length[:, 0] > 0.0, 0.0, np.nan)
-        self.see(0, state, np.ones(state.n, dtype=np.bool_))
+        self.see(0, state, self._stable)
 
     def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
         """See the state after control step ``step``; only the flights (n,) that continue count."""

@@ -3,14 +3,16 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from sb3_quad.evaluation.flights import arrival_tolerance
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
-from sb3_quad.evaluation.scenarios.load import axis_name
-from sb3_quad.evaluation.scenarios.scenario import NumberOrRange, Reference, Scenario
+from sb3_quad.evaluation.scenarios.load import axis_values
+from sb3_quad.evaluation.scenarios.scenario import Printed, Reference, Scenario
 from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 
@@ -24,16 +26,27 @@ LIMIT = Row("physical limit of the settling time", "s")
 OVERSHOOT_RATE = Row("overshoot rate", "%")
 OVERSHOOT = Row("overshoot, median", "m")
 PATH = Row("mean path", "m")
-MEDIAN = Row("final error, median", "m")
-QUANTILE = Row("final error, 95 %", "m")
-RECOVERY_TIME = Row("recovery time", "s")
+MEDIAN = Row("final error, median", "m", decimals=3)
+QUANTILE = Row("final error, 95 %", "m", decimals=3)
+RECOVERY_TIME = Row("recovery time", "s", verb="recover")
 CROSS_TRACK_ERROR = Row("cross-track error", "m")
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
-COURSE_TIME = Row("time of the course", "s")
-# The names of rows with times begin like this; in them less is better.
-TIME = "mean time to"
-SETTLING = "settling time"
+COURSE_TIME = Row("time of the course", "s", verb="complete")
+# The rows of fields of Metrics; those of Reference have the same names.
+ROWS = {
+    "success": SUCCESS,
+    "survival": SURVIVAL,
+    "reward": REWARD,
+    "own_reward": OWN_REWARD,
+    "flown": FLOWN,
+    "overshoot": OVERSHOOT,
+    "path": PATH,
+    "cross_track_error": CROSS_TRACK_ERROR,
+    "final_error_median": MEDIAN,
+    "final_error_95": QUANTILE,
+    "recovery_time": RECOVERY_TIME,
+}
 # Flights that are lost end early, which makes other rows incomparable.
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD, OWN_REWARD}
@@ -41,17 +54,19 @@ MOST_TOLERANCES = 6
 MAIN_TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
 
+NOTHING = Cell()
+
 Cells = Mapping[Row, Cell]  # by the rows they stand in
 
 
 def time_row(tolerance: float | str) -> Row:
     """Return the row with the time to a tolerance, m."""
-    return Row(f"{TIME} {float(tolerance):g} m", "s")
+    return Row(f"mean time to {float(tolerance):g} m", "s", verb="arrive")
 
 
 def settling_row(tolerance: float) -> Row:
     """Return the row with the settling time of a tolerance, m."""
-    return Row(f"{SETTLING} ({tolerance:g} m)", "s")
+    return Row(f"settling time ({tolerance:g} m)", "s", verb="settle")
 
 
 def estimate_cell(
@@ -64,43 +79,40 @@ def estimate_cell(
     return Cell(factor * estimate.value, ends, decimals)
 
 
-def share_cell(share: Estimate | None) -> Cell:
-    """Return a share in percent, with as many digits as a single flight takes to show."""
-    if share is None:
-        return Cell(words="–")
-    return estimate_cell(share, 100.0, decimals=len(str(share.n // 200)))
-
-
 def metric_cells(metrics: Metrics) -> Cells:
-    """Return all that was measured of a controller in a scenario."""
-    cells = {
-        SUCCESS: share_cell(metrics.success),
-        SURVIVAL: share_cell(metrics.survival),
-        REWARD: estimate_cell(metrics.reward),
-        FLOWN: estimate_cell(metrics.flown),
-        OVERSHOOT: Cell(metrics.overshoot, words="–"),
-        PATH: estimate_cell(metrics.path),
-        MEDIAN: Cell(metrics.final_error_median, decimals=3, words="–"),
-        QUANTILE: estimate_cell(metrics.final_error_95, decimals=3),
-        RECOVERY_TIME: _moment(metrics.recovery_time, "recover"),
-    }
-    near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
+    """Return all that was measured of a controller in a scenario.
+
+    What does not exist of these flights, such as the error of survivors without any, has no cell.
+    """
+    values: dict[Row, Any] = {row: getattr(metrics, name) for name, row in ROWS.items()}
+    near = arrival_tolerance(map(attrgetter("tolerance"), metrics.arrivals))
     for arrival in metrics.arrivals:
-        cells[time_row(arrival.tolerance)] = _moment(arrival, "arrive")
+        values[time_row(arrival.tolerance)] = arrival
         # Settling and overshoot are shown of one tolerance only.
         if arrival.tolerance == near:
-            cells[settling_row(near)] = _moment(arrival.settling, "settle")
-            cells[OVERSHOOT_RATE] = share_cell(arrival.overshoot_rate)
-    # These exist only of some flights.
-    if metrics.own_reward is not None:
-        cells[OWN_REWARD] = estimate_cell(metrics.own_reward)
-    if metrics.cross_track_error is not None:
-        cells[CROSS_TRACK_ERROR] = estimate_cell(metrics.cross_track_error)
+            values[settling_row(near)] = arrival.settling
+            values[OVERSHOOT_RATE] = arrival.overshoot_rate
     if metrics.course is not None:
-        cells[REACHED] = estimate_cell(metrics.course.reached)
-        cells[COMPLETED] = share_cell(metrics.course.completed)
-        cells[COURSE_TIME] = estimate_cell(metrics.course.time, none="never")
-    return cells
+        values[REACHED] = metrics.course.reached
+        values[COMPLETED] = metrics.course.completed
+        values[COURSE_TIME] = metrics.course.time
+    return {row: _measured(row, value) for row, value in values.items() if value is not None}
+
+
+def _measured(row: Row, value: Any) -> Cell:
+    """The cell of a number, an :class:`Estimate` or a :class:`Moment`."""
+    if isinstance(value, float):
+        return Cell(value, decimals=row.decimals)
+    if not isinstance(value, Moment):
+        # A share has as many digits as a single flight takes to show.
+        if row.unit == "%":
+            return estimate_cell(value, 100.0, decimals=len(str(value.n // 200)))
+        return estimate_cell(value, decimals=row.decimals)
+    # A mean time says how many flights it is of, unless it is all or none.
+    note = ""
+    if 0.0 < value.share.value < 1.0:
+        note = f"{100 * value.share.value:.3g} % {row.verb}"
+    return replace(estimate_cell(value.time, none="never"), note=note)
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
@@ -113,18 +125,13 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
 
 def reference_cells(reference: Reference) -> Cells:
     """Return others' metrics."""
-    numbers = {
-        REWARD: reference.reward,
-        PATH: reference.path,
-        MEDIAN: reference.final_error,
-        FLOWN: reference.flown,
-        RECOVERY_TIME: reference.recovery_time,
-    }
-    shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
-    cells = {row: _printed(number) for row, number in numbers.items() if number is not None}
-    for row, share in shares.items():
-        if share is not None:
-            cells[row] = replace(_printed(share, 100.0), note=reference.note)
+    cells = {}
+    rows = {**ROWS, "final_error": MEDIAN}
+    for name, number in reference:
+        if name in rows and number is not None:
+            cells[rows[name]] = _printed(number, 100.0 if rows[name].unit == "%" else 1.0)
+    for row in {SUCCESS, SURVIVAL} & {*cells}:
+        cells[row] = replace(cells[row], note=reference.note)
     # Here None has a meaning: never within the tolerance.
     for tolerance, time in reference.time_to.items():
         cells[time_row(tolerance)] = _printed(time)
@@ -140,42 +147,42 @@ def metric_rows(
     """
     # A controller that failed has one cell, which says so.
     failed = {SUCCESS: Cell(words="failed")}
-    ours = [failed if cells is None else cells for cells in measured]
+    ours = [cells or failed for cells in measured]
     others = [*map(reference_cells, references)]
-    none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells is not None)
+    none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells)
     rows = []
     for row in _rows_of(scenario):
-        own = [cells.get(row, Cell()) for cells in ours]
+        own = cells_of(row, ours)
         # A row without any number of ours is left out, whatever others measured.
-        if not any(cell != Cell() for cell in own):
+        if own == [NOTHING] * len(own):
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        for cells in others:
-            own.append(cells.get(row, Cell()))
-        rows.append(replace(row, cells=own))
+        rows.append(replace(row, cells=[*own, *cells_of(row, others)]))
     return rows
+
+
+def cells_of(row: Row, columns: Iterable[Cells]) -> list[Cell]:
+    """Return the cells of a row, empty in the columns that have none."""
+    return [cells.get(row, NOTHING) for cells in columns]
 
 
 def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a row, the best marked if its interval is apart from all others'."""
     if row in HIGHER_IS_BETTER:
         sign = 1.0
-    elif row == COURSE_TIME or row.name.startswith((TIME, SETTLING)):
+    elif row.verb:
         sign = -1.0
     else:
         return list(cells)
-    # The intervals, turned so that more is better; without a number a cell cannot win.
-    ends = np.full((2, len(cells)), -np.inf)
-    for number, cell in enumerate(cells):
-        if cell.value is not None:
-            ends[:, number] = sorted(np.multiply(sign, cell.ends or (cell.value, cell.value)))
+    # The intervals, turned so that more is better; NaN without a number, which cannot win.
+    ends = np.array([cell.ends or (cell.value, cell.value) for cell in cells], np.float64)
+    low, high = np.sort(sign * ends, axis=1).T
     marked = []
     for number, cell in enumerate(cells):
-        best_of_others = np.delete(ends[1], number).max(initial=-np.inf)
+        others = np.fmax.reduce(np.delete(high, number), initial=-np.inf)
         # A cell that is alone is not the best.
-        best = bool(ends[0, number] > best_of_others > -np.inf)
-        marked.append(replace(cell, best=best))
+        marked.append(replace(cell, best=bool(low[number] > others > -np.inf)))
     return marked
 
 
@@ -185,36 +192,40 @@ def overview(results: Results, controllers: Sequence[str]) -> Table:
     :param controllers: labels, in the order of their columns.
     """
     columns = [*map(Column, controllers)]
+    if any(map(attrgetter("reference"), results.scenarios)):
+        columns.append(Column(results.source, align="left"))
     rows = []
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
         for scenario in scenarios:
             rows += _section(results, controllers, scenario)
-            if scenario.reference and len(columns) == len(controllers):
-                columns.append(Column(results.source, align="left"))
     return Table(columns, rows, title=results.suite, caption=CAPTION)
 
 
 def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -> list[Row]:
     """The rows of a scenario in the overview."""
-    measured = [measured_cells(results, label, scenario) for label in controllers]
-    rows = metric_rows(scenario, measured, scenario.reference.values())
+    rows = scenario_rows(results, controllers, scenario)
+    values = axis_values(scenario.cell)
     section = []
     for row in rows:
-        names = [f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items()]
         # The values of a cell are name enough for its only row.
-        if len(rows) > 1 or not names:
-            names.append(row.name)
-        cells = [*row.cells[: len(controllers)]]
+        names = values if values and len(rows) == 1 else [*values, row.name]
         # All references share a column.
         words = []
         for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
-            if cell != Cell():
+            if cell != NOTHING:
                 words.append(f"{who} {replace(cell, note='').text}")
+        cells = [*row.cells[: len(controllers)]]
         if words:
             cells.append(Cell(words="; ".join(words)))
         section.append(Row(f"  {', '.join(names)}", row.unit, cells))
     return section
+
+
+def scenario_rows(results: Results, labels: Iterable[str], scenario: Scenario) -> list[Row]:
+    """Return the :func:`metric_rows` of a scenario: some controllers, then all references."""
+    measured = [measured_cells(results, label, scenario) for label in labels]
+    return metric_rows(scenario, measured, scenario.reference.values())
 
 
 def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
@@ -231,40 +242,31 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 
 def _rows_of(scenario: Scenario) -> list[Row]:
     """The rows that mean something in a scenario."""
-    common = [SUCCESS, SURVIVAL]
+    shares = [SUCCESS, SURVIVAL]
     if scenario.target.waypoints is not None:
-        return [*common, REACHED, COMPLETED, COURSE_TIME]
+        return [*shares, REACHED, COMPLETED, COURSE_TIME]
     if len(scenario.cell) > 1:
         return [SUCCESS]
     if scenario.group is not None:
-        return [*common, MEDIAN]
+        return [*shares, MEDIAN]
     rewards = [REWARD, OWN_REWARD]
     if scenario.target.distance == 0.0:
-        if scenario.is_fixed:
-            common.append(FLOWN)
         # An episode that starts at its target has no way to it.
-        return [*common, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
-    tolerances = scenario.tolerances
+        flown = [FLOWN] if scenario.is_fixed else []
+        return [*shares, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
+    tolerances = {*scenario.tolerances}
     if len(tolerances) > MOST_TOLERANCES:
         # Only the main ones and those of references; a plot shows the others.
-        kept = {tolerances[0], *MAIN_TOLERANCES}
+        kept = {min(tolerances), *MAIN_TOLERANCES}
         for reference in scenario.reference.values():
             kept |= {*map(float, reference.time_to)}
-        tolerances = tuple(sorted(kept & {*tolerances}))
+        tolerances &= kept
     settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
-    times = map(time_row, tolerances)
-    return [*common, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
+    times = map(time_row, sorted(tolerances))
+    return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
-def _moment(moment: Moment, verb: str) -> Cell:
-    """The mean time of an event; the note says how many flights reach it, unless all or none do."""
-    note = ""
-    if moment.time is not None and moment.share.value < 1.0:
-        note = f"{100 * moment.share.value:.3g} % {verb}"
-    return replace(estimate_cell(moment.time, none="never"), note=note)
-
-
-def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:
+def _printed(value: Printed, factor: float = 1.0) -> Cell:
     """A number as its source prints it; a pair is a range, None a time that never came."""
     if value is None:
         return Cell(words="never")

@@ -1,17 +1,17 @@
 """Many flights in a few metrics."""
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flights import Flights
-from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
 
 
-class Moment(Frozen, use_attribute_docstrings=True):
+class Moment(Frozen):
     """An event that a flight reaches at some time, or never."""
 
     share: Estimate
@@ -31,7 +31,7 @@ class Arrival(Moment):
     """share of the flights that arrived and left the tolerance again"""
 
 
-class Course(Frozen, use_attribute_docstrings=True):
+class Course(Frozen):
     """A course of waypoints."""
 
     reached: Estimate
@@ -42,7 +42,7 @@ class Course(Frozen, use_attribute_docstrings=True):
     """mean time until the last waypoint of those flights, s"""
 
 
-class Metrics(Frozen, use_attribute_docstrings=True):
+class Metrics(Frozen):
     """The metrics of one controller in one scenario; path and errors are means over survivors."""
 
     n: int
@@ -73,10 +73,6 @@ class Metrics(Frozen, use_attribute_docstrings=True):
     """m"""
     final_error_95: Estimate | None
     """95 % quantile of the final error, m"""
-    final_error_max: float | None
-    """m"""
-    final_offset: Vector | None
-    """mean r - r_T at the end, world frame, m"""
     recovery_time: Moment
     """flights that became stable again, and when"""
     cross_track_error: Estimate | None
@@ -89,18 +85,14 @@ def summarise(flights: Flights) -> Metrics:
     """Return the metrics of some flights, at least one."""
     survived = flights.survival
     error = flights.final_error[survived]
-    # These need a survivor: a quantile of nothing has no value.
-    errors: dict[str, Any] = dict.fromkeys(
-        ("final_error_median", "final_error_95", "final_error_max", "final_offset")
-    )
-    if error.size:
-        errors = {
-            "final_error_median": float(np.median(error)),
-            "final_error_95": bootstrap(error, _quantile_95),
-            "final_error_max": float(error.max()),
-            "final_offset": tuple(flights.final_offset[survived].mean(axis=0).tolist()),
-        }
-    overshoot = flights.overshoot[np.isfinite(flights.overshoot)]
+    course = None
+    if flights.waypoint_times.shape[1] > 0:
+        reached = np.isfinite(flights.waypoint_times)
+        course = Course(
+            reached=bootstrap(reached.sum(axis=1, dtype=np.float64)),
+            completed=share(reached.all(axis=1)),
+            time=mean(flights.waypoint_times[:, -1]),
+        )
     return Metrics(
         n=flights.n,
         success=share(flights.success),
@@ -111,13 +103,14 @@ def summarise(flights: Flights) -> Metrics:
         own_reward=mean(flights.own_reward),
         flown=bootstrap(flights.flown),
         arrivals=[_arrival(flights, tolerance) for tolerance in sorted(flights.time_to)],
-        overshoot=float(np.median(overshoot)) if overshoot.size else None,
+        overshoot=_median(flights.overshoot),
         path=mean(flights.path_length[survived]),
         final_error=mean(error),
-        **errors,
+        final_error_median=_median(error),
+        final_error_95=mean(error, partial(np.quantile, q=0.95)),
         recovery_time=Moment(**_moment(flights.recovery_time)),
         cross_track_error=mean(flights.cross_track_error[survived]),
-        course=_course(flights.waypoint_times),
+        course=course,
     )
 
 
@@ -133,21 +126,10 @@ def _arrival(flights: Flights, tolerance: float) -> Arrival:
     )
 
 
-def _course(waypoint_times: FloatArray) -> Course | None:
-    """The course of flights whose times at W waypoints are (n, W), NaN where not reached."""
-    if waypoint_times.shape[1] == 0:
-        return None
-    reached = np.isfinite(waypoint_times)
-    return Course(
-        reached=bootstrap(reached.sum(axis=1, dtype=np.float64)),
-        completed=share(reached.all(axis=1)),
-        time=mean(waypoint_times[:, -1]),
-    )
-
-
-def _moment(times: FloatArray) -> dict[str, Any]:
+def _moment(times: FloatArray) -> StrDict:
     return {"share": share(np.isfinite(times)), "time": mean(times)}
 
 
-def _quantile_95(values: FloatArray, axis: int) -> FloatArray:
-    return np.asarray(np.quantile(values, 0.95, axis=axis))
+def _median(values: FloatArray) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else None

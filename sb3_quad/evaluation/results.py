@@ -10,14 +10,17 @@ A number that does not exist is None, never NaN.
 
 import re
 from collections.abc import Iterable
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
+import pandas as pd
 
+from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays, write_csv
+from sb3_quad.base.files import read_arrays, write_text
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
@@ -35,7 +38,7 @@ _AXES = {
 }
 
 
-class ControllerRecord(Frozen, use_attribute_docstrings=True):
+class ControllerRecord(Frozen):
     """A controller that flew."""
 
     label: str
@@ -49,7 +52,7 @@ class ControllerRecord(Frozen, use_attribute_docstrings=True):
     """SHA-256 of the zip"""
 
 
-class Entry(Frozen, use_attribute_docstrings=True):
+class Entry(Frozen):
     """One controller in one scenario."""
 
     controller: str
@@ -75,7 +78,7 @@ class Entry(Frozen, use_attribute_docstrings=True):
         return self.scenario, self.controller
 
 
-class Failure(Frozen, use_attribute_docstrings=True):
+class Failure(Frozen):
     """A controller that could not be loaded, or did not get through a scenario."""
 
     controller: str
@@ -84,10 +87,10 @@ class Failure(Frozen, use_attribute_docstrings=True):
     message: str
 
 
-class Results(Frozen, use_attribute_docstrings=True):
+class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[5] = 5
+    schema_version: Literal[6] = 6
     suite: str
     description: str
     source: str = "reference"
@@ -98,21 +101,24 @@ class Results(Frozen, use_attribute_docstrings=True):
     controllers: list[ControllerRecord]
     scenarios: list[Scenario]
     entries: list[Entry]
-    failures: list[Failure] = Field(default_factory=list)
+    failures: list[Failure] = []
     digest: str = ""
     """hash of all inputs; an interrupted evaluation resumes only if it is unchanged"""
     finished: bool = True
     """whether all flights were flown"""
 
+    @property
+    def colours(self) -> dict[str, str]:
+        """The colours of the controllers in plots, ``#rrggbb``, by label."""
+        return colours_of([*map(attrgetter("label"), self.controllers)])
+
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """Return the entry of a controller's label and a scenario's name; None if it failed."""
-        for entry in self.entries:
-            if entry.name == (scenario, controller):
-                return entry
-        return None
+        entries = {entry.name: entry for entry in self.entries}
+        return entries.get((scenario, controller))
 
 
-def load_results(folder: str | Path) -> Results:
+def load_results(folder: StrPath) -> Results:
     """Read the ``results.json`` of a folder.
 
     :raises ConfigError: no such file, a damaged one, or one of another version.
@@ -138,45 +144,32 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
     """
-    rows: list[dict[str, Any]] = []
-    columns: dict[str, None] = {}
-    for entry in entries:
-        rows += _rows(entry, read_arrays(folder / entry.flights, "episode_"))
-        columns |= dict.fromkeys(rows[-1])  # scenarios differ in tolerances and waypoints
-    write_csv(folder / EPISODES, columns, rows)
+    # Scenarios differ in tolerances and waypoints, and so in their columns.
+    table = pd.concat([_table(folder, entry) for entry in entries])
+    # Nine digits tell any two float32 apart.
+    text = table.to_csv(index=False, float_format="%.9g", lineterminator="\n")
+    write_text(folder / EPISODES, text)
 
 
-def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
-    """The lines of a scenario's flights, one each."""
-    columns: dict[str, Any] = {name: arrays[f"episode_{name}"] for name in _COLUMNS}
+def _table(folder: Path, entry: Entry) -> pd.DataFrame:
+    """The flights of an entry, a line for each."""
+    arrays = read_arrays(folder / entry.flights, "episode_")
+    columns: StrDict = {
+        "controller": entry.controller,
+        "scenario": entry.scenario,
+        "episode": range(entry.metrics.n),
+    }
+    for name in _COLUMNS:
+        columns[name] = arrays[f"episode_{name}"]
     waypoints = arrays["episode_waypoints"]
-    # Arrays of several numbers become a column for each of them.
     columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
-    for name, axes in _AXES.items():
-        for axis, values in zip(axes.split(), arrays[f"episode_{name}"].T, strict=True):
-            columns[f"{name}_{axis}"] = values
-    for name in ("time_to", "settling_time"):
-        by_tolerance = zip(arrays["episode_tolerances"], arrays[f"episode_{name}"].T, strict=True)
-        for tolerance, values in by_tolerance:
-            columns[f"{name}_{tolerance:g}"] = values
+    # Arrays of several numbers become a column for each of them.
+    tolerances = " ".join(map("{:g}".format, arrays["episode_tolerances"]))
+    titles = {**_AXES, "time_to": tolerances, "settling_time": tolerances}
+    for name, parts in titles.items():
+        for part, values in zip(parts.split(), arrays[f"episode_{name}"].T, strict=True):
+            columns[f"{name}_{part}"] = values
     columns["overshoot"] = arrays["episode_overshoot"]
     for number, values in enumerate(waypoints.T, 1):
         columns[f"waypoint_{number}"] = values
-    rows = []
-    for episode in range(entry.metrics.n):
-        row: dict[str, Any] = {
-            "controller": entry.controller,
-            "scenario": entry.scenario,
-            "episode": episode,
-        }
-        for name, values in columns.items():
-            row[name] = _written(values[episode])
-        rows.append(row)
-    return rows
-
-
-def _written(value: Any) -> str:
-    # Nine digits tell any two float32 apart; a number that does not exist stays empty.
-    if not isinstance(value, np.floating):
-        return str(value)
-    return f"{value:.9g}" if np.isfinite(value) else ""
+    return pd.DataFrame(columns)

@@ -14,10 +14,11 @@ from sb3_quad.base.validate import Frozen
 
 Z = 1.959963984540054  # the 97.5 % quantile of the normal distribution
 RESAMPLES = 1000
+Statistic = Callable[..., Any]
 BLOCK = 2**21  # values that a bootstrap holds at once, 16 MiB
 
 
-class Estimate(Frozen, use_attribute_docstrings=True):
+class Estimate(Frozen):
     """A statistic of a sample with its 95 % interval."""
 
     value: float
@@ -32,7 +33,7 @@ def share(hits: npt.ArrayLike) -> Estimate:
 
     :param hits: bool, (n,), n at least 1.
     """
-    array = np.asarray(hits, dtype=np.bool_)
+    array = np.asarray(hits, bool)
     n = array.size
     p = float(array.mean())
     scale = 1 + Z * Z / n
@@ -43,14 +44,13 @@ def share(hits: npt.ArrayLike) -> Estimate:
     return Estimate(value=p, low=min(p, low), high=max(p, high), n=n)
 
 
-def mean(values: npt.ArrayLike) -> Estimate | None:
-    """Estimate the mean of the finite values with its bootstrap interval; None without any."""
-    array = np.asarray(values, dtype=np.float64)
-    finite = array[np.isfinite(array)]
-    return bootstrap(finite) if finite.size else None
+def mean(values: FloatArray, statistic: Statistic = np.mean) -> Estimate | None:
+    """Return the :func:`bootstrap` of the finite values; None without any."""
+    finite = values[np.isfinite(values)]
+    return bootstrap(finite, statistic) if finite.size else None
 
 
-def bootstrap(values: FloatArray, statistic: Callable[..., Any] = np.mean) -> Estimate:
+def bootstrap(values: FloatArray, statistic: Statistic = np.mean) -> Estimate:
     """Estimate a statistic with the percentile bootstrap's interval (Efron, 1979).
 
     The same values give the same interval: the resamples are those of a fixed seed.

@@ -2,10 +2,10 @@
 intervals, or words.
 """
 
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape as escape_html
+from operator import attrgetter
 from typing import Literal
 
 import rich.console
@@ -87,11 +87,17 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """A metric with its unit, and a cell for each column; without cells it is a heading."""
+    """A metric with its unit, and a cell for each column; without cells it is a heading.
+
+    :param decimals: of its cells.
+    :param verb: what the flights do whose mean time it holds, of which less is better.
+    """
 
     name: str
     unit: str = ""
     cells: Sequence[Cell] = ()
+    decimals: int = 2
+    verb: str = ""
 
     @property
     def heading(self) -> str:
@@ -118,24 +124,27 @@ class Table:
 
         Names are escaped, so that none becomes HTML.
         """
-        lines = [
-            _markdown([self.corner, *self._headings]),
-            _markdown(["---"] * (1 + len(self.columns))),
-        ]
+        rows = [[self.corner, *self._headings], ["---"] * (1 + len(self.columns))]
         for row in self.rows:
             texts = [f"**{cell.text}**" if cell.best else cell.text for cell in row.cells]
-            lines.append(_markdown([row.heading, *texts]))
-        return "\n".join(lines)
+            rows.append([row.heading, *texts])
+        lines = []
+        for texts in rows:
+            # The bar that divides cells may not be in them.
+            line = "\t".join(texts).replace("|", "/").replace("\t", " | ")
+            lines.append(f"| {line} |")
+        return escape_html("\n".join(lines), quote=False)
 
     @property
     def _headings(self) -> list[str]:
-        return [column.heading for column in self.columns]
+        return [*map(attrgetter("heading"), self.columns)]
 
     def __str__(self) -> str:
         """The table as plain text."""
-        console = rich.console.Console(file=io.StringIO(), width=WIDTH, color_system=None)
-        console.print(self)
-        return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+        console = rich.console.Console(width=WIDTH, color_system=None)
+        with console.capture() as capture:
+            console.print(self)
+        return capture.get()
 
     def __rich__(self) -> rich.table.Table:
         """The table as ``rich`` prints it; the best of a row is bold."""
@@ -148,12 +157,12 @@ class Table:
         for column in self.columns:
             table.add_column(Text(column.heading), justify=column.align)
         for row in self.rows:
-            if not row.cells:
+            if row.cells:
+                texts = [Text(cell.text, "bold" if cell.best else "") for cell in row.cells]
+                table.add_row(row.heading, *texts)
+            else:
                 table.add_section()
                 table.add_row(Text(row.heading, "bold"))
-                continue
-            texts = [Text(cell.text, "bold" if cell.best else "") for cell in row.cells]
-            table.add_row(row.heading, *texts)
         return table
 
 
@@ -165,14 +174,9 @@ def text_table(
     :param heads: of all columns, that of the rows' names first.
     :param rows: each begins with its name.
     """
-    columns = [Column(head, align=align) for head in heads[1:]]
+    corner, *names = heads
+    columns = [Column(name, align=align) for name in names]
     filled = []
     for name, *texts in rows:
         filled.append(Row(name, "", [Cell(words=text) for text in texts]))
-    return Table(columns, filled, heads[0], title)
-
-
-def _markdown(texts: Iterable[str]) -> str:
-    """A line of a table; the bar that divides its cells may not be in them."""
-    cells = [escape_html(text.replace("|", "/"), False) for text in texts]
-    return f"| {' | '.join(cells)} |"
+    return Table(columns, filled, corner, title)

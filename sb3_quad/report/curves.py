@@ -3,13 +3,11 @@
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from itertools import chain, cycle
 
-import numpy as np
-from matplotlib.axes import Axes
+import pandas as pd
 from matplotlib.figure import Figure
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.learning_curves import Curve
@@ -48,8 +46,7 @@ def plot_curves(
         has; success, if the runs have it, and reward by default.
     :raises ConfigError: a panel that no curve has values for.
     """
-    curves = [curve for group in groups.values() for curve in group]
-    measures = _measures(curves, show)
+    measures = _measures([*chain.from_iterable(groups.values())], show)
     figure = Figure(figsize=(11, 1.2 + 2.65 * len(measures)), layout="constrained")
     panels = figure.subplots(len(measures), 2, sharex="col", sharey="row", squeeze=False)
     colours = colours_of([*groups])
@@ -60,12 +57,15 @@ def plot_curves(
             panel.label_outer()
             # The seeds of an agent are one line with a band.
             for name, runs in groups.items():
-                points = _mean_and_range(runs, axis, measure)
-                if points is not None:
-                    seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
-                    times, ends = points
-                    band(panel, colours[name], name + seeds, times / unit, factor * ends, **POINTS)
-            _horizontal_lines(panel, measure, factor, lines)
+                points = _mean_and_range(runs, axis, measure) * factor
+                seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
+                if len(points):
+                    times = points.index / unit
+                    band(panel, colours[name], name + seeds, times, points.to_numpy().T, **POINTS)
+            for style, (name, heights) in zip(cycle(("--", ":", "-.")), lines.items()):
+                if measure in heights:
+                    height = heights[measure] * factor
+                    panel.axhline(height, color="0.3", ls=style, linewidth=1.2, label=name)
     # A title of the figure would lie on the legend.
     panels[0, 0].set_title(title, loc="left")
     legend(figure)
@@ -74,51 +74,27 @@ def plot_curves(
 
 def _measures(curves: Sequence[Curve], show: Sequence[str]) -> list[str]:
     """The measures that get a row of panels."""
-    present: dict[str, None] = {}
-    for curve in curves:
-        for name, values in curve.measures.items():
-            if not np.isnan(values).all():
-                present[name] = None
-    losses = [name for name in present if name.endswith("loss")]
+    # Runs of different algorithms have different losses: all of them are shown.
+    table = pd.concat([pd.DataFrame(dict(curve.measures)) for curve in curves])
+    present = table.dropna(axis="columns", how="all")
+    losses = [*present.filter(regex="loss$")]
     if not show:
         show = ["success", "reward"] if "success" in present else ["reward"]
-    measures = []
-    # Runs of different algorithms have different losses: all of them are shown.
+    measures: list[str] = []
     for name in show:
-        measures += losses if name == "losses" else [name]
-        if name not in present and not (name == "losses" and losses):
+        chosen = losses if name == "losses" else [name]
+        if not chosen or not {*chosen} <= {*present.columns}:
             raise ConfigError(f"{name}: the runs' evaluations hold none")
+        measures += chosen
     return measures
 
 
-def _mean_and_range(
-    runs: Sequence[Curve], axis: str, measure: str
-) -> tuple[FloatArray, FloatArray] | None:
-    """Times of the first run, (k,), and the runs' mean, least and greatest value there, (3, k).
+def _mean_and_range(runs: Sequence[Curve], axis: str, measure: str) -> pd.DataFrame:
+    """The mean, the least and the greatest value of the runs, at the times of their evaluations.
 
-    None if a run has no value.
+    Between its evaluations a run is interpolated. There is no line where a run has no values.
     """
-    known = []
-    for curve in runs:
-        values = curve.values(measure)
-        finite = np.isfinite(values)
-        if not finite.any():
-            return None
-        known.append((getattr(curve, axis)[finite], values[finite]))
-    # Where all runs have values; between its evaluations a run is interpolated.
-    first = max(times[0] for times, _ in known)
-    last = min(times[-1] for times, _ in known)
-    grid = np.clip(known[0][0], first, last)
-    heights = [np.interp(grid, times, values) for times, values in known]
-    return grid, np.stack(
-        [np.mean(heights, axis=0), np.min(heights, axis=0), np.max(heights, axis=0)]
-    )
-
-
-def _horizontal_lines(
-    panel: Axes, measure: str, factor: float, lines: Mapping[str, Mapping[str, float]]
-) -> None:
-    for style, (name, heights) in zip(cycle(("--", ":", "-.")), lines.items(), strict=False):
-        if measure in heights:
-            height = heights[measure] * factor
-            panel.axhline(height, color="0.3", linestyle=style, linewidth=1.2, label=name)
+    lines = [pd.Series(curve.values(measure), getattr(curve, axis)).dropna() for curve in runs]
+    table = pd.concat(lines, axis="columns").sort_index()
+    table = table.interpolate("index", limit_area="inside").dropna()
+    return table.agg(["mean", "min", "max"], axis="columns")

@@ -2,14 +2,15 @@
 ``report.html``.
 """
 
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
 from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.report.plots import Plot
 
@@ -34,7 +35,7 @@ class Section:
     facts: str = ""
 
 
-def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Section]) -> Path:
+def write_page(folder: StrPath, title: str, facts: str, sections: Sequence[Section]) -> Path:
     """Write ``report.md`` with the tables, ``figures/`` with each plot as PNG, and the page,
     ``report.html``.
 
@@ -45,38 +46,23 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
     :raises ConfigError: a folder that cannot be written.
     """
     folder = Path(folder)
-    write_text(folder / MARKDOWN, _markdown(title, sections))
+    content = {"title": title, "facts": facts, "sections": sections, "pictures": PICTURES}
+    write_text(folder / MARKDOWN, render("page.md.j2", **content))
     for section in sections:
         for plot in section.plots:
             write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
-    write_text(folder / PAGE, render(title, facts, sections))
+    write_text(folder / PAGE, render("page.html.j2", **content))
     return folder / PAGE
 
 
-def render(title: str, facts: str, sections: Sequence[Section]) -> str:
-    """Return the page as text, which expects its plots as files in ``figures/``."""
+def render(template: str, **content: Any) -> str:
+    """Return the text that a template of this package makes of its content."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sb3_quad.report", "templates"),
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(["html.j2"]),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
-    template = environment.get_template("page.html.j2")
-    return template.render(title=title, facts=facts, sections=sections, pictures=PICTURES)
-
-
-def _markdown(title: str, sections: Sequence[Section]) -> str:
-    """Return headings, descriptions and tables as text, for the pages of a repository."""
-    blocks = [f"# {_escape(title)}"]
-    for section in sections:
-        texts = (section.heading, section.description, section.facts)
-        heading, *paragraphs = map(_escape, texts)
-        blocks += [f"## {heading}", *paragraphs]
-        blocks += [table.markdown() for table in section.tables]
-    return "\n\n".join(filter(None, blocks)) + "\n"
-
-
-def _escape(text: str) -> str:
-    """Return a text as one line that holds no HTML."""
-    return html.escape(" ".join(text.split()), False)
+    return environment.get_template(template).render(content)

@@ -4,6 +4,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -12,12 +13,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.statistics import Estimate
 
-INK = "#1c2430"  # of text
-QUIET = "#5c6672"  # of small print
-GRID = "#dfe3e8"
-PAPER = "#ffffff"  # of the background
+INK = "#1c2430"
+# The colours of the style, by their names in the page's own, which may be dark.
+COLOURS = {INK: "ink", "#5c6672": "quiet", "#dfe3e8": "grid", "#ffffff": "paper"}
 # Inches: two stand side by side in the page, and one can be read on a telephone.
 WIDTH = 5.0
 HEIGHT = 3.3
@@ -26,24 +27,9 @@ DPI = 150
 LETTERS = 13
 MARK = 8
 POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
-STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "sb3_quad",
-    "text.parse_math": False,
-    "grid.color": GRID,
-    "figure.facecolor": PAPER,
-    "axes.facecolor": PAPER,
-    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), INK),
-    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), QUIET),
-}
+STYLE = matplotlib.rc_params_from_file(
+    Path(__file__).parent / "templates/plots.mplstyle", use_default_template=False
+)
 styled = matplotlib.rc_context(STYLE)
 # None removes these from the file, so that the same results give the same bytes.
 METADATA: Any = dict.fromkeys(("Date", "Creator", "Format", "Type"))
@@ -67,7 +53,7 @@ class Plot:
         """The plot as an ``svg`` element in the page's colours, which may be dark."""
         text = picture(self.figure, "svg", bbox_inches="tight", metadata=METADATA).decode("utf-8")
         text = text[text.index("<svg") :]
-        for colour, name in ((INK, "ink"), (QUIET, "quiet"), (GRID, "grid"), (PAPER, "paper")):
+        for colour, name in COLOURS.items():
             text = text.replace(colour, f"var(--{name})")
         # Groups have the same names in every plot, and names must be unique in a page.
         text = re.sub(r' id="[a-zA-Z0-9]+_\d+"', "", text)
@@ -88,10 +74,10 @@ def picture(figure: Figure, kind: str, **options: Any) -> bytes:
 
 def legend(figure: Figure) -> None:
     """Write every name in the figure once, outside of its axes, in as many columns as have room."""
-    handles = {}
+    handles: StrDict = {}
     for axes in figure.axes:
-        for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
-            handles[name] = handle
+        drawn, names = axes.get_legend_handles_labels()
+        handles.update(zip(names, drawn, strict=True))
     longest = max(map(len, handles), default=0) + MARK
     columns = max(1, int(LETTERS * figure.get_figwidth() / longest))
     figure.legend([*handles.values()], [*handles], loc="outside upper left", ncols=columns)

@@ -1,9 +1,11 @@
 """The plots of a scenario: paths, times to its target, distances from it, what ``vary`` changes."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -54,7 +56,7 @@ def arrivals_plot(
     width = 0.75 / len(metrics)
     # A group of bars at each tolerance, one for each controller.
     for number, (label, measured) in enumerate(metrics.items()):
-        value, low, high = interval_ends([arrival.time for arrival in measured.arrivals])
+        value, low, high = interval_ends([*map(attrgetter("time"), measured.arrivals)])
         axes.bar(
             places + (number - 0.5 * (len(metrics) - 1)) * width,
             value,
@@ -64,7 +66,7 @@ def arrivals_plot(
             yerr=np.stack([value - low, high - value]),
             error_kw={"ecolor": INK, "elinewidth": 0.9, "capsize": 2},
         )
-    axes.set_xticks(places, [f"{tolerance:g}" for tolerance in scenario.tolerances])
+    axes.set_xticks(places, [*map("{:g}".format, scenario.tolerances)])
     axes.grid(axis="x", visible=False)
     legend(figure)
     caption = (
@@ -133,45 +135,43 @@ def errors_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plo
 
 def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
     """Times, (k,), and the median, least and greatest error, (3, k); NaN where it is infinite."""
-    times = max((track.times for track in tracks), key=len)
+    longest = max(tracks, key=lambda track: len(track.times))
     # A flight that has ended early is lost, infinitely far away.
-    errors = np.full((len(tracks), len(times)), np.inf)
-    for row, track in enumerate(tracks):
-        errors[row, : len(track.times)] = track.error
-    stride = -(-len(times) // LINE_POINTS)
-    ends = np.quantile(errors[:, ::stride], (0.5, 0.0, 1.0), axis=0, method="higher")
-    ends[np.isinf(ends)] = np.nan
-    return times[::stride], ends
+    errors = pd.DataFrame(map(attrgetter("error"), tracks)).fillna(np.inf)
+    stride = -(-errors.shape[1] // LINE_POINTS)
+    ends = np.quantile(errors, (0.5, 0.0, 1.0), axis=0, method="higher")[:, ::stride]
+    return longest.times[::stride], np.where(np.isinf(ends), np.nan, ends)
 
 
 @styled
-def group_plots(
-    results: Results, scenarios: Sequence[Scenario], colours: Mapping[str, str]
-) -> list[Plot]:
+def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
     """Draw the cells that ``vary`` makes of a scenario: success over each quantity, the final error
     over a single one.
-
-    :param colours: by the labels of the controllers.
     """
     group = scenarios[0].group
+    table = _cells(results, scenarios)
     keys = [*scenarios[0].cell]
+    spread = "with 95 % intervals"
+    if len(keys) > 1:
+        spread = "mean, least and greatest over the other quantities"
     plots = []
     for number, key in enumerate(keys):
-        name = f"{group}_success" if len(keys) == 1 else f"{group}_{number}_success"
+        name = f"{group}_success"
+        if len(keys) > 1:
+            name = f"{group}_{number}_success"
         figure, axes = new_axes(axis_label(key, scenarios[0]), "success (%)")
-        for label, colour in colours.items():
-            metrics = _by_value(results, scenarios, label, key)
-            _draw_success(axes, metrics, label, colour, several=len(keys) > 1)
+        for label, flown in table.groupby("label", sort=False):
+            shares = flown.groupby(key).agg({"success": "mean", "low": "min", "high": "max"})
+            ends = 100.0 * shares.to_numpy().T
+            band(axes, results.colours[label], label, shares.index, ends, **POINTS)
         axes.set_ylim(-3.0, 103.0)
         legend(figure)
-        spread = "with 95 % intervals"
-        if len(keys) > 1:
-            spread = "mean, least and greatest over the other quantities"
         plots.append(Plot(name, f"Success, {spread}.", figure))
     if len(keys) == 1:
         figure, axes = new_axes(axis_label(keys[0], scenarios[0]), "final error (m)")
-        for label, colour in colours.items():
-            _draw_error(axes, _by_value(results, scenarios, label, keys[0]), label, colour)
+        for label, flown in table.dropna(subset="error").groupby("label", sort=False):
+            errors = flown.set_index(keys[0])["error"].sort_index().clip(lower=LEAST_ERROR)
+            axes.plot(errors, color=results.colours[label], label=label, **POINTS)
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
         legend(figure)
@@ -183,47 +183,25 @@ def group_plots(
     return plots
 
 
-def _by_value(
-    results: Results, scenarios: Sequence[Scenario], label: str, key: str
-) -> dict[float, list[Metrics]]:
-    """The metrics of a controller by the values of a varied key, rising; failures are not in it."""
-    metrics: dict[float, list[Metrics]] = {}
-    for scenario in sorted(scenarios, key=lambda cell: cell.cell[key]):
-        entry = results.entry(label, scenario.name)
-        if entry is not None:
-            metrics.setdefault(scenario.cell[key], []).append(entry.metrics)
-    return metrics
+def _cells(results: Results, scenarios: Sequence[Scenario]) -> pd.DataFrame:
+    """A line for each controller in each cell that it did not fail in.
 
-
-def _draw_success(
-    axes: Axes,
-    metrics: Mapping[float, Sequence[Metrics]],
-    label: str,
-    colour: str,
-    several: bool,
-) -> None:
-    """A band of success over a quantity.
-
-    It is the interval; of several quantities, the least and the greatest share over the others.
+    Of several quantities, the ends are the share itself, so that they become the least and the
+    greatest over the others. There is no error where most flights are lost.
     """
-    ends = []
-    for measured in metrics.values():
-        value, low, high = interval_ends([cell.success for cell in measured], 100.0)
-        if several:
-            ends.append([value.mean(), value.min(), value.max()])
-        else:
-            ends.append([value[0], low[0], high[0]])
-    if ends:
-        band(axes, colour, label, np.array([*metrics]), np.transpose(ends), **POINTS)
-
-
-def _draw_error(
-    axes: Axes, metrics: Mapping[float, Sequence[Metrics]], label: str, colour: str
-) -> None:
-    """A line of the median final error over a quantity, where at least half the flights survive."""
-    errors = {}
-    for value, measured in metrics.items():
-        if measured[0].survival.value >= 0.5 and measured[0].final_error_median is not None:
-            errors[value] = max(measured[0].final_error_median, LEAST_ERROR)
-    if errors:
-        axes.plot([*errors], [*errors.values()], color=colour, label=label, **POINTS)
+    keys = scenarios[0].cell
+    rows = []
+    for label in results.colours:
+        for scenario in scenarios:
+            entry = results.entry(label, scenario.name)
+            if entry is not None:
+                success = entry.metrics.success
+                ends = (success.low, success.high)
+                if len(keys) > 1:
+                    ends = (success.value, success.value)
+                error = entry.metrics.final_error_median
+                if entry.metrics.survival.value < 0.5:
+                    error = None
+                rows.append((*scenario.cell.values(), label, success.value, *ends, error))
+    columns = [*keys, "label", "success", "low", "high", "error"]
+    return pd.DataFrame(rows, columns=columns).astype({"error": np.float64})

@@ -5,15 +5,16 @@ With ``vary``, one scenario is written down and a grid of them is flown, for hea
 
 import copy
 import itertools
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import validate
-from sb3_quad.base.yaml_files import YamlFolder, parse_yaml
+from sb3_quad.base.yaml_files import YamlFolder, parse_keys
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 from sb3_quad.vehicles.vehicle import VEHICLES
 
@@ -43,11 +44,13 @@ UNITS = {
 }
 # The units of wrenches with `unit: weight`.
 WEIGHTS = {"force": "weights", "torque": "weights × arm length"}
+# The types that the values of an axis may have.
+NUMBERS = ({int}, {float}, {int, float})
 # Parts of a key that its short name does not need.
 _SILENT = {"magnitude", "std", "value"}
 
 
-def load_suite(source: str | Path) -> Suite:
+def load_suite(source: StrPath) -> Suite:
     """Read a suite by name (``"thesis"``) or by the path of a YAML file.
 
     :raises ConfigError: an unknown name, a missing or unreadable file, an unknown key (the nearest
@@ -64,8 +67,8 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     :param folder: what the paths of vehicle files are relative to.
     :raises ConfigError: see :func:`load_suite`.
     """
-    data = parse_yaml(content, where)
-    entries = data.get("scenarios") if isinstance(data, dict) else None
+    data = parse_keys(content, where)
+    entries = data.get("scenarios")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise ConfigError(
             f"{where}: must hold 'name' and a list 'scenarios', each with keys and values"
@@ -82,7 +85,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     return validate(Suite, {**data, "scenarios": scenarios}, where)
 
 
-def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
+def grid(entry: StrMapping, where: str) -> list[StrDict]:
     """Return the scenarios of one entry: a cell for each combination of the values in ``vary``.
 
     Without ``vary`` it is the entry alone.
@@ -95,12 +98,14 @@ def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         return [dict(entry)]
     plain = dict(entry)
     axes = plain.pop("vary")
-    if not isinstance(axes, Mapping) or not axes:
+    if not isinstance(axes, dict) or not axes:
         raise ConfigError(
             f"{where}: vary must map keys to lists of numbers, such as 'noise: [0, 0.05, 0.1]'"
         )
     for key, values in axes.items():
-        if not _are_different_numbers(values):
+        # A bool is an int to Python, but no number to a reader.
+        numbers = isinstance(values, list) and {*map(type, values)} in NUMBERS
+        if not numbers or len({*values}) < len(values) or not np.isfinite(values).all():
             raise ConfigError(
                 f"{where}: vary.{key} must be a list of different numbers, not {values!r}"
             )
@@ -109,32 +114,24 @@ def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         # Keys may lead into nested parts, which the cells must not share.
         cell = copy.deepcopy(plain)
         cell["cell"] = dict(zip(map(str, axes), values, strict=True))
-        titles = []
         for key, value in cell["cell"].items():
             put_key(cell, key, value, f"{where}: vary.{key}")
-            titles.append(f"{axis_name(key)} {value:g}")
         name = plain.get("name")
         cell["group"] = name
-        cell["title"] = f"{plain.get('title') or name}: {', '.join(titles)}"
+        cell["title"] = f"{plain.get('title') or name}: {', '.join(axis_values(cell['cell']))}"
         cell["name"] = f"{name}.{'_'.join(map('{:g}'.format, values))}"
         cells.append(cell)
     return cells
 
 
-def _are_different_numbers(values: Any) -> bool:
-    if not isinstance(values, list) or not values:
-        return False
-    for value in values:
-        # A bool is an int to Python, but no number to a reader.
-        if type(value) not in (int, float) or not math.isfinite(value):
-            return False
-    return len(set(values)) == len(values)
-
-
 def axis_name(key: str) -> str:
     """Return the short name of a varied key: ``start.body_rates.magnitude`` is ``body_rates``."""
-    parts = [part for part in key.split(".") if part not in _SILENT and not part.isdigit()]
-    return parts[-1]
+    return [part for part in key.split(".") if part not in _SILENT and not part.isdigit()][-1]
+
+
+def axis_values(cell: Mapping[str, float]) -> list[str]:
+    """Return the short names of varied keys, each with its value."""
+    return [f"{axis_name(key)} {value:g}" for key, value in cell.items()]
 
 
 def axis_label(key: str, scenario: Scenario | None = None) -> str:
@@ -145,11 +142,9 @@ def axis_label(key: str, scenario: Scenario | None = None) -> str:
     name = axis_name(key)
     unit = UNITS.get(name)
     # The unit of a wrench may differ from scenario to scenario.
-    if name in WEIGHTS and scenario is not None and key.startswith("wrenches."):
+    if scenario is not None and key.startswith("wrenches."):
         wrench = scenario.wrenches[int(key.split(".")[1])]
         if wrench.unit == "weight":
-            unit = WEIGHTS[name]
+            unit = WEIGHTS.get(name, unit)
     label = name.replace("_", " ")
-    if unit is not None:
-        label += f" ({unit})"
-    return label
+    return f"{label} ({unit})" if unit else label

@@ -13,11 +13,12 @@ from sb3_quad.base.validate import Frozen
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 Frame = Literal["world", "body"]
 Factor = Annotated[float, Field(ge=0.1, le=10)]
 
 
-class OneOf(Frozen, use_attribute_docstrings=True):
+class OneOf(Frozen):
     """A part with several ways to give it; a file uses exactly one. A list is the first way."""
 
     ways: ClassVar[tuple[str, ...]]
@@ -56,17 +57,6 @@ class VectorDistribution(OneOf):
     magnitude: NonNegativeFloat | None = None
     """length, in the same unit; the direction is random"""
 
-    @property
-    def largest(self) -> float:
-        """The greatest length that is likely: for ``std``, three standard deviations in each
-        component.
-        """
-        if self.value is not None:
-            return math.hypot(*self.value)
-        if self.magnitude is not None:
-            return self.magnitude
-        return 3.0 * math.sqrt(3.0) * (self.std or 0.0)
-
 
 ZERO = VectorDistribution(value=(0.0, 0.0, 0.0))
 
@@ -78,7 +68,7 @@ class Attitude(OneOf):
 
     ways = ("quaternion", "tilt", "distribution")
 
-    quaternion: tuple[float, float, float, float] | None = None
+    quaternion: Quaternion | None = None
     """w, x, y, z, body to world; is normalised"""
     tilt: Annotated[float, Field(ge=0, le=180)] | None = None
     """angle between body z and world z, deg; about a random horizontal axis"""
@@ -88,26 +78,23 @@ class Attitude(OneOf):
     @model_validator(mode="before")
     @classmethod
     def _from_word(cls, data: Any) -> Any:
-        if data == "level":
-            return {"tilt": 0.0}
-        if data == "uniform":
-            return {"distribution": "uniform"}
-        if isinstance(data, str):
-            names = unknown("attitude", data, ("level", "uniform"))
+        words = {"level": {"tilt": 0.0}, "uniform": {"distribution": "uniform"}}
+        if not isinstance(data, str):
+            return data
+        if data not in words:
+            names = unknown("attitude", data, words)
             raise ValueError(f"{names}, or {{quaternion: …}}, or {{tilt: …}}")
-        return data
+        return words[data]
 
     @field_validator("quaternion")
     @classmethod
-    def _not_zero(
-        cls, value: tuple[float, float, float, float] | None
-    ) -> tuple[float, float, float, float] | None:
+    def _not_zero(cls, value: Quaternion | None) -> Quaternion | None:
         if value is not None and math.hypot(*value) < 1e-6:
             raise ValueError("must not be zero")
         return value
 
 
-class Start(Frozen, use_attribute_docstrings=True):
+class Start(Frozen):
     """Where and how an episode starts; rotors turn at hover speed."""
 
     position: Vector = (0.0, 0.0, 15.0)
@@ -155,7 +142,7 @@ class Target(OneOf):
         return self.waypoints or ()
 
 
-class Wrench(Frozen, use_attribute_docstrings=True):
+class Wrench(Frozen):
     """An external force and torque at the centre of mass for some time; several add up."""
 
     start: NonNegativeFloat = 0.0
@@ -183,7 +170,7 @@ class Wrench(Frozen, use_attribute_docstrings=True):
         return weight, weight * vehicle.arm_length
 
 
-class VehicleChanges(Frozen, use_attribute_docstrings=True):
+class VehicleChanges(Frozen):
     """Differences of the vehicle that flies from the one its controller was made for.
 
     Motors and limits stay as they are.
@@ -209,12 +196,13 @@ class VehicleChanges(Frozen, use_attribute_docstrings=True):
         """
         if self == VehicleChanges():
             return vehicle
-        low, high = vehicle.thrust_limits
+        inertia = np.multiply(vehicle.inertia, self.inertia)
+        thrust_limits = np.divide(vehicle.thrust_limits, self.mass)
         return vehicle.model_copy(
             update={
                 "mass": vehicle.mass * self.mass,
-                "inertia": tuple((np.array(vehicle.inertia) * self.inertia).tolist()),
-                "thrust_limits": (low / self.mass, high / self.mass),
+                "inertia": tuple(inertia.tolist()),
+                "thrust_limits": tuple(thrust_limits.tolist()),
                 "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
                 "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,
                 "delay": vehicle.delay if self.delay is None else self.delay,

@@ -43,7 +43,7 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     generators = [np.random.default_rng([SCENARIO_STREAM, seed]) for seed in seeds]
     attitude = scenario.start.attitude
     target = scenario.target
-    start: dict[str, FloatArray] = {}
+    start = {}
     # The task samples uniform attitudes and normal velocities itself.
     if attitude.distribution is None:
         start["quaternion"] = _quaternions(attitude, generators)
@@ -55,14 +55,11 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
         rotation = rotation_matrices(start["quaternion"])
         start["velocity"] = np.einsum("nij,nj->ni", rotation, start["velocity"])
     if target.points:
-        start["target"] = np.tile(np.array(target.points[0]), (len(seeds), 1))
+        start["target"] = np.tile(target.points[0], (len(seeds), 1))
     vehicle = scenario.nominal_vehicle()
-    return Plan(
-        start,
-        sample_wrenches(scenario.wrenches, vehicle, scenario.steps, generators),
-        np.array(target.waypoints or np.zeros((0, 3))),
-        target.radius or Plan.radius,
-    )
+    wrenches = sample_wrenches(scenario.wrenches, vehicle, scenario.steps, generators)
+    waypoints = np.array(target.waypoints or ()).reshape(-1, 3)
+    return Plan(start, wrenches, waypoints, target.radius or Plan.radius)
 
 
 def sample_wrenches(
@@ -85,24 +82,24 @@ def sample_wrenches(
         force = newton * _vectors(wrench.force, generators)
         torque = newton_metre * _vectors(wrench.torque, generators)
         values = make_wrench(force, torque, wrench.force_frame, wrench.torque_frame).T
-        acting.append((first, last, wrench.factor * values))
+        acting.append((range(first, last), wrench.factor * values))
         times |= {first, last}
     # The sum changes only where a wrench begins or ends.
     sums = {}
-    for time in sorted(times):
-        if time < steps:
-            sums[time] = np.zeros((len(generators), WRENCH_SIZE))
-            for first, last, values in acting:
-                if first <= time < last:
-                    sums[time] = sums[time] + values
+    for time in sorted(times & {*range(steps)}):
+        sums[time] = np.zeros((len(generators), WRENCH_SIZE))
+        for when, values in acting:
+            if time in when:
+                sums[time] += values
     return sums
 
 
 def _vectors(distribution: VectorDistribution, generators: Generators) -> FloatArray:
     if distribution.value is not None:
-        return np.tile(np.array(distribution.value), (len(generators), 1))
+        return np.tile(distribution.value, (len(generators), 1))
     if distribution.std is not None:
         return distribution.std * _normals(generators, 3)
+    # Nothing is drawn for a magnitude of zero.
     if not distribution.magnitude:
         return np.zeros((len(generators), 3))
     return distribution.magnitude * _directions(generators, 3)

@@ -1,14 +1,17 @@
 """A scenario: one way to judge a controller, flown many times; and a suite of them."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from functools import cache
+from operator import attrgetter
 from typing import Annotated, Any
 
 from pydantic import Field, PositiveFloat, ValidationError, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.randomization import Randomization
@@ -21,27 +24,27 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_veh
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
 DEFAULT_VEHICLE = "itm"
-NumberOrRange = float | tuple[float, float]
+Printed = float | tuple[float, float] | None  # None: not known
 
 
-class Reference(Frozen, use_attribute_docstrings=True):
+class Reference(Frozen):
     """Metrics that others measured, printed next to our own; a pair is a range."""
 
-    success: NumberOrRange | None = None
+    success: Printed = None
     """share of flights that end at their target, 0 to 1"""
-    survival: NumberOrRange | None = None
+    survival: Printed = None
     """share that neither crash nor leave the range: the thesis's success"""
-    reward: NumberOrRange | None = None
+    reward: Printed = None
     """mean per episode"""
-    time_to: dict[str, NumberOrRange | None] = Field(default_factory=dict)
+    time_to: dict[str, Printed] = {}
     """from tolerances in m to mean times in s; null: never within it"""
-    path: NumberOrRange | None = None
+    path: Printed = None
     """mean path, m"""
-    final_error: NumberOrRange | None = None
+    final_error: Printed = None
     """|r - r_T| at the end, m"""
-    flown: NumberOrRange | None = None
+    flown: Printed = None
     """until the flight ended, s"""
-    recovery_time: NumberOrRange | None = None
+    recovery_time: Printed = None
     """until the vehicle was stable again, s"""
     note: str = ""
     """the source's own words"""
@@ -55,7 +58,7 @@ class Reference(Frozen, use_attribute_docstrings=True):
         return {f"{key:g}" if type(key) is float else str(key): value[key] for key in value}
 
 
-class Scenario(Frozen, use_attribute_docstrings=True):
+class Scenario(Frozen):
     """One way to judge a controller: the episodes, their number, and others' metrics.
 
     Units m, s, rad, N, N m, kg.
@@ -93,11 +96,11 @@ class Scenario(Frozen, use_attribute_docstrings=True):
     """every episode derives its own from it"""
     tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1)
     """of arrival, |r - r_T|, m"""
-    reference: dict[str, Reference] = Field(default_factory=dict)
+    reference: dict[str, Reference] = {}
     """from a column's title to others' metrics"""
     group: str | None = None
     """the scenario that this one is a cell of; set by vary"""
-    cell: dict[str, float] = Field(default_factory=dict)
+    cell: dict[str, float] = {}
     """this cell's values, by key; set by vary"""
 
     @field_validator("vehicle")
@@ -199,16 +202,15 @@ class Scenario(Frozen, use_attribute_docstrings=True):
     @property
     def task(self) -> Task:
         """The task that samples random targets and attitudes, as in training."""
-        elsewhere = self.target.distance or any(
-            point != self.start.position for point in self.target.points
-        )
+        start = self.start
+        elsewhere = self.target.distance or {*self.target.points} - {start.position}
         return Task(
             name="scenario",
-            start_position=self.start.position,
+            start_position=start.position,
             target_distance=self.target.distance or 0.0,
-            random_attitude=self.start.attitude.distribution == "uniform",
-            velocity_std=self.start.velocity.std or 0.0,
-            body_rates_std=self.start.body_rates.std or 0.0,
+            random_attitude=start.attitude.distribution == "uniform",
+            velocity_std=start.velocity.std or 0.0,
+            body_rates_std=start.body_rates.std or 0.0,
             max_distance=self.max_distance,
             **({} if elsewhere else RECOVERED),
         )
@@ -240,25 +242,24 @@ class Scenario(Frozen, use_attribute_docstrings=True):
         vectors = [self.start.velocity, self.start.body_rates]
         for wrench in self.wrenches:
             vectors += [wrench.force, wrench.torque]
-        for vector in vectors:
-            if vector.value is None and vector.largest > 0.0:
-                return False
+        random: list[Any] = [vector.std or vector.magnitude for vector in vectors]
         attitude = self.start.attitude
-        random = [attitude.distribution, attitude.tilt, self.target.distance]
+        random += [attitude.distribution, attitude.tilt, self.target.distance]
         return not any([*random, self.randomize, self.vehicles])
 
     def _check_way(self, vehicle: Vehicle) -> None:
         """Check that start and targets lie above ground, within ``max_distance`` of each other."""
         least = vehicle.collision_radius
         distance = self.target.distance or 0.0
-        place, before = "start.position", self.start.position
+        before = self.start.position
         for point in (before, *self.target.points):
             if point[2] <= least:
+                place = "start.position" if point == self.start.position else "target"
                 raise ValueError(
                     f"{place}: {list(point)} touches the ground; z must exceed {least:g} m"
                 )
             distance = max(distance, math.dist(before, point))
-            place, before = "target", point
+            before = point
         if distance > self.max_distance:
             raise ValueError(
                 f"target: {distance:.3g} m away, and an episode ends beyond max_distance"
@@ -266,7 +267,7 @@ class Scenario(Frozen, use_attribute_docstrings=True):
             )
 
 
-class Suite(Frozen, use_attribute_docstrings=True):
+class Suite(Frozen):
     """Scenarios that belong together."""
 
     name: str = Field(pattern=NAME)
@@ -282,12 +283,10 @@ class Suite(Frozen, use_attribute_docstrings=True):
 
         :raises ConfigError: an unknown name.
         """
-        names = []
-        for scenario in self.scenarios:
-            if scenario.name == name:
-                return scenario
-            names.append(scenario.name)
-        raise ConfigError(unknown("scenario", name, names))
+        scenarios = {scenario.name: scenario for scenario in self.scenarios}
+        if name not in scenarios:
+            raise ConfigError(unknown("scenario", name, scenarios))
+        return scenarios[name]
 
     def with_changes(
         self,
@@ -304,37 +303,31 @@ class Suite(Frozen, use_attribute_docstrings=True):
         :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible
             for the vehicle.
         """
+        chosen: StrDict = {"episodes": episodes, "seed": seed, "vehicle": vehicle}
+        flown_by = ""
+        if vehicle is not None:
+            chosen["reference"] = {}
+            flown_by = f", flown by {vehicle}"
+        changes = {key: value for key, value in chosen.items() if value is not None}
         known = set[str]()
+        changed = []
         for scenario in self.scenarios:
-            known |= {scenario.name, scenario.group or scenario.name}
+            own = {scenario.name, scenario.group or scenario.name}
+            known |= own
+            if not names or own & {*names}:
+                where = f"scenario {scenario.name}{flown_by}"
+                changed.append(validate(Scenario, scenario.model_dump() | changes, where))
         for name in names:
             if name not in known:
                 raise ConfigError(unknown("scenario", name, known))
-        changes: dict[str, Any] = {}
-        flown_by = ""
-        if episodes is not None:
-            changes["episodes"] = episodes
-        if seed is not None:
-            changes["seed"] = seed
-        if vehicle is not None:
-            changes |= {"vehicle": vehicle, "reference": {}}
-            flown_by = f", flown by {vehicle}"
-        changed = []
-        for scenario in self.scenarios:
-            if not names or scenario.name in names or scenario.group in names:
-                where = f"scenario {scenario.name}{flown_by}"
-                changed.append(validate(Scenario, {**scenario.model_dump(), **changes}, where))
         return self.model_copy(update={"scenarios": tuple(changed)})
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = set[str]()
-        for scenario in self.scenarios:
-            if scenario.name in names:
-                raise ValueError(
-                    f"scenarios: {scenario.name!r} is there twice; names must be unique"
-                )
-            names.add(scenario.name)
+        names = Counter(map(attrgetter("name"), self.scenarios))
+        for name, times in names.items():
+            if times > 1:
+                raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
         return self
 
 
