@@ -46,7 +46,7 @@ def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
     Each comes to one with the same sign of its yaw moment. Of turns that fit equally well it is the
     smallest.
 
-    :raises ConfigError: there is none.
+    :raises ConfigError: no turn does that.
     """
     # Places in the plane as complex numbers: a turn is a factor.
     places = np.array(own.rotor_positions) @ (1.0, 1.0j)
@@ -65,9 +65,8 @@ def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
     least = min(fits.values())
     if least >= TOLERANCE:
         raise ConfigError(
-            f"rotor_layout: no turn brings the rotors of {own.name} to where those of "
-            f"{other.name} are, directions included; an agent flies only vehicles whose "
-            "rotors are where it knows them, once turned and renumbered"
+            "rotor_layout: rotor layouts are incompatible: no yaw rotation and renumbering maps"
+            f" the rotors of {own.name} (position and spin direction) onto those of {other.name}"
         )
     fitting = [turn for turn, misfit in fits.items() if misfit < least + _SLACK]
     return min(fitting, key=lambda turn: (round(abs(turn.angle), 6), -turn.angle))
