@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
+from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
 
 # Ends that SB3's Monitor may leave uncounted in one episode: Atari's wrappers report each life.
@@ -89,9 +90,9 @@ class BestModel(EveryTimesteps):
         every: int,
         n_episodes: int,
         seed: int,
-        best_model: str | Path = "best_model.zip",
-        evaluations: str | Path = "evaluations.npz",
-        report: Callable[[str], None] = lambda line: None,
+        best_model: StrPath = "best_model.zip",
+        evaluations: StrPath = "evaluations.npz",
+        report: Report = lambda line: None,
         others: Mapping[str, VecEnv] | None = None,
         should_continue: Callable[[float, float], bool] = lambda success, reward: True,
         by: str = "success",
@@ -169,7 +170,7 @@ class BestModel(EveryTimesteps):
         self.logger.dump(self.num_timesteps)
         self.stopped = not self._should_continue(*score)
 
-    def _evaluate_in(self, evaluations: "_Evaluations", group: str, values: dict[str, Any]) -> str:
+    def _evaluate_in(self, evaluations: "_Evaluations", group: str, values: StrDict) -> str:
         """Evaluate in some environments; write, log and return the results.
 
         :param group: their group in the log.
@@ -193,7 +194,7 @@ class _Evaluations:
     def __init__(self, env: VecEnv, path: Path) -> None:
         self.env = env
         self.path = path
-        self.rows: dict[str, Any] = {}
+        self.rows: StrDict = {}
 
     def read(self, n_episodes: int) -> None:
         """Continue the file, if it exists.
@@ -213,7 +214,7 @@ class _Evaluations:
                 f"n_episodes (--eval-episodes) must be {flown}"
             )
 
-    def append(self, values: dict[str, Any]) -> None:
+    def append(self, values: StrDict) -> None:
         """Add an evaluation and write the file.
 
         NaN stands for what one of the evaluations does not have, such as losses before the first
@@ -245,7 +246,7 @@ class _Evaluations:
         return float(rate), float(np.mean(self.rows["results"][number]))
 
 
-def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> dict[str, Any]:
+def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
     """Return the arrays of an evaluation, (n_episodes,) each; those that are reported.
 
     :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
@@ -254,7 +255,7 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> dict[str, Any]:
     arrays: dict[str, list[float]] = {name: [] for name in reported}
     n_uncounted = 0
 
-    def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
+    def note(local_variables: StrDict, global_variables: StrDict) -> None:
         nonlocal n_uncounted
         if not local_variables["done"]:
             return
@@ -278,7 +279,7 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> dict[str, Any]:
     rewards, lengths = evaluate_policy(
         model, env, n_episodes, callback=note, return_episode_rewards=True, warn=False
     )
-    values: dict[str, Any] = {"results": rewards, "ep_lengths": lengths}
+    values: StrDict = {"results": rewards, "ep_lengths": lengths}
     for name, array in arrays.items():
         if not np.isnan(array).all():
             values[name] = array

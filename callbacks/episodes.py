@@ -8,6 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import ResultsWriter
 
 from sb3_quad.base.files import read_text
+from sb3_quad.base.types import StrPath
 
 
 class EpisodeLog(BaseCallback):
@@ -29,7 +30,7 @@ class EpisodeLog(BaseCallback):
     :param env_id: noted in the file.
     """
 
-    def __init__(self, path: str | Path, env_id: str = "", verbose: int = 0) -> None:
+    def __init__(self, path: StrPath, env_id: str = "", verbose: int = 0) -> None:
         super().__init__(verbose)
         self._path = Path(path)
         self._env_id = env_id

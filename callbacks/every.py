@@ -1,7 +1,6 @@
 """Callbacks that do something at regular intervals, of timesteps or of seconds."""
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -13,6 +12,7 @@ from stable_baselines3.common.utils import safe_mean
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import save_model
+from sb3_quad.base.types import Report
 
 
 class EveryTimesteps(EventCallback):
@@ -89,9 +89,7 @@ class ProgressLine(BaseCallback):
     :param seconds: between two lines.
     """
 
-    def __init__(
-        self, report: Callable[[str], None] = print, seconds: float = 60.0, verbose: int = 0
-    ) -> None:
+    def __init__(self, report: Report = print, seconds: float = 60.0, verbose: int = 0) -> None:
         super().__init__(verbose)
         self._report = report
         self._seconds = seconds

@@ -1,11 +1,11 @@
 """The commands, their errors and exit codes."""
 
-import argparse
 import importlib
 import io
 import pkgutil
 import sys
 import traceback
+from argparse import Namespace
 from collections.abc import Container, Sequence
 from pathlib import Path
 
@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _parse(arguments: list[str]) -> argparse.Namespace | None:
+def _parse(arguments: list[str]) -> Namespace | None:
     """Return the options of a command, or None after printing help.
 
     :raises ConfigError: An unknown command or option, or a bad value.

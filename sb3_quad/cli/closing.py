@@ -4,10 +4,11 @@ The tables are of fresh episodes, the same for all.
 """
 
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.types import StrMapping
 from sb3_quad.cli.output import console
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
@@ -25,8 +26,8 @@ PIPELINE_EPISODES = 480  # in each table after a pipeline
 
 
 def print_tables(
-    controllers: Mapping[str, Any],
-    settings: Mapping[str, Any],
+    controllers: StrMapping,
+    settings: StrMapping,
     n: int,
     seed: int,
     thesis_columns: Iterable[str] = (),

@@ -15,6 +15,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from sb3_quad.base.types import StrPath
+
 # Columns of a table in a file or a pipe, where lines need not wrap.
 FILE_WIDTH = 180
 Show = Callable[[int, "int | None", str], None]
@@ -36,7 +38,7 @@ def shows_progress(wanted: bool | None) -> bool:
     return sys.stderr.isatty() if wanted is None else wanted
 
 
-def output_file(given: str | Path | None, name: str) -> Path:
+def output_file(given: StrPath | None, name: str) -> Path:
     """Return the file that ``-o`` names, or the file ``name`` in the folder that it names.
 
     Without ``-o``, the folder is the working directory.

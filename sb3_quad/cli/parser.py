@@ -4,6 +4,7 @@ import argparse
 import math
 import random
 import typing
+from argparse import Namespace
 from collections.abc import Container, Mapping
 from typing import Any, NoReturn
 
@@ -11,6 +12,7 @@ from pydantic import BaseModel
 
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
+from sb3_quad.base.types import StrDict, StrMapping
 
 # Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
 SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
@@ -82,7 +84,7 @@ class Pairs(argparse.Action):
     """Stores ``k:v`` entries as a mapping."""
 
     def __call__(
-        self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None
+        self, parser: Any, namespace: Namespace, values: Any, option: str | None = None
     ) -> None:
         """Add the entries of one flag to those of the flags before it.
 
@@ -100,8 +102,8 @@ class Pairs(argparse.Action):
         setattr(namespace, self.dest, pairs)
 
 
-PAIRS: dict[str, Any] = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
-YES_OR_NO: dict[str, Any] = {"action": argparse.BooleanOptionalAction}
+PAIRS: StrDict = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
+YES_OR_NO: StrDict = {"action": argparse.BooleanOptionalAction}
 
 
 def whole(text: str) -> int:
@@ -145,7 +147,7 @@ def add_fields(
     parser: argparse.ArgumentParser,
     model: type[BaseModel],
     *names: str,
-    **changes: Mapping[str, Any],
+    **changes: StrMapping,
 ) -> None:
     """Add a flag for each field of a model, from the field's name, type, description and default.
 
@@ -160,7 +162,7 @@ def add_fields(
         metadata: Any = field.json_schema_extra
         # The alternatives of a union such as `int | None`, or the type itself.
         kinds = {field.annotation, *typing.get_args(field.annotation)}
-        arguments: dict[str, Any] = {"help": field.description, "metavar": metadata["metavar"]}
+        arguments: StrDict = {"help": field.description, "metavar": metadata["metavar"]}
         if field.default not in (None, False):
             arguments["help"] += f" ({field.default})"
         if name == "progress":
@@ -168,7 +170,7 @@ def add_fields(
         elif bool in kinds:
             # argparse knows no metavar for a flag without a value.
             arguments = {"help": arguments["help"], "action": "store_true", "default": None}
-        elif dict[str, Any] in kinds:
+        elif StrDict in kinds:
             arguments |= PAIRS
         elif float in kinds:
             arguments["type"] = float
@@ -204,7 +206,7 @@ def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
         add("-P", "--progress", help="show a progress bar (yes in a terminal)", **YES_OR_NO)
 
 
-def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+def given(options: Namespace, *names: str) -> StrDict:
     """Return those of some options that the command has and that were given."""
     values = {name: getattr(options, name, None) for name in names}
     return {name: value for name, value in values.items() if value is not None}

@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.literals import parse_mapping
+from sb3_quad.base.types import StrDict
 
 BASES: dict[str, type] = {
     "callback": BaseCallback,
@@ -25,7 +26,7 @@ def as_list(value: Any) -> Any:
     return value if isinstance(value, (list, tuple)) else [value]
 
 
-def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
+def qualified_classes(value: Any, where: str) -> list[tuple[str, StrDict]]:
     """Return ``package.module.Class`` and keywords of each class, from any of rl-zoo's three forms.
 
     These are a name, ``{name: keywords}``, or a list of both.

@@ -24,6 +24,7 @@ from pydantic import (
 from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
@@ -62,10 +63,10 @@ Whole: TypeAlias = Annotated[
     BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
 ]
 Keywords: TypeAlias = Annotated[
-    dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
+    StrDict, BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
 ]
 Classes: TypeAlias = Annotated[
-    list[tuple[str, dict[str, Any]]],
+    list[tuple[str, StrDict]],
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
 Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
@@ -125,10 +126,8 @@ class TrainingConfig(Frozen):
     noise_std: NonNegativeFloat = Field(
         default=0.1, description="standard deviation of the action noise; actions are in [-1, 1]"
     )
-    hyperparams: dict[str, Any] = Field(
-        description="keywords of the algorithm's constructor, converted"
-    )
-    settings: dict[str, Any] = Field(repr=False)
+    hyperparams: StrDict = Field(description="keywords of the algorithm's constructor, converted")
+    settings: StrDict = Field(repr=False)
 
     @property
     def task(self) -> str | None:
@@ -185,7 +184,7 @@ class TrainingConfig(Frozen):
 
     @field_validator("policy_kwargs")
     @classmethod
-    def _fits_policy(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    def _fits_policy(cls, value: StrDict, info: ValidationInfo) -> StrDict:
         if "policy" not in info.data:
             return value
         # The constructor of the policy takes these, not that of the algorithm.
@@ -199,7 +198,7 @@ class TrainingConfig(Frozen):
 
     @field_validator("env_kwargs", "eval_env_kwargs")
     @classmethod
-    def _known_keywords(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    def _known_keywords(cls, value: StrDict, info: ValidationInfo) -> StrDict:
         env_id = info.data["env_id"]
         if env_id in ENVIRONMENTS:
             valid = FlightSettings.model_fields
@@ -267,7 +266,7 @@ class TrainingJob(JobOptions):
         """How the agent is evaluated, in an environment of this package."""
         return self.for_evaluation().flight_settings
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self) -> StrDict:
         """Return what args.yml holds: all but the settings, and how evaluations fly.
 
         The settings are in config.yml.
@@ -312,8 +311,8 @@ def describe(job: TrainingJob) -> str:
 def load_config(
     algo: str,
     env_id: str,
-    conf_file: str | Path | None = None,
-    overrides: dict[str, Any] | None = None,
+    conf_file: StrPath | None = None,
+    overrides: StrDict | None = None,
 ) -> TrainingConfig:
     """Read the settings of ``env_id`` from a YAML file and put ``overrides`` over them.
 
@@ -350,7 +349,7 @@ def load_config(
 def build_config(
     algo: str,
     env_id: str,
-    settings: dict[str, Any],
+    settings: StrDict,
     where: str = "settings",
     changes: Collection[str] = (),
 ) -> TrainingConfig:
@@ -374,7 +373,7 @@ def build_config(
     def source(key: str) -> str:
         return "command line" if key in changes else where
 
-    fields: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
+    fields: StrDict = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
     hyperparams = {}
     for key, value in settings.items():
         if key in parameters:

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt, model
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import require
 from sb3_quad.base.seeds import Seed
+from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen
 
 
@@ -47,7 +48,7 @@ class SettingsOptions(Frozen):
     expert: str | None = option(
         None, "pid, geometric, path/to/model.zip or package.module:factory", metavar="SPEC"
     )
-    env_kwargs: dict[str, Any] | None = option(
+    env_kwargs: StrDict | None = option(
         None, "environment keywords, such as noise:0", metavar="K:V"
     )
 
@@ -55,7 +56,7 @@ class SettingsOptions(Frozen):
 class RunOptions(Frozen):
     """Run options outside the settings file; the configurations of a sweep may override them."""
 
-    eval_env_kwargs: dict[str, Any] | None = option(
+    eval_env_kwargs: StrDict | None = option(
         None, "environment keywords for evaluations only", metavar="K:V"
     )
     trained_agent: str | None = option(
@@ -99,7 +100,7 @@ class JobOptions(RunOptions):
 
     @model_validator(mode="before")
     @classmethod
-    def _tracked(cls, given: dict[str, Any]) -> dict[str, Any]:
+    def _tracked(cls, given: StrDict) -> StrDict:
         """Weights & Biases shows what TensorBoard is given, so there must be a folder for that."""
         if not given.get("track"):
             return given

@@ -4,7 +4,6 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
@@ -74,7 +74,7 @@ class OffsetCorrection(Frozen):
         default=OVERSHOOT_COST,
         description="arrival: penalty in seconds for leaving a target after reaching it",
     )
-    env_kwargs: dict[str, Any] = Field(
+    env_kwargs: StrDict = Field(
         default={}, description="arrival: changes to env_kwargs of the flights that are optimised"
     )
 
@@ -95,7 +95,7 @@ class Stage(Frozen):
     conf_file: str | None = Field(
         default=None, description="settings file; <algo>.yml of the package without it"
     )
-    settings: dict[str, Any] = Field(
+    settings: StrDict = Field(
         default={}, description="changes to these settings, such as n_timesteps: 5_000_000"
     )
     seed_offset: NonNegativeInt = Field(
@@ -138,7 +138,7 @@ class Pipeline(Frozen):
 class Status(Pipeline):
     """The content of ``pipeline.yml`` in a pipeline's folder."""
 
-    job: dict[str, Any] = Field(description="options of every job")
+    job: StrDict = Field(description="options of every job")
     runs: tuple[str, ...] = Field(description="the run folders of the stages that have begun")
 
 
@@ -171,7 +171,7 @@ class PipelineResult:
     exit_code: int = 0
 
 
-def is_pipeline(conf_file: str | Path) -> bool:
+def is_pipeline(conf_file: StrPath) -> bool:
     """Whether a settings file holds stages rather than the settings of one run."""
     return "stages" in SETTINGS.read(conf_file)[0]
 
@@ -181,7 +181,7 @@ def is_pipeline_run(folder: Path) -> bool:
     return (folder / STATUS_FILE).is_file()
 
 
-def load_pipeline(conf_file: str | Path) -> Pipeline:
+def load_pipeline(conf_file: StrPath) -> Pipeline:
     """Load the pipeline in a file, by path or by the name of one in the package.
 
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
@@ -189,7 +189,7 @@ def load_pipeline(conf_file: str | Path) -> Pipeline:
     return validate(Pipeline, *SETTINGS.read(conf_file))
 
 
-def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
+def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
     """Return the pipeline with ``changes`` put over the settings of every stage.
 
     ``env_kwargs`` are merged key by key.
@@ -207,7 +207,7 @@ def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
 
 
 def run_pipeline(
-    pipeline: Pipeline, job: Mapping[str, Any], name: str, report: Report = print
+    pipeline: Pipeline, job: StrMapping, name: str, report: Report = print
 ) -> PipelineResult:
     """Train the stages one after the other, each from the agent that the one before passed on.
 
@@ -239,7 +239,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     return _train_stages(folder, status, stage_jobs(status, status.job), report, **changes)
 
 
-def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
+def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     """Return the checked job of each stage.
 
     :raises ConfigError: settings of a stage, or options of its job, that do not fit.

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import uuid
 from pathlib import Path
-from typing import Any
 
 import stable_baselines3
 import torch
@@ -14,6 +13,7 @@ import yaml
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import make_folder, write_text
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.controllers.zips import saved_data
@@ -89,7 +89,7 @@ class RunFolder:
             )
         return self.checkpoint(max(steps))
 
-    def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
+    def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
 
         args.yml comes last, so that a run that has it lacks nothing.
@@ -102,7 +102,7 @@ class RunFolder:
         write_text(self.command, shlex.join([*start, *sys.argv[1:]]) + "\n")
         write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
 
-    def read_yaml(self) -> tuple[dict[str, Any], dict[str, Any]]:
+    def read_yaml(self) -> tuple[StrDict, StrDict]:
         """Read config.yml and args.yml, also those of rl_zoo3.
 
         :raises ConfigError: either is missing, unreadable or not a mapping.
@@ -134,7 +134,7 @@ def file_name(env_id: str) -> str:
     return env_id.replace("/", "-").replace(":", "-")
 
 
-def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> RunFolder:
+def claim_run(log_folder: StrPath, algo: str, env_id: str, unique: bool = False) -> RunFolder:
     """Make the folder of a new run, with the next free number.
 
     No other process can get the same one.
@@ -177,7 +177,7 @@ def _numbered(parent: Path, name: str) -> dict[int, Path]:
     return folders
 
 
-def open_run(path: str | Path) -> RunFolder:
+def open_run(path: StrPath) -> RunFolder:
     """Open the folder of an existing run.
 
     :raises ConfigError: a folder that holds no run.
@@ -191,7 +191,7 @@ def open_run(path: str | Path) -> RunFolder:
     return RunFolder(folder, configs[0].parent.name)
 
 
-def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
+def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
     """Find a run by rl-zoo's ``--exp-id``.
 
     :param exp_id: number of the run; 0: the latest that has an agent.

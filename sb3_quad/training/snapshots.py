@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import model_bytes, one_line, read_arrays, write_arrays, write_bytes
+from sb3_quad.base.types import Report, StrDict
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
@@ -67,7 +68,7 @@ class SnapshotFile(BaseCallback):
     snapshot: Snapshot | None = None
 
     def __init__(
-        self, run: RunFolder, every: float, report: Callable[[str], None], hurry: Callable[[], bool]
+        self, run: RunFolder, every: float, report: Report, hurry: Callable[[], bool]
     ) -> None:
         super().__init__()
         self._run = run
@@ -147,7 +148,7 @@ class SnapshotFile(BaseCallback):
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
         assert self.snapshot is not None
-        arrays: dict[str, Any] = {
+        arrays: StrDict = {
             "timesteps": np.array(self.snapshot.timesteps),
             "model": np.frombuffer(self.snapshot.model, np.uint8),
             **self._state,
@@ -258,7 +259,7 @@ def _environment_state(env: VecEnv) -> Arrays:
     return {f"{ENVIRONMENT}{name}": array for name, array in batch.snapshot().items()}
 
 
-def _stores(model: Any) -> dict[str, Any]:
+def _stores(model: Any) -> StrDict:
     """Return what a model keeps beyond a rollout, by name."""
     stores = {name: getattr(model, name, None) for name in COUNTERS}
     return {name: store for name, store in stores.items() if store is not None}

@@ -1,9 +1,9 @@
 """Settings of a training that starts from a trained agent: observation and networks of its zip."""
 
-from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.process import print_once
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import unlike_trained
@@ -11,7 +11,7 @@ from sb3_quad.training.config import TrainingConfig
 from sb3_quad.vehicles.vehicle import first_vehicle
 
 
-def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) -> dict[str, Any]:
+def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict:
     """Return ``changes`` to a settings file with the observation and networks of a zip added.
 
     What is in ``changes`` takes precedence. Evaluations fly with the agent's position integral, if

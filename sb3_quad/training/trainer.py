@@ -27,6 +27,7 @@ from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.types import Report, StrDict
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
@@ -46,7 +47,6 @@ from sb3_quad.training.tracking import HyperparameterLog, tracked
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 NEVER = 2**62  # timesteps
 OWN_TASK = ""  # the name of the evaluations on the task of the training
-Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
 
 
@@ -133,7 +133,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
             return training.run_to_end(_user_callbacks(config))
 
 
-def _read_job(run: RunFolder, changes: dict[str, Any]) -> TrainingJob:
+def _read_job(run: RunFolder, changes: StrDict) -> TrainingJob:
     """Return the job of a run folder, with ``changes`` to its options."""
     settings, options = run.read_yaml()
     if not {"algo", "env"} <= options.keys():
@@ -174,7 +174,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
         yield env, eval_envs
 
 
-def _expert(config: TrainingConfig) -> dict[str, Any]:
+def _expert(config: TrainingConfig) -> StrDict:
     """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
     if not takes_expert(get_algorithm(config.algo)):
         return {}
@@ -221,7 +221,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     return model
 
 
-def _construct(config: TrainingConfig, env: VecEnv, keywords: dict[str, Any]) -> BaseAlgorithm:
+def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAlgorithm:
     """Call the algorithm's constructor; errors that do not concern its arguments stay as they are.
 
     :raises ConfigError: arguments that it does not take or refuses, or too little memory.

@@ -12,9 +12,9 @@ examples:
   sb3-quad benchmark --algo ppo_bc --conf-file robust/ppo_bc.yml
 """
 
-import argparse
 import itertools
 import time
+from argparse import Namespace
 from contextlib import ExitStack, closing
 from timeit import Timer
 from typing import Any
@@ -61,7 +61,7 @@ def add_arguments(parser: Parser) -> None:
     add("--training", help="measure only, or no, training loops (both)", **YES_OR_NO)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Measure and print. Returns the exit code."""
     import numpy as np
 

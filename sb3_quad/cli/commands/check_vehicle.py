@@ -14,9 +14,9 @@ Exit code 1: the rotors cannot produce hover thrust. For the contents of a
 vehicle file, see docs/vehicles.md.
 """
 
-import argparse
 import math
 import sys
+from argparse import Namespace
 from typing import TYPE_CHECKING, Any
 
 from sb3_quad.base.errors import CannotHover
@@ -51,7 +51,7 @@ def add_arguments(parser: Parser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if the vehicle cannot hover."""
     from sb3_quad.base.seeds import seed_for
     from sb3_quad.cli.closing import print_tables

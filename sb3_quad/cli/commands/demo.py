@@ -20,7 +20,7 @@ same vehicle, first that of the first agent. The page also offers the vehicles
 of the package.
 """
 
-import argparse
+from argparse import Namespace
 
 from sb3_quad.base.files import refuse_existing, write_text
 from sb3_quad.cli.parser import Parser, add_common
@@ -39,7 +39,7 @@ def add_arguments(parser: Parser) -> None:
     add_common(parser, "trust", "overwrite")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Make the page and write it. Returns the exit code."""
     from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import parse_controllers

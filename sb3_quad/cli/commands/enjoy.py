@@ -24,15 +24,16 @@ agent (vehicle, task and observation) hold for all, unless you give --env,
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-import argparse
 import io
 import sys
+from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
+from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, positive, whole
 from sb3_quad.envs.registration import ENVIRONMENTS
 
@@ -149,12 +150,12 @@ def _size(text: str) -> tuple[int, int]:
         width, height = text.lower().split("x")
         return int(width), int(height)
     except ValueError:
-        raise argparse.ArgumentTypeError(
+        raise ArgumentTypeError(
             f"{text}: must be width and height in pixels, such as 640x480"
         ) from None
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Fly, print the results, show the flights. Returns the exit code."""
     from rich.console import Console
 
@@ -190,7 +191,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _check(options: argparse.Namespace, window: bool) -> None:
+def _check(options: Namespace, window: bool) -> None:
     """Refuse what can be refused before anything flies.
 
     :raises ConfigError: No controller, a bad size or file, or no display for a window.
@@ -224,7 +225,7 @@ def _is_picture(file: str) -> bool:
     return file.lower().endswith(".png")
 
 
-def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
+def _setting(options: Namespace) -> tuple[Any, StrDict]:
     """Return the :class:`~sb3_quad.show.episodes.Setting` of all, and the controllers by label."""
     from sb3_quad.cli.output import warn
     from sb3_quad.controllers.resolve import resolve_expert
@@ -247,7 +248,7 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         setting = scenario_setting(options.scenario, first and first.vehicle)
     controllers = {}
     # What an agent observes stays as in its training, unless the command line says otherwise.
-    observed: dict[str, dict[str, Any]] = {}
+    observed: dict[str, StrDict] = {}
     vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
@@ -258,7 +259,7 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     return setting._replace(own=observed), controllers
 
 
-def _flight_settings(options: argparse.Namespace, first: Any) -> Any:
+def _flight_settings(options: Namespace, first: Any) -> Any:
     """Return the :class:`~sb3_quad.simulation.settings.FlightSettings` of all flights.
 
     :param first: Those of the first agent, or None.
@@ -281,7 +282,7 @@ def _flight_settings(options: argparse.Namespace, first: Any) -> Any:
     return settings.with_changes(**changes | options.env_kwargs)
 
 
-def _agent_of_run(options: argparse.Namespace) -> tuple[str, str]:
+def _agent_of_run(options: Namespace) -> tuple[str, str]:
     """Return label and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and
     ``--load-…`` name.
 
@@ -335,7 +336,7 @@ def _write_picture(file: str, episode: Sequence[Any], size: tuple[int, int]) -> 
 
 
 def _write_film(
-    file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: argparse.Namespace
+    file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: Namespace
 ) -> None:
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.show.film import FPS, film_frames, frame_times, write_film

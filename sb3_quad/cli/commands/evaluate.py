@@ -35,9 +35,9 @@ results of one command, so give all controllers at once. After an interruption,
 the same command continues where it stopped.
 """
 
-import argparse
 import sys
 import time
+from argparse import Namespace
 
 from sb3_quad.cli.parser import YES_OR_NO, Parser, add_common, whole
 
@@ -75,7 +75,7 @@ def add_arguments(parser: Parser) -> None:
     add_common(parser, "executor", "trust", "progress")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Fly, print the table and the failures. Returns the exit code."""
     from sb3_quad.cli.commands.report import report
     from sb3_quad.cli.output import console, progress_bar, warn

@@ -20,7 +20,7 @@ ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. The check
 of a C header needs a C compiler.
 """
 
-import argparse
+from argparse import Namespace
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -59,7 +59,7 @@ def add_arguments(parser: Parser) -> None:
     add_common(parser, "trust", "overwrite")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Export, check, write. Returns the exit code."""
     from sb3_quad.cli.output import output_file, warn
     from sb3_quad.evaluation.controllers import ControllerSpec

@@ -14,13 +14,13 @@ examples:
     --thesis state_recovery --show survival reward losses
 """
 
-import argparse
 import glob
+from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
+from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import Parser, add_common
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 
@@ -77,19 +77,19 @@ def _line(text: str) -> tuple[str, dict[str, float]]:
         share = float(success) / 100
         return name, {"success": share, "survival": share, "reward": float(reward)}
     except ValueError:
-        raise argparse.ArgumentTypeError(
+        raise ArgumentTypeError(
             f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.25:-16.1"
         ) from None
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Read the runs, draw, write. Returns the exit code."""
     from sb3_quad.evaluation.learning_curves import read_curve
     from sb3_quad.evaluation.scenarios.load import load_suite
     from sb3_quad.report.curves import plot_curves
     from sb3_quad.report.plots import picture
 
-    groups: dict[str, Any] = {}
+    groups: StrDict = {}
     for text in options.groups:
         name, folders = _group(text)
         if name in groups:

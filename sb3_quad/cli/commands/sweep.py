@@ -21,13 +21,14 @@ The new folder receives the run folders, results.csv, results.json, report.md
 and report.html. For the keys of the file, see docs/sweeps.md.
 """
 
-import argparse
 import sys
 import time
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import StrDict
 from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
 from sb3_quad.controllers.pretrained import agent_path
@@ -70,7 +71,7 @@ def add_arguments(parser: Parser) -> None:
     add_common(parser, "executor", "trust", "progress")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
     from sb3_quad.base.imports import import_packages
     from sb3_quad.sweep.folder import Sweep, SweepFolder
@@ -103,7 +104,7 @@ def _print_runs(sweep: Any) -> None:
     print(f"{_count(len(sweep.runs), 'run')} of {_count(len(configurations), 'configuration')}")
 
 
-def _spec(options: argparse.Namespace) -> Any:
+def _spec(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line.
 
     Flags replace the keys of the file.
@@ -111,7 +112,7 @@ def _spec(options: argparse.Namespace) -> Any:
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
 
-    data: dict[str, Any] = {"name": "sweep"}
+    data: StrDict = {"name": "sweep"}
     if options.sweep is not None:
         data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
     flags = given(options, *SweepSpec.model_fields)
@@ -134,7 +135,7 @@ def _spec(options: argparse.Namespace) -> Any:
     return validate(SweepSpec, data, options.sweep or "command line")
 
 
-def _add_defaults(data: dict[str, Any]) -> None:
+def _add_defaults(data: StrDict) -> None:
     """Let a sweep without settings train what ``train`` does by default: its pipeline, or its
     algorithm and environment.
     """
@@ -153,7 +154,7 @@ def _add_defaults(data: dict[str, Any]) -> None:
     data.setdefault("env", DEFAULT_ENV)
 
 
-def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
+def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
     """Do what is left of a sweep. Returns the exit code.
 
     :param sweep: The sweep.
@@ -199,7 +200,7 @@ def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
     return 1 if failures else 0
 
 
-def _new_folder(options: argparse.Namespace, sweep: Any) -> Any:
+def _new_folder(options: Namespace, sweep: Any) -> Any:
     from sb3_quad.sweep.folder import SweepFolder
     from sb3_quad.training.runs import claim_folder
 

@@ -30,12 +30,13 @@ examples:
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
 
-import argparse
 import time
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, SettingsOptions
@@ -119,7 +120,7 @@ def add_arguments(parser: Parser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Train, compare, print where everything is. Returns the exit code."""
     from sb3_quad.cli.output import shows_progress
     from sb3_quad.training.pipeline import is_pipeline
@@ -143,7 +144,7 @@ def run(options: argparse.Namespace) -> int:
     return _train_single(options, job)
 
 
-def _resume(options: argparse.Namespace, changes: dict[str, Any]) -> int:
+def _resume(options: Namespace, changes: StrDict) -> int:
     from sb3_quad.cli.closing import close_pipeline, close_run
     from sb3_quad.training.pipeline import is_pipeline_run, resume_pipeline
     from sb3_quad.training.trainer import resume
@@ -157,7 +158,7 @@ def _resume(options: argparse.Namespace, changes: dict[str, Any]) -> int:
     return close_run(resume(options.resume, **changes))
 
 
-def _train_pipeline(options: argparse.Namespace, job: dict[str, Any]) -> int:
+def _train_pipeline(options: Namespace, job: StrDict) -> int:
     from sb3_quad.cli.closing import close_pipeline
     from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 
@@ -172,7 +173,7 @@ def _train_pipeline(options: argparse.Namespace, job: dict[str, Any]) -> int:
     return close_pipeline(result, time.perf_counter() - start)
 
 
-def _train_single(options: argparse.Namespace, job: dict[str, Any]) -> int:
+def _train_single(options: Namespace, job: StrDict) -> int:
     from sb3_quad.base.validate import validate
     from sb3_quad.cli.closing import close_run
     from sb3_quad.training.config import TrainingJob, describe
@@ -188,7 +189,7 @@ def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def prepare(options: argparse.Namespace) -> None:
+def prepare(options: Namespace) -> None:
     """Import further environments, set the number of threads.
 
     :raises ConfigError: a module that cannot be imported.
@@ -206,7 +207,7 @@ def prepare(options: argparse.Namespace) -> None:
         torch.set_num_threads(options.num_threads)
 
 
-def make_config(options: argparse.Namespace) -> Any:
+def make_config(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.training.config.TrainingConfig` of a command line."""
     from sb3_quad.training.config import load_config
     from sb3_quad.training.successor import as_agent
@@ -222,6 +223,6 @@ def make_config(options: argparse.Namespace) -> Any:
     return config
 
 
-def changed_settings(options: argparse.Namespace) -> dict[str, Any]:
+def changed_settings(options: Namespace) -> StrDict:
     """Return the settings that a command line puts over a settings file."""
     return {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)}

@@ -27,7 +27,7 @@ Ctrl-C keeps the finished trials. Needs Optuna: pip install '.[tune]' from a
 clone.
 """
 
-import argparse
+from argparse import Namespace
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -103,7 +103,7 @@ def add_arguments(parser: Parser) -> None:
     add("--eval-episodes", type=whole, help="episodes per evaluation (batch: 240, else 48)")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Search, report, write. Returns the exit code."""
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.tuning.results import count_trials, trial_line, write_results
@@ -130,7 +130,7 @@ def run(options: argparse.Namespace) -> int:
     return signals.exit_code
 
 
-def _make_search(options: argparse.Namespace) -> Any:
+def _make_search(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.tuning.search.Search` of a command line, with a new folder for
     its results.
     """
