@@ -18,7 +18,9 @@ Model = TypeVar("Model", bound=BaseModel)
 class Frozen(BaseModel):
     """A record: frozen, with finite numbers and no unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:

@@ -1,10 +1,16 @@
 """Argument parsing with one-line errors, types of arguments, and flags of several commands."""
 
-import argparse
 import math
 import random
 import typing
-from argparse import Namespace
+from argparse import (
+    Action,
+    ArgumentParser,
+    ArgumentTypeError,
+    BooleanOptionalAction,
+    Namespace,
+    RawDescriptionHelpFormatter,
+)
 from collections.abc import Container, Mapping
 from typing import Any, NoReturn
 
@@ -12,29 +18,22 @@ from pydantic import BaseModel
 
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
-from sb3_quad.base.types import StrDict, StrMapping
+from sb3_quad.base.types import StrDict
+from sb3_quad.training.options import METAVARS, SHORT_FLAGS
 
 # Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
 SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
 
 
-class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the line breaks of examples, and shows the value of a number as N."""
-
-    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
-        if action.type in (whole, natural, positive, seed):
-            return "N"
-        return super()._get_default_metavar_for_optional(action)
-
-
-class Parser(argparse.ArgumentParser):
+class Parser(ArgumentParser):
     """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
 
     siblings: Mapping[str, Container[str]] = {}
     """The options of each command."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(allow_abbrev=False, formatter_class=HelpFormatter, **kwargs)
+        # This formatter keeps the line breaks of examples.
+        super().__init__(allow_abbrev=False, formatter_class=RawDescriptionHelpFormatter, **kwargs)
 
     def error(self, message: str) -> NoReturn:
         """Raise the error instead of exiting.
@@ -80,7 +79,7 @@ class Parser(argparse.ArgumentParser):
         return "see --help, and docs/zoo.md for flags of rl_zoo3"
 
 
-class Pairs(argparse.Action):
+class Pairs(Action):
     """Stores ``k:v`` entries as a mapping."""
 
     def __call__(
@@ -103,14 +102,16 @@ class Pairs(argparse.Action):
 
 
 PAIRS: StrDict = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
-YES_OR_NO: StrDict = {"action": argparse.BooleanOptionalAction}
+YES_OR_NO: StrDict = {"action": BooleanOptionalAction}
+SWITCH: StrDict = {"action": "store_true"}
+SEVERAL: StrDict = {"nargs": "+"}
 
 
 def whole(text: str) -> int:
     """Return a whole number, also from a text such as ``1e6``."""
     number = parse_number(text)
     if isinstance(number, str) or not abs(number) < 2**63 or number != int(number):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number below 2**63")
+        raise ArgumentTypeError(f"{text!r} is not a whole number below 2**63")
     return int(number)
 
 
@@ -118,7 +119,7 @@ def natural(text: str, least: int = 0) -> int:
     """Return a whole number of at least 0."""
     number = whole(text)
     if number < least:
-        raise argparse.ArgumentTypeError(f"{text}: must be at least {least}")
+        raise ArgumentTypeError(f"{text}: must be at least {least}")
     return number
 
 
@@ -139,71 +140,91 @@ def above_zero(text: str) -> float:
     """Return a finite number above 0."""
     number = float(text)
     if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text}: must be above 0, and finite")
+        raise ArgumentTypeError(f"{text}: must be above 0, and finite")
     return number
 
 
+Flags = Mapping[str, tuple[Any, Any, str]]
+"""A table of flags: by names and metavar, the type (or keywords of ``add_argument``), the default,
+and the help.
+"""
+
+
+def add_flags(parser: ArgumentParser, flags: Flags) -> None:
+    """Add the flags of a table."""
+    for words, (kind, default, text) in flags.items():
+        arguments = kind if isinstance(kind, dict) else {"type": kind}
+        names = words.split()
+        if not names[-1].startswith("-"):
+            arguments = {**arguments, "metavar": names.pop()}
+        parser.add_argument(*names, default=default, help=text, **arguments)
+
+
 def add_fields(
-    parser: argparse.ArgumentParser,
-    model: type[BaseModel],
-    *names: str,
-    **changes: StrMapping,
+    parser: ArgumentParser, model: type[BaseModel], *names: str, **changes: StrDict
 ) -> None:
-    """Add a flag for each field of a model, from the field's name, type, description and default.
+    """Add a flag for each field of a model, from the field's name, type, docstring and default.
 
     A flag that is not given is None.
 
-    :param model: A model whose fields are made by :func:`sb3_quad.training.options.option`.
     :param names: The fields; without any, all of them.
     :param changes: Arguments of ``add_argument`` for a field, which replace those made from it.
     """
     for name in names or model.model_fields:
         field = model.model_fields[name]
-        metadata: Any = field.json_schema_extra
         # The alternatives of a union such as `int | None`, or the type itself.
         kinds = {field.annotation, *typing.get_args(field.annotation)}
-        arguments: StrDict = {"help": field.description, "metavar": metadata["metavar"]}
+        arguments: StrDict = {"help": field.description}
         if field.default not in (None, False):
             arguments["help"] += f" ({field.default})"
         if name == "progress":
             arguments |= YES_OR_NO
         elif bool in kinds:
-            # argparse knows no metavar for a flag without a value.
-            arguments = {"help": arguments["help"], "action": "store_true", "default": None}
+            arguments |= {"action": "store_true", "default": None}
         elif StrDict in kinds:
             arguments |= PAIRS
-        elif float in kinds:
-            arguments["type"] = float
-        elif str not in kinds:
-            arguments["type"] = whole
+        else:
+            arguments["metavar"] = METAVARS.get(name, "N")
+            if float in kinds:
+                arguments["type"] = float
+            elif str not in kinds:
+                arguments["type"] = whole
+        short = [SHORT_FLAGS[name]] if name in SHORT_FLAGS else []
         arguments |= changes.get(name, {})
-        parser.add_argument(*metadata["flags"], f"--{name.replace('_', '-')}", **arguments)
+        parser.add_argument(*short, f"--{name.replace('_', '-')}", **arguments)
 
 
-def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add flags that several commands have: ``executor`` (with ``--address``), ``trust``,
-    ``overwrite`` and ``progress``.
-    """
-    add = parser.add_argument
-    if "executor" in names:
-        add(
-            "--executor",
-            default="local",
-            metavar="KIND",
-            help="local (processes on this machine, default) or ray (docs/sweeps.md)",
+COMMON: dict[str, Flags] = {
+    "executor": {
+        "--executor KIND": (
+            str,
+            "local",
+            "local (processes on this machine, default) or ray (docs/sweeps.md)",
+        ),
+        "--address WHERE": (
+            str,
+            None,
+            "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)",
+        ),
+    },
+    "trust": {
+        "--trust": (
+            SWITCH,
+            False,
+            "let zips run code that is pickled in them; only for files you trust "
+            "(docs/security.md)",
         )
-        add(
-            "--address",
-            metavar="WHERE",
-            help="Ray cluster: auto, host:port or ray://host:port (a new one on this machine)",
-        )
-    if "trust" in names:
-        trust = "let zips run code that is pickled in them; only for files you trust"
-        add("--trust", action="store_true", help=f"{trust} (docs/security.md)")
-    if "overwrite" in names:
-        add("--overwrite", action="store_true", help="replace existing files")
-    if "progress" in names:
-        add("-P", "--progress", help="show a progress bar (yes in a terminal)", **YES_OR_NO)
+    },
+    "overwrite": {"--overwrite": (SWITCH, False, "replace existing files")},
+    "progress": {"-P --progress": (YES_OR_NO, None, "show a progress bar (yes in a terminal)")},
+}
+"""Flags that several commands have."""
+
+
+def add_common(parser: ArgumentParser, *names: str) -> None:
+    """Add those flags of ``COMMON`` that have these names."""
+    for name in names:
+        add_flags(parser, COMMON[name])
 
 
 def given(options: Namespace, *names: str) -> StrDict:

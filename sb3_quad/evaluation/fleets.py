@@ -5,12 +5,15 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
+import gymnasium
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
+
+ENV_ID = "QuadTargetTracking-v0"  # of the environment on PyBullet; its task comes with the settings
 
 
 class FleetStep(NamedTuple):
@@ -91,13 +94,11 @@ class PyBulletFleet:
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        # PyBullet may be missing, which matters here only.
-        from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-
-        # Flights end by their plan; none is truncated by its environment.
-        keywords = dict(settings.with_changes(max_episode_steps=ENDLESS))
+        # Flights end by their plan; -1 is Gymnasium's word for an environment that truncates none.
+        keywords = {**dict(settings), "max_episode_steps": -1, "disable_env_checker": True}
         self._seeds = seeds
-        self._envs = [QuadcopterEnv(**keywords) for _ in seeds]
+        # By its id, since PyBullet may be missing, which matters here only.
+        self._envs: list[Any] = [gymnasium.make(ENV_ID, **keywords).unwrapped for _ in seeds]
         self.vehicle = self._envs[0].vehicle
         self.observation_size = self._envs[0].batch.observation.size
 

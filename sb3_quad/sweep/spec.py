@@ -17,7 +17,7 @@ from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import Seed
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.training.classes import as_list
+from sb3_quad.training.algorithms import as_list
 from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.vehicles.vehicle import NAME
 

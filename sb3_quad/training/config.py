@@ -24,24 +24,28 @@ from pydantic import (
 from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
+from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
+from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.tasks import TASKS, in_words
 from sb3_quad.training.algorithms import (
+    as_list,
     check,
     constructor_parameters,
     convert,
     get_algorithm,
     is_off_policy,
+    qualified_classes,
     takes_expert,
 )
-from sb3_quad.training.classes import as_list, qualified_classes
 from sb3_quad.training.options import JobOptions
-from sb3_quad.vehicles.vehicle import VEHICLES
+from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 
 _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
@@ -84,49 +88,39 @@ class TrainingConfig(Frozen):
 
     algo: str
     env_id: str
-    n_timesteps: Whole = Field(description="timesteps to train on, over all environments")
-    n_envs: Whole = Field(default=1, description="number of parallel environments")
-    vec_env: VecEnvKind = Field(
-        description="batch by default for this package's environments, dummy for others"
-    )
-    env_kwargs: Keywords = Field(
-        default={}, description="keywords of the environment's constructor"
-    )
-    eval_env_kwargs: Keywords = Field(
-        default={}, description="put over env_kwargs in the evaluation's environments"
-    )
-    eval_tasks: Tasks = Field(
-        default=(),
-        description="more tasks to evaluate on; the job's own task decides which model is best",
-    )
-    best_by: Literal["success", "survival"] = Field(
-        default="success", description="the rate that decides which model is best"
-    )
+    n_timesteps: Whole
+    """timesteps to train on, over all environments"""
+    n_envs: Whole = 1
+    """number of parallel environments"""
+    vec_env: VecEnvKind
+    """batch by default for this package's environments, dummy for others"""
+    env_kwargs: Keywords = {}
+    """keywords of the environment's constructor"""
+    eval_env_kwargs: Keywords = {}
+    """put over env_kwargs in the evaluation's environments"""
+    eval_tasks: Tasks = ()
+    """more tasks to evaluate on; the job's own task decides which model is best"""
+    best_by: Literal["success", "survival"] = "success"
+    """the rate that decides which model is best"""
     policy: str = "MlpPolicy"
-    policy_kwargs: Keywords = Field(
-        default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'"
-    )
-    expert: Any = Field(
-        default=None,
-        description="pid, geometric, path/to/model.zip or package.module:factory, to learn from",
-    )
-    callback: Classes = Field(default=[], description="callbacks of the training")
-    env_wrapper: Classes = Field(
-        default=[], description="wrappers around each environment, for dummy and subproc"
-    )
-    vec_env_wrapper: Classes = Field(
-        default=[], description="wrappers around the vectorised environment"
-    )
-    normalize: Literal[False] | None = Field(
-        default=None, description="its statistics would not be part of a model's zip"
-    )
-    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = Field(
-        default=None, description="action noise, for off-policy algorithms"
-    )
-    noise_std: NonNegativeFloat = Field(
-        default=0.1, description="standard deviation of the action noise; actions are in [-1, 1]"
-    )
-    hyperparams: StrDict = Field(description="keywords of the algorithm's constructor, converted")
+    policy_kwargs: Keywords = {}
+    """mapping, or a string such as 'dict(net_arch=[64, 64])'"""
+    expert: Any = None
+    """pid, geometric, path/to/model.zip or package.module:factory, to learn from"""
+    callback: Classes = []
+    """callbacks of the training"""
+    env_wrapper: Classes = []
+    """wrappers around each environment, for dummy and subproc"""
+    vec_env_wrapper: Classes = []
+    """wrappers around the vectorised environment"""
+    normalize: Literal[False] | None = None
+    """its statistics would not be part of a model's zip"""
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
+    """action noise, for off-policy algorithms"""
+    noise_std: NonNegativeFloat = 0.1
+    """standard deviation of the action noise; actions are in [-1, 1]"""
+    hyperparams: StrDict
+    """keywords of the algorithm's constructor, converted"""
     settings: StrDict = Field(repr=False)
 
     @property
@@ -246,7 +240,8 @@ JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams"
 class TrainingJob(JobOptions):
     """One job of the trainer: settings and options."""
 
-    config: TrainingConfig = Field(description="the settings")
+    config: TrainingConfig
+    """the settings"""
 
     def for_evaluation(self, **changes: Any) -> TrainingConfig:
         """Return the settings with the environments as evaluations have them.
@@ -423,3 +418,39 @@ def check_environment(env_id: str) -> None:
         f"unknown environment {env_id!r}: {hint}(of this package: {', '.join(ENVIRONMENTS)}; "
         "others: --gym-packages)"
     )
+
+
+def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict:
+    """Return ``changes`` to a settings file with the observation and networks of a zip added.
+
+    What is in ``changes`` takes precedence. Evaluations fly with the agent's position integral, if
+    it has one; training does without. A zip that does not say how its agent flies adds nothing.
+
+    :param config: the settings with ``changes`` alone.
+    """
+    own, source = agent_settings(path)
+    if source is None or config.task is None:
+        return changes
+    # A new vehicle may be what the user wants, so this is only a warning.
+    notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))
+    if notice:
+        print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
+    env_kwargs = {
+        name: own.observed[name]
+        for name in ("last_action", "history", "observation_mean", "observation_std")
+    }
+    env_kwargs |= changes.get("env_kwargs", {})
+    eval_env_kwargs = {"position_integral": own.observed["position_integral"]}
+    eval_env_kwargs |= config.eval_env_kwargs
+    eval_env_kwargs |= changes.get("eval_env_kwargs", {})
+    merged = {**changes, "env_kwargs": env_kwargs, "eval_env_kwargs": eval_env_kwargs}
+    # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
+    if "policy_kwargs" not in changes and not config.is_off_policy:
+        policy: Any = load_model(path).policy
+        merged["policy_kwargs"] = {
+            **config.policy_kwargs,
+            "net_arch": policy.net_arch,
+            # As config.yml names it.
+            "activation_fn": f"nn.{policy.activation_fn.__name__}",
+        }
+    return merged

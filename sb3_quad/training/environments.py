@@ -17,7 +17,7 @@ from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.process import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.simulation.settings import ENDLESS
-from sb3_quad.training.classes import instance
+from sb3_quad.training.algorithms import instance
 from sb3_quad.training.config import TrainingConfig
 
 Env: TypeAlias = gymnasium.Env[Any, Any]

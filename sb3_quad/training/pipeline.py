@@ -61,22 +61,16 @@ class Requirement(Frozen):
 class OffsetCorrection(Frozen):
     """How the agent of a stage is corrected after its training."""
 
-    kind: Literal["position", "hover", "arrival"] = Field(
-        description="see algorithms/offset_correction.py, and training/arrival_correction.py"
-    )
-    scale: PositiveFloat = Field(
-        default=1.0, description="position: α, which becomes a part of the agent"
-    )
-    rounds: PositiveInt = Field(
-        default=1, description="arrival: number of searches, each from the result of the one before"
-    )
-    overshoot_cost: NonNegativeFloat = Field(
-        default=OVERSHOOT_COST,
-        description="arrival: penalty in seconds for leaving a target after reaching it",
-    )
-    env_kwargs: StrDict = Field(
-        default={}, description="arrival: changes to env_kwargs of the flights that are optimised"
-    )
+    kind: Literal["position", "hover", "arrival"]
+    """see algorithms/offset_correction.py, and training/arrival_correction.py"""
+    scale: PositiveFloat = 1.0
+    """position: α, which becomes a part of the agent"""
+    rounds: PositiveInt = 1
+    """arrival: number of searches, each from the result of the one before"""
+    overshoot_cost: NonNegativeFloat = OVERSHOOT_COST
+    """arrival: penalty in seconds for leaving a target after reaching it"""
+    env_kwargs: StrDict = {}
+    """arrival: changes to env_kwargs of the flights that are optimised"""
 
     @model_validator(mode="after")
     def _keys_of_kind(self) -> "OffsetCorrection":
@@ -89,36 +83,31 @@ class OffsetCorrection(Frozen):
 class Stage(Frozen):
     """One stage of a pipeline."""
 
-    name: str = Field(min_length=1, description="what the stage is called in tables")
-    algo: str = Field(description="as for a single run")
-    env: str = Field(description="as for a single run")
-    conf_file: str | None = Field(
-        default=None, description="settings file; <algo>.yml of the package without it"
-    )
-    settings: StrDict = Field(
-        default={}, description="changes to these settings, such as n_timesteps: 5_000_000"
-    )
-    seed_offset: NonNegativeInt = Field(
-        default=0,
-        description="added to the seed, so that stages on the same task fly different episodes",
-    )
-    pass_on: Literal["best", "last"] = Field(
-        default="best", description="the best evaluation, as best_by of its settings says"
-    )
+    name: str = Field(min_length=1)
+    """what the stage is called in tables"""
+    algo: str
+    """as for a single run"""
+    env: str
+    """as for a single run"""
+    conf_file: str | None = None
+    """settings file; <algo>.yml of the package without it"""
+    settings: StrDict = {}
+    """changes to these settings, such as n_timesteps: 5_000_000"""
+    seed_offset: NonNegativeInt = 0
+    """added to the seed, so that stages on the same task fly different episodes"""
+    pass_on: Literal["best", "last"] = "best"
+    """the best evaluation, as best_by of its settings says"""
     correct_offset: Annotated[
         OffsetCorrection | None,
         BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value),
-    ] = Field(
-        default=None,
-        description="offset correction after the stage: {kind: arrival, rounds: 2}, or its kind",
-    )
-    require: Requirement = Field(
-        default=Requirement(), description="the pipeline stops where this is missed"
-    )
-    eval_freq: int | None = Field(
-        default=None, description="timesteps between evaluations of this stage"
-    )
-    eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
+    ] = None
+    """offset correction after the stage: {kind: arrival, rounds: 2}, or its kind"""
+    require: Requirement = Requirement()
+    """the pipeline stops where this is missed"""
+    eval_freq: int | None = None
+    """timesteps between evaluations of this stage"""
+    eval_episodes: PositiveInt | None = None
+    """episodes in each"""
 
 
 class Pipeline(Frozen):
@@ -138,8 +127,10 @@ class Pipeline(Frozen):
 class Status(Pipeline):
     """The content of ``pipeline.yml`` in a pipeline's folder."""
 
-    job: StrDict = Field(description="options of every job")
-    runs: tuple[str, ...] = Field(description="the run folders of the stages that have begun")
+    job: StrDict
+    """options of every job"""
+    runs: tuple[str, ...]
+    """the run folders of the stages that have begun"""
 
 
 class StageResult(NamedTuple):

@@ -36,8 +36,7 @@ from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import get_algorithm, takes_expert
-from sb3_quad.training.classes import instance
+from sb3_quad.training.algorithms import get_algorithm, instance, takes_expert
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run

@@ -19,7 +19,7 @@ from contextlib import ExitStack, closing
 from timeit import Timer
 from typing import Any
 
-from sb3_quad.cli.parser import YES_OR_NO, Parser, above_zero, positive
+from sb3_quad.cli.parser import SEVERAL, YES_OR_NO, Flags, Parser, above_zero, add_flags, positive
 
 ENV_ID = "QuadTargetTracking-v0"
 # The environment of the training loops.
@@ -29,36 +29,22 @@ REPETITIONS = 5
 Measurement = tuple[str, int, list[float]]
 
 
+FLAGS: Flags = {
+    "--sizes": (
+        {"nargs": "+", "type": positive, "metavar": "N"},
+        [64, 240, 1024, 4096, 16384],
+        "numbers of rows of the batch (64 240 1024 4096 16384)",
+    ),
+    "--n-envs N": (positive, 8, "environments of DummyVecEnv and SubprocVecEnv (8)"),
+    "--seconds S": (above_zero, 3.0, "duration of each measurement (3)"),
+    "--algo": (SEVERAL, ["dagger", "ppo_bc"], "algorithms of the training loops (dagger ppo_bc)"),
+    "-conf --conf-file FILE": (str, None, "settings of the training loops (ALGO.yml)"),
+    "--training": (YES_OR_NO, None, "measure only, or no, training loops (both)"),
+}
+
+
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
-        "--sizes",
-        nargs="+",
-        type=positive,
-        default=[64, 240, 1024, 4096, 16384],
-        help="numbers of rows of the batch (64 240 1024 4096 16384)",
-    )
-    add(
-        "--n-envs",
-        type=positive,
-        default=8,
-        help="environments of DummyVecEnv and SubprocVecEnv (8)",
-    )
-    add(
-        "--seconds",
-        type=above_zero,
-        default=3.0,
-        metavar="S",
-        help="duration of each measurement (3)",
-    )
-    add(
-        "--algo",
-        nargs="+",
-        default=["dagger", "ppo_bc"],
-        help="algorithms of the training loops (dagger ppo_bc)",
-    )
-    add("-conf", "--conf-file", metavar="FILE", help="settings of the training loops (ALGO.yml)")
-    add("--training", help="measure only, or no, training loops (both)", **YES_OR_NO)
+    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

@@ -20,7 +20,7 @@ from argparse import Namespace
 from typing import TYPE_CHECKING, Any
 
 from sb3_quad.base.errors import CannotHover
-from sb3_quad.cli.parser import Parser, natural
+from sb3_quad.cli.parser import Flags, Parser, add_flags, natural
 
 if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import Vehicle
@@ -33,22 +33,19 @@ FASTEST_HOVER = 10_000.0
 RPM = 60.0 / (2.0 * math.pi)
 
 
+FLAGS: Flags = {
+    "-n --episodes N": (
+        natural,
+        480,
+        "episodes of each task and expert, with the true state (480)",
+    ),
+    "--seed N": (natural, 0, "seed of the episodes, which no search or training uses (0)"),
+}
+
+
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add("vehicle", metavar="VEHICLE", help="name or YAML file")
-    add(
-        "-n",
-        "--episodes",
-        type=natural,
-        default=480,
-        help="episodes of each task and expert, with the true state (480)",
-    )
-    add(
-        "--seed",
-        type=natural,
-        default=0,
-        help="seed of the episodes, which no search or training uses (0)",
-    )
+    parser.add_argument("vehicle", metavar="VEHICLE", help="name or YAML file")
+    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

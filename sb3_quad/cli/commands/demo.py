@@ -23,19 +23,22 @@ of the package.
 from argparse import Namespace
 
 from sb3_quad.base.files import refuse_existing, write_text
-from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.cli.parser import Flags, Parser, add_common, add_flags
+
+FLAGS: Flags = {
+    "-o --output FILE": (str, "demo.html", "page to write (demo.html)"),
+    "--vehicle": (str, None, "first vehicle, by name or YAML file (that of the first agent)"),
+}
 
 
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
+    parser.add_argument(
         "agents",
         nargs="*",
         metavar="CONTROLLER",
         help="controllers to show (pid, geometric, and agents of the package)",
     )
-    add("-o", "--output", default="demo.html", metavar="FILE", help="page to write (demo.html)")
-    add("--vehicle", help="first vehicle, by name or YAML file (that of the first agent)")
+    add_flags(parser, FLAGS)
     add_common(parser, "trust", "overwrite")
 
 

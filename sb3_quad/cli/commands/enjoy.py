@@ -34,115 +34,25 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.base.types import StrDict
-from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, positive, whole
+from sb3_quad.cli.parser import (
+    PAIRS,
+    SEVERAL,
+    SWITCH,
+    Flags,
+    Parser,
+    above_zero,
+    add_common,
+    add_flags,
+    natural,
+    positive,
+    whole,
+)
 from sb3_quad.envs.registration import ENVIRONMENTS
 
 DEFAULT_ENV = "QuadTargetTracking-v0"
 # Width and height of the only panel, and of one of several, pixels.
 SINGLE = (640, 480)
 PANEL = (480, 480)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of this command."""
-    add = parser.add_argument
-    add(
-        "controllers",
-        nargs="*",
-        metavar="CONTROLLER",
-        help="controllers to fly, in addition to the agent of --algo",
-    )
-    _add_run_arguments(parser)
-    task = parser.add_mutually_exclusive_group()
-    task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
-    task.add_argument("--task", help="a task such as target_tracking, instead of --env")
-    task.add_argument(
-        "--scenario",
-        metavar="SUITE:NAME",
-        help="a scenario such as thesis:side_hit, instead of --env",
-    )
-    add(
-        "-n",
-        "--n-timesteps",
-        type=positive,
-        help="control steps, in as many episodes as needed (one episode)",
-    )
-    add(
-        "--n-envs",
-        type=positive,
-        default=1,
-        help="number of parallel episodes, with consecutive seeds (1)",
-    )
-    add(
-        "--seed", type=natural, default=0, help="seed of the first episode; later ones count up (0)"
-    )
-    actions = parser.add_mutually_exclusive_group()
-    actions.add_argument(
-        "--deterministic", action="store_true", help="fly the mean of a policy's actions (default)"
-    )
-    actions.add_argument("--stochastic", action="store_true", help="sample a policy's actions")
-    add("--env-kwargs", default={}, help="environment keywords, such as noise:0", **PAIRS)
-    add("--target", nargs=3, type=float, metavar=("X", "Y", "Z"), help="target to fly to, m")
-    add("--no-render", action="store_true", help="only fly and print the results")
-    add(
-        "-o",
-        "--output",
-        nargs="+",
-        default=[],
-        metavar="FILE",
-        help="write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
-    )
-    add("--size", type=_size, metavar="WxH", help="size of one controller's panel, pixels")
-    add(
-        "--speed",
-        type=above_zero,
-        default=1.0,
-        metavar="X",
-        help="playback speed of film and window; 0.5 is slow motion (1)",
-    )
-    add_common(parser, "trust", "overwrite", "progress")
-
-
-def _add_run_arguments(parser: Parser) -> None:
-    """Add the flags that name the agent of a run folder."""
-    add = parser.add_argument
-    add("--algo", help="algorithm of a trained agent, which is looked up in the log folder")
-    add(
-        "-f",
-        "--folder",
-        "--log-folder",
-        default="logs",
-        metavar="DIR",
-        help="folder that holds the run folders (logs)",
-    )
-    add(
-        "--exp-id",
-        type=whole,
-        default=0,
-        help="number of the run (0: the latest one that has an agent)",
-    )
-    add = parser.add_mutually_exclusive_group().add_argument
-    add(
-        "--load-best",
-        dest="which",
-        action="store_const",
-        const="best",
-        help="fly the best agent of the evaluations",
-    )
-    add(
-        "--load-checkpoint",
-        dest="which",
-        type=whole,
-        metavar="N",
-        help="fly the checkpoint after N timesteps",
-    )
-    add(
-        "--load-last-checkpoint",
-        dest="which",
-        action="store_const",
-        const="last",
-        help="fly the last checkpoint",
-    )
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -153,6 +63,83 @@ def _size(text: str) -> tuple[int, int]:
         raise ArgumentTypeError(
             f"{text}: must be width and height in pixels, such as 640x480"
         ) from None
+
+
+RUN_FLAGS: Flags = {
+    "--algo": (str, None, "algorithm of a trained agent, which is looked up in the log folder"),
+    "-f --folder --log-folder DIR": (str, "logs", "folder that holds the run folders (logs)"),
+    "--exp-id N": (whole, 0, "number of the run (0: the latest one that has an agent)"),
+}
+"""The flags that name a run folder."""
+AGENT_FLAGS: Flags = {
+    "--load-best": (
+        {"dest": "which", "action": "store_const", "const": "best"},
+        None,
+        "fly the best agent of the evaluations",
+    ),
+    "--load-checkpoint N": (
+        {"dest": "which", "type": whole},
+        None,
+        "fly the checkpoint after N timesteps",
+    ),
+    "--load-last-checkpoint": (
+        {"dest": "which", "action": "store_const", "const": "last"},
+        None,
+        "fly the last checkpoint",
+    ),
+}
+"""The flags that name the agent in it, one at most; likewise the next two tables."""
+EPISODE_FLAGS: Flags = {
+    "--env": (str, None, f"environment id ({DEFAULT_ENV})"),
+    "--task": (str, None, "a task such as target_tracking, instead of --env"),
+    "--scenario SUITE:NAME": (
+        str,
+        None,
+        "a scenario such as thesis:side_hit, instead of --env",
+    ),
+}
+ACTION_FLAGS: Flags = {
+    "--deterministic": (SWITCH, False, "fly the mean of a policy's actions (default)"),
+    "--stochastic": (SWITCH, False, "sample a policy's actions"),
+}
+FLAGS: Flags = {
+    "-n --n-timesteps N": (
+        positive,
+        None,
+        "control steps, in as many episodes as needed (one episode)",
+    ),
+    "--n-envs N": (positive, 1, "number of parallel episodes, with consecutive seeds (1)"),
+    "--seed N": (natural, 0, "seed of the first episode; later ones count up (0)"),
+    "--env-kwargs": (PAIRS, {}, "environment keywords, such as noise:0"),
+    "--target": (
+        {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")},
+        None,
+        "target to fly to, m",
+    ),
+    "--no-render": (SWITCH, False, "only fly and print the results"),
+    "-o --output FILE": (
+        SEVERAL,
+        [],
+        "write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
+    ),
+    "--size WxH": (_size, None, "size of one controller's panel, pixels"),
+    "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
+}
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of this command."""
+    parser.add_argument(
+        "controllers",
+        nargs="*",
+        metavar="CONTROLLER",
+        help="controllers to fly, in addition to the agent of --algo",
+    )
+    add_flags(parser, RUN_FLAGS)
+    for flags in (AGENT_FLAGS, EPISODE_FLAGS, ACTION_FLAGS):
+        add_flags(parser.add_mutually_exclusive_group(), flags)
+    add_flags(parser, FLAGS)
+    add_common(parser, "trust", "overwrite", "progress")
 
 
 def run(options: Namespace) -> int:

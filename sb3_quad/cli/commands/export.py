@@ -25,37 +25,43 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.cli.parser import Flags, Parser, add_common, add_flags
 from sb3_quad.controllers.pretrained import agent_path
 
 # Facts about an exported policy that are printed, in this order.
 FACTS = ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check")
 
 
+FLAGS: Flags = {
+    "--format": ({"required": True}, None, "onnx, torchscript or c"),
+    "-o FILE": (
+        {"dest": "file"},
+        None,
+        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
+    ),
+    "--output KIND": (
+        str,
+        "thrusts",
+        "result of the policy: thrusts (N, default) or speeds (rad/s)",
+    ),
+    "--vehicle": (
+        str,
+        None,
+        "vehicle, by name or YAML file (that of the zip or its run folder)",
+    ),
+    "--name": (str, None, "call the C function NAME_policy (the name of the file)"),
+}
+
+
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
+    parser.add_argument(
         "model",
         type=agent_path,
         metavar="MODEL",
         help="agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     )
-    add("--format", required=True, help="onnx, torchscript or c")
-    add(
-        "-o",
-        metavar="FILE",
-        dest="file",
-        help="file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
-    )
-    add(
-        "--output",
-        default="thrusts",
-        metavar="KIND",
-        help="result of the policy: thrusts (N, default) or speeds (rad/s)",
-    )
-    add("--vehicle", help="vehicle, by name or YAML file (the one in the zip or its run folder)")
-    add("--name", help="call the C function NAME_policy (the name of the file)")
+    add_flags(parser, FLAGS)
     add_common(parser, "trust", "overwrite")
 
 

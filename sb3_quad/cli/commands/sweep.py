@@ -30,44 +30,52 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
-from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
+from sb3_quad.cli.parser import (
+    PAIRS,
+    SEVERAL,
+    SWITCH,
+    Flags,
+    Parser,
+    add_common,
+    add_fields,
+    add_flags,
+    given,
+    positive,
+    seed,
+)
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 
+FLAGS: Flags = {
+    "--seed N": ({"nargs": "+", "type": seed}, None, "seeds of each configuration (0)"),
+    "-conf --conf-file FILE": (
+        SEVERAL,
+        None,
+        "settings files, of single runs or pipelines (two_stage.yml)",
+    ),
+    "--algo": (SEVERAL, None, "algorithms of single runs (dagger)"),
+    "--env": (str, None, "environment id of single runs (QuadTargetTracking-v0)"),
+    "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
+    "--suite": (str, None, "suite for the comparison (240 fresh episodes of each task)"),
+    "--episodes N": (positive, None, "episodes of each scenario in the comparison"),
+    "--gym-packages MODULE": (SEVERAL, None, "modules that register further environments"),
+    "--workers N": (positive, None, "number of parallel runs (one per core)"),
+    "--dry-run": (SWITCH, False, "list the runs and train nothing"),
+    "--resume FOLDER": (str, None, "continue the sweep in its folder"),
+}
+
 
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
+    parser.add_argument(
         "sweep",
         nargs="?",
         metavar="SWEEP",
         help="YAML file, or the name of a sweep of the package; the flags below replace its keys",
     )
-    add("--seed", nargs="+", type=seed, help="seeds of each configuration (0)")
-    add(
-        "-conf",
-        "--conf-file",
-        nargs="+",
-        metavar="FILE",
-        help="settings files, of single runs or pipelines (two_stage.yml)",
-    )
-    add("--algo", nargs="+", help="algorithms of single runs (dagger)")
-    add("--env", help="environment id of single runs (QuadTargetTracking-v0)")
+    add_flags(parser, FLAGS)
     add_fields(parser, SettingsOptions)
-    add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
     fields = (*RunOptions.model_fields, "log_folder")
     add_fields(parser, JobOptions, *fields, trained_agent={"type": agent_path})
-    add("--suite", help="suite for the comparison (240 fresh episodes of each task)")
-    add("--episodes", type=positive, help="episodes of each scenario in the comparison")
-    add(
-        "--gym-packages",
-        nargs="+",
-        metavar="MODULE",
-        help="modules that register further environments",
-    )
-    add("--workers", type=positive, help="number of parallel runs (one per core)")
-    add("--dry-run", action="store_true", help="list the runs and train nothing")
-    add("--resume", metavar="FOLDER", help="continue the sweep in its folder")
     add_common(parser, "executor", "trust", "progress")
 
 

@@ -37,7 +37,19 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
-from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
+from sb3_quad.cli.parser import (
+    PAIRS,
+    SEVERAL,
+    SWITCH,
+    Flags,
+    Parser,
+    add_common,
+    add_fields,
+    add_flags,
+    given,
+    positive,
+    seed,
+)
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, SettingsOptions
 
@@ -61,63 +73,53 @@ KEPT_BY_RESUME = (
 KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
 
 
+SETTINGS_FLAGS: Flags = {
+    "--algo": (str, None, f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})"),
+    "--env": (
+        str,
+        None,
+        f"environment id ({DEFAULT_ENV}); "
+        "any id that Gymnasium knows, with --vec-env dummy or subproc",
+    ),
+    "-conf --conf-file FILE": (
+        str,
+        None,
+        "settings: a YAML file, or one of the package, such as thesis/dagger.yml "
+        "(ALGO.yml: undisturbed, PID expert)",
+    ),
+    "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
+    "--num-threads N": (positive, None, "threads (the cores; one where PyTorch computes)"),
+    "--gym-packages MODULE": (SEVERAL, [], "modules that register further environments"),
+}
+FLAGS: Flags = {
+    "--thesis": (SWITCH, False, f"the thesis's method: --conf-file {THESIS}"),
+    "--seed N": (seed, None, "seed (0); negative: a random one, recorded in args.yml"),
+    "--resume RUN_FOLDER": (
+        str,
+        None,
+        "continue an interrupted or killed run with all its settings",
+    ),
+}
+# Options of a run that tune has, and all others; seed and progress have flags of their own.
+SHARED_FIELDS = ("eval_env_kwargs", "trained_agent", "n_eval_envs", "device")
+TRAIN_FIELDS = [
+    name for name in JobOptions.model_fields if name not in (*SHARED_FIELDS, "seed", "progress")
+]
+
+
 def add_settings(parser: Parser) -> None:
     """Add the flags for what is trained, which ``tune`` has as well."""
-    add = parser.add_argument
-    add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
-    add(
-        "--env",
-        help=f"environment id ({DEFAULT_ENV}); "
-        "any id that Gymnasium knows, with --vec-env dummy or subproc",
-    )
-    add(
-        "-conf",
-        "--conf-file",
-        metavar="FILE",
-        help="settings: a YAML file, or one of the package, such as thesis/dagger.yml "
-        "(ALGO.yml: undisturbed, PID expert)",
-    )
+    add_flags(parser, SETTINGS_FLAGS)
     add_fields(parser, SettingsOptions)
-    add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
-    shared = ("eval_env_kwargs", "trained_agent", "n_eval_envs", "device")
-    add_fields(parser, JobOptions, *shared, trained_agent={"type": agent_path})
-    add(
-        "--num-threads",
-        type=positive,
-        metavar="N",
-        help="threads (the cores; one where PyTorch computes)",
-    )
-    add(
-        "--gym-packages",
-        nargs="+",
-        default=[],
-        metavar="MODULE",
-        help="modules that register further environments",
-    )
+    add_fields(parser, JobOptions, *SHARED_FIELDS, trained_agent={"type": agent_path})
     add_common(parser, "trust", "progress")
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
-    add = parser.add_argument
-    add("--thesis", action="store_true", help=f"the thesis's method: --conf-file {THESIS}")
-    add(
-        "--seed",
-        type=seed,
-        metavar="N",
-        help="seed (0); negative: a random one, recorded in args.yml",
-    )
-    run_fields = ("log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
-    log_fields = ("log_interval", "tensorboard_log", "verbose", "track", "wandb_project_name")
-    add_fields(parser, JobOptions, *run_fields, *log_fields)
-    tags = {"nargs": "+", "type": str}
-    add_fields(parser, JobOptions, "wandb_entity", "wandb_group", "wandb_tags", wandb_tags=tags)
-    add(
-        "--resume",
-        metavar="RUN_FOLDER",
-        help="continue an interrupted or killed run with all its settings",
-    )
+    add_flags(parser, FLAGS)
+    add_fields(parser, JobOptions, *TRAIN_FIELDS, wandb_tags={"nargs": "+", "type": str})
 
 
 def run(options: Namespace) -> int:
@@ -209,8 +211,7 @@ def prepare(options: Namespace) -> None:
 
 def make_config(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.training.config.TrainingConfig` of a command line."""
-    from sb3_quad.training.config import load_config
-    from sb3_quad.training.successor import as_agent
+    from sb3_quad.training.config import as_agent, load_config
 
     algo = options.algo or DEFAULT_ALGO
     env = options.env or DEFAULT_ENV

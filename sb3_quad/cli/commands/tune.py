@@ -35,72 +35,53 @@ from typing import Any
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
-from sb3_quad.cli.parser import Parser, given, natural, positive, seed, whole
+from sb3_quad.cli.parser import Flags, Parser, add_flags, given, natural, positive, seed, whole
 
 JOURNAL = "study.log"
 # Episodes per evaluation by --vec-env.
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 
 
+FLAGS: Flags = {
+    "--n-trials N": (natural, 500, "trials of this process; 0 only writes the results (500)"),
+    "--max-total-trials N": (
+        positive,
+        None,
+        "trials of the whole study, without failed ones (no limit)",
+    ),
+    "--sampler NAME": (
+        str,
+        "tpe",
+        "method that proposes trials: tpe (default), random or cmaes",
+    ),
+    "--pruner NAME": (
+        str,
+        "median",
+        "method that stops poor trials early: median (default), halving or none",
+    ),
+    "--n-startup-trials N": (whole, 10, "random trials before sampler and pruner start (10)"),
+    "--n-evaluations N": (whole, 10, "evaluations per trial, for the pruner (10)"),
+    "--storage WHERE": (
+        str,
+        None,
+        "journal file, or URL of a database (study.log in the new folder)",
+    ),
+    "--study-name NAME": (str, None, "name of the study in the storage (ALGO_ENV)"),
+    "--search-space FILE": (
+        str,
+        None,
+        "YAML file of the settings to vary (the package's file for the algorithm)",
+    ),
+    "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
+    "--seed N": (seed, None, "seed of trainings and sampler, negative for a random one (0)"),
+    "--eval-episodes N": (whole, None, "episodes per evaluation (batch: 240, else 48)"),
+}
+
+
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings."""
     add_settings(parser)
-    add = parser.add_argument
-    add(
-        "--n-trials",
-        type=natural,
-        default=500,
-        help="trials of this process; 0 only writes the results (500)",
-    )
-    add(
-        "--max-total-trials",
-        type=positive,
-        help="trials of the whole study, without failed ones (no limit)",
-    )
-    add(
-        "--sampler",
-        default="tpe",
-        metavar="NAME",
-        help="method that proposes trials: tpe (default), random or cmaes",
-    )
-    add(
-        "--pruner",
-        default="median",
-        metavar="NAME",
-        help="method that stops poor trials early: median (default), halving or none",
-    )
-    add(
-        "--n-startup-trials",
-        type=whole,
-        default=10,
-        help="random trials before sampler and pruner start (10)",
-    )
-    add(
-        "--n-evaluations",
-        type=whole,
-        default=10,
-        help="evaluations per trial, for the pruner (10)",
-    )
-    add(
-        "--storage",
-        metavar="WHERE",
-        help="journal file, or URL of a database (study.log in the new folder)",
-    )
-    add("--study-name", metavar="NAME", help="name of the study in the storage (ALGO_ENV)")
-    add(
-        "--search-space",
-        metavar="FILE",
-        help="YAML file of the settings to vary (the package's file for the algorithm)",
-    )
-    add(
-        "-f",
-        "--log-folder",
-        default="logs",
-        metavar="DIR",
-        help="results go to DIR/tune/ALGO/ENV_N (logs)",
-    )
-    add("--seed", type=seed, help="seed of trainings and sampler, negative for a random one (0)")
-    add("--eval-episodes", type=whole, help="episodes per evaluation (batch: 240, else 48)")
+    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:
