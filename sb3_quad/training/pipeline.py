@@ -4,6 +4,7 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,7 +56,7 @@ class Requirement(Frozen):
     """The least that a stage must reach in its best evaluation before the next stage begins."""
 
     success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
-    mean_reward: float | None = None
+    mean_reward: float = -math.inf
 
 
 class OffsetCorrection(Frozen):
@@ -273,14 +274,13 @@ def _train_stages(
     **changes: Any,
 ) -> PipelineResult:
     """Train the stages that are not complete."""
-    runs = [*status.runs]
+    # The stages are written, too, since the settings file may change before a resume.
+    content = status.model_dump(mode="json", exclude_defaults=True)
+    runs = content["runs"]
     results: dict[str, StageResult] = {}
-    agent: str | None = None
+    agent = ""
 
     def write() -> None:
-        # The stages are written, too, since the settings file may change before a resume.
-        current = status.model_copy(update={"runs": tuple(runs)})
-        content = current.model_dump(mode="json", exclude_defaults=True)
         write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
 
     def note(number: int, run: RunFolder) -> None:
@@ -292,22 +292,21 @@ def _train_stages(
         try:
             write()
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
-                if agent is not None:
-                    job = job.model_copy(update={"trained_agent": agent})
                 run = open_run(runs[number]) if number < len(runs) else None
                 if run is not None and run.timesteps >= job.config.n_timesteps:
                     seconds = trained_seconds(run)
                 else:
+                    if agent:
+                        job = job.model_copy(update={"trained_agent": agent})
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
                     # A run that has a model and no snapshot cannot be resumed.
                     if run is not None and (run.not_begun or run.resume_state.is_file()):
                         trained = resume(runs[number], report, **changes)
                     else:
                         trained = train(job, report, on_start=partial(note, number))
-                    if trained.exit_code:
-                        break
                     run = trained.run
                     seconds = trained.seconds
+                # The signal that ended a training is noted here, too.
                 if signals.received is not None:
                     break
                 agent = str(_agent(stage, job, run, report))
@@ -336,18 +335,17 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
     """
     if run.evaluations.is_file():
         curve = read_curve(run.path)
-        rate = np.nan_to_num(curve.values(job.config.best_by))
-        success = np.nan_to_num(curve.values("success"))
-        # Ordered as BestModel orders models: by the rate, then by the reward.
-        scores = list(zip(rate, curve.reward, success, strict=True))
+        index = -1
         if stage.pass_on == "best":
-            scores.sort()
-        _, reward, success_rate = scores[-1]
+            # Ordered as BestModel orders models: by the rate, then by the reward.
+            rate = np.nan_to_num(curve.values(job.config.best_by))
+            index = np.lexsort((curve.reward, rate))[-1]
+        success = np.nan_to_num(curve.values("success"))[index]
+        reward = curve.reward[index]
         required = stage.require
-        misses_reward = required.mean_reward is not None and reward < required.mean_reward
-        if success_rate < required.success_rate or misses_reward:
+        if success < required.success_rate or reward < required.mean_reward:
             raise TrainingError(
-                f"stage {stage.name!r}: success {success_rate:.3f} and mean reward {reward:.2f} "
+                f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} "
                 f"miss what it requires ({required}); its run is {run.path}"
             )
     if stage.pass_on == "best" and run.best_model.is_file():

@@ -32,6 +32,7 @@ examples:
 
 import time
 from argparse import Namespace
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -124,71 +125,63 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: Namespace) -> int:
     """Train, compare, print where everything is. Returns the exit code."""
+    from sb3_quad.base.validate import validate
+    from sb3_quad.cli.closing import close_pipeline, close_run
     from sb3_quad.cli.output import shows_progress
-    from sb3_quad.training.pipeline import is_pipeline
+    from sb3_quad.training import pipeline
+    from sb3_quad.training.config import TrainingJob, describe
+    from sb3_quad.training.trainer import resume, train
 
+    start = time.perf_counter()
+    _check_flags(options)
+    prepare(options)
+    job = given(options, *JobOptions.model_fields)
+    job["progress"] = shows_progress(options.progress)
+    if options.resume is not None:
+        folder = Path(options.resume)
+        if not pipeline.is_pipeline_run(folder):
+            return close_run(resume(options.resume, **job))
+        result = pipeline.resume_pipeline(folder, **job)
+    elif options.conf_file is not None and pipeline.is_pipeline(options.conf_file):
+        _refuse(
+            options,
+            KEPT_BY_STAGES,
+            "{} goes with a single run (--algo, --env); "
+            f"a pipeline's stages have their own in {options.conf_file}",
+        )
+        stages = pipeline.load_pipeline(options.conf_file)
+        stages = pipeline.with_settings(stages, changed_settings(options))
+        result = pipeline.run_pipeline(stages, job, Path(options.conf_file).stem)
+    else:
+        content = {"config": make_config(options), **job}
+        checked = validate(TrainingJob, content, "command line")
+        print(describe(checked))
+        return close_run(train(checked))
+    return close_pipeline(result, time.perf_counter() - start)
+
+
+def _check_flags(options: Namespace) -> None:
+    """Check that flags go together, and fill in the settings file that they stand for."""
     if options.thesis:
         if options.conf_file or options.resume:
             raise ConfigError(
                 f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume"
             )
         options.conf_file = THESIS
-    prepare(options)
-    job = given(options, *JobOptions.model_fields)
-    job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
-        return _resume(options, job)
+        _refuse(options, KEPT_BY_RESUME, "--resume keeps the run's own settings; remove {}")
     # Without any of these, the default is a pipeline rather than a single run.
-    if options.conf_file is None and options.algo is None and options.env is None:
+    elif not given(options, "conf_file", "algo", "env"):
         options.conf_file = DEFAULT_PIPELINE
-    if options.conf_file is not None and is_pipeline(options.conf_file):
-        return _train_pipeline(options, job)
-    return _train_single(options, job)
 
 
-def _resume(options: Namespace, changes: StrDict) -> int:
-    from sb3_quad.cli.closing import close_pipeline, close_run
-    from sb3_quad.training.pipeline import is_pipeline_run, resume_pipeline
-    from sb3_quad.training.trainer import resume
+def _refuse(options: Namespace, names: Iterable[str], message: str) -> None:
+    """Refuse flags of these names; ``{}`` in the message stands for the flag.
 
-    for name in given(options, *KEPT_BY_RESUME):
-        raise ConfigError(f"--resume keeps the run's own settings; remove {_flag(name)}")
-    folder = Path(options.resume)
-    start = time.perf_counter()
-    if is_pipeline_run(folder):
-        return close_pipeline(resume_pipeline(folder, **changes), time.perf_counter() - start)
-    return close_run(resume(options.resume, **changes))
-
-
-def _train_pipeline(options: Namespace, job: StrDict) -> int:
-    from sb3_quad.cli.closing import close_pipeline
-    from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
-
-    for name in given(options, *KEPT_BY_STAGES):
-        raise ConfigError(
-            f"{_flag(name)} goes with a single run (--algo, --env); "
-            f"a pipeline's stages have their own in {options.conf_file}"
-        )
-    start = time.perf_counter()
-    pipeline = with_settings(load_pipeline(options.conf_file), changed_settings(options))
-    result = run_pipeline(pipeline, job, Path(options.conf_file).stem)
-    return close_pipeline(result, time.perf_counter() - start)
-
-
-def _train_single(options: Namespace, job: StrDict) -> int:
-    from sb3_quad.base.validate import validate
-    from sb3_quad.cli.closing import close_run
-    from sb3_quad.training.config import TrainingJob, describe
-    from sb3_quad.training.trainer import train
-
-    content = {"config": make_config(options), **job}
-    checked = validate(TrainingJob, content, "command line")
-    print(describe(checked))
-    return close_run(train(checked))
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+    :raises ConfigError: one of them is given.
+    """
+    for name in given(options, *names):
+        raise ConfigError(message.format(f"--{name.replace('_', '-')}"))
 
 
 def prepare(options: Namespace) -> None:
