@@ -481,7 +481,7 @@ def test_the_benchmark_measures_each_kind_of_environments(capsys):
     )
 
 
-def test_the_benchmark_measures_rollouts_and_updates(tmp_path, capsys):
+def test_the_benchmark_measures_training_loops(tmp_path, capsys):
     sizes = "n_timesteps: 100, n_envs: 4, n_steps: 10, batch_size: 20, n_epochs: 1"
     (tmp_path / "tiny.yml").write_text(f"QuadStateRecovery-v0: {{{sizes}}}")
     assert main(["benchmark", "--training", "--conf-file", str(tmp_path / "tiny.yml")]) == 0

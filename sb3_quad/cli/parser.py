@@ -145,8 +145,8 @@ def above_zero(text: str) -> float:
 
 
 Flags = Mapping[str, tuple[Any, Any, str]]
-"""A table of flags: by names and metavar, the type (or keywords of ``add_argument``), the default,
-and the help.
+"""A table of arguments: by names and metavar, the type (or keywords of ``add_argument``), the
+default, and the help.
 """
 
 
@@ -155,7 +155,7 @@ def add_flags(parser: ArgumentParser, flags: Flags) -> None:
     for words, (kind, default, text) in flags.items():
         arguments = kind if isinstance(kind, dict) else {"type": kind}
         names = words.split()
-        if not names[-1].startswith("-"):
+        if len(names) > 1 and not names[-1].startswith("-"):
             arguments = {**arguments, "metavar": names.pop()}
         parser.add_argument(*names, default=default, help=text, **arguments)
 
@@ -194,37 +194,27 @@ def add_fields(
         parser.add_argument(*short, f"--{name.replace('_', '-')}", **arguments)
 
 
-COMMON: dict[str, Flags] = {
-    "executor": {
-        "--executor KIND": (
-            str,
-            "local",
-            "local (processes on this machine, default) or ray (docs/sweeps.md)",
-        ),
-        "--address WHERE": (
-            str,
-            None,
-            "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)",
-        ),
-    },
-    "trust": {
-        "--trust": (
-            SWITCH,
-            False,
-            "let zips run code that is pickled in them; only for files you trust "
-            "(docs/security.md)",
-        )
-    },
-    "overwrite": {"--overwrite": (SWITCH, False, "replace existing files")},
-    "progress": {"-P --progress": (YES_OR_NO, None, "show a progress bar (yes in a terminal)")},
+EXECUTOR: Flags = {
+    "--executor KIND": (
+        str,
+        "local",
+        "local (processes on this machine, default) or ray (docs/sweeps.md)",
+    ),
+    "--address WHERE": (
+        str,
+        None,
+        "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)",
+    ),
 }
-"""Flags that several commands have."""
-
-
-def add_common(parser: ArgumentParser, *names: str) -> None:
-    """Add those flags of ``COMMON`` that have these names."""
-    for name in names:
-        add_flags(parser, COMMON[name])
+TRUST: Flags = {
+    "--trust": (
+        SWITCH,
+        False,
+        "let zips run code that is pickled in them; only for files you trust (docs/security.md)",
+    )
+}
+OVERWRITE: Flags = {"--overwrite": (SWITCH, False, "replace existing files")}
+PROGRESS: Flags = {"-P --progress": (YES_OR_NO, None, "show a progress bar (yes in a terminal)")}
 
 
 def given(options: Namespace, *names: str) -> StrDict:

@@ -55,6 +55,7 @@ from command to thrust {lag:.1f} ms
 
 
 FLAGS: Flags = {
+    "vehicle VEHICLE": (str, None, "name or YAML file"),
     "-n --episodes N": (
         natural,
         480,
@@ -65,7 +66,6 @@ FLAGS: Flags = {
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument("vehicle", metavar="VEHICLE", help="name or YAML file")
     add_flags(parser, FLAGS)
 
 

@@ -23,23 +23,23 @@ of the package.
 from argparse import Namespace
 
 from sb3_quad.base.files import refuse_existing, write_text
-from sb3_quad.cli.parser import Flags, Parser, add_common, add_flags
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, Parser, add_flags
 
 FLAGS: Flags = {
+    "agents CONTROLLER": (
+        {"nargs": "*"},
+        None,
+        "controllers to show (pid, geometric, and agents of the package)",
+    ),
     "-o --output FILE": (str, "demo.html", "page to write (demo.html)"),
     "--vehicle": (str, None, "first vehicle, by name or YAML file (that of the first agent)"),
+    **TRUST,
+    **OVERWRITE,
 }
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "agents",
-        nargs="*",
-        metavar="CONTROLLER",
-        help="controllers to show (pid, geometric, and agents of the package)",
-    )
     add_flags(parser, FLAGS)
-    add_common(parser, "trust", "overwrite")
 
 
 def run(options: Namespace) -> int:

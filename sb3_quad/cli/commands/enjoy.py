@@ -35,13 +35,15 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
+    OVERWRITE,
     PAIRS,
+    PROGRESS,
     SEVERAL,
     SWITCH,
+    TRUST,
     Flags,
     Parser,
     above_zero,
-    add_common,
     add_flags,
     natural,
     positive,
@@ -103,6 +105,11 @@ ACTION_FLAGS: Flags = {
     "--stochastic": (SWITCH, False, "sample a policy's actions"),
 }
 FLAGS: Flags = {
+    "controllers CONTROLLER": (
+        {"nargs": "*"},
+        None,
+        "controllers to fly, in addition to the agent of --algo",
+    ),
     "-n --n-timesteps N": (
         positive,
         None,
@@ -124,22 +131,18 @@ FLAGS: Flags = {
     ),
     "--size WxH": (_size, None, "size of one controller's panel, pixels"),
     "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
+    **TRUST,
+    **OVERWRITE,
+    **PROGRESS,
 }
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of this command."""
-    parser.add_argument(
-        "controllers",
-        nargs="*",
-        metavar="CONTROLLER",
-        help="controllers to fly, in addition to the agent of --algo",
-    )
     add_flags(parser, RUN_FLAGS)
     for flags in (AGENT_FLAGS, EPISODE_FLAGS, ACTION_FLAGS):
         add_flags(parser.add_mutually_exclusive_group(), flags)
     add_flags(parser, FLAGS)
-    add_common(parser, "trust", "overwrite", "progress")
 
 
 def run(options: Namespace) -> int:

@@ -40,12 +40,14 @@ import time
 from argparse import Namespace
 
 from sb3_quad.cli.parser import (
+    EXECUTOR,
+    PROGRESS,
     SEVERAL,
     SWITCH,
+    TRUST,
     YES_OR_NO,
     Flags,
     Parser,
-    add_common,
     add_flags,
     whole,
 )
@@ -54,6 +56,7 @@ DEFAULT_FOLDER = "evaluations"
 
 
 FLAGS: Flags = {
+    "controllers CONTROLLER": (SEVERAL, None, "controllers to fly, see below"),
     "--suite": (
         str,
         "thesis",
@@ -73,15 +76,14 @@ FLAGS: Flags = {
         "show the mean of a reward of your own, function(state, actions) per control step",
     ),
     "--report": (YES_OR_NO, True, "update report.html and its plots (yes)"),
+    **EXECUTOR,
+    **TRUST,
+    **PROGRESS,
 }
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "controllers", nargs="+", metavar="CONTROLLER", help="controllers to fly, see below"
-    )
     add_flags(parser, FLAGS)
-    add_common(parser, "executor", "trust", "progress")
 
 
 def run(options: Namespace) -> int:

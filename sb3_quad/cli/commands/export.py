@@ -25,7 +25,7 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import Flags, Parser, add_common, add_flags
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, Parser, add_flags
 from sb3_quad.controllers.pretrained import agent_path
 
 # Facts about an exported policy that are printed, in this order.
@@ -33,6 +33,12 @@ FACTS = ("vehicle", "scaling", "network", "observation", "state", "result", "rot
 
 
 FLAGS: Flags = {
+    "model MODEL": (
+        agent_path,
+        None,
+        "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
+        "a zip, a run folder, or a name such as itm-recovery",
+    ),
     "--format": ({"required": True}, None, "onnx, torchscript or c"),
     "-o FILE": (
         {"dest": "file"},
@@ -50,19 +56,13 @@ FLAGS: Flags = {
         "vehicle, by name or YAML file (that of the zip or its run folder)",
     ),
     "--name": (str, None, "call the C function NAME_policy (the name of the file)"),
+    **TRUST,
+    **OVERWRITE,
 }
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "model",
-        type=agent_path,
-        metavar="MODEL",
-        help="agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
-        "a zip, a run folder, or a name such as itm-recovery",
-    )
     add_flags(parser, FLAGS)
-    add_common(parser, "trust", "overwrite")
 
 
 def run(options: Namespace) -> int:

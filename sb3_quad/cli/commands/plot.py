@@ -21,7 +21,7 @@ from pathlib import Path
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.base.types import StrDict
-from sb3_quad.cli.parser import Flags, Parser, add_common, add_flags
+from sb3_quad.cli.parser import OVERWRITE, SEVERAL, Flags, Parser, add_flags
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 
 PANELS = ("success", "survival", "reward", "losses")
@@ -39,6 +39,11 @@ def _line(text: str) -> tuple[str, dict[str, float]]:
 
 
 FLAGS: Flags = {
+    "groups RUN": (
+        SEVERAL,
+        None,
+        "run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
+    ),
     "--line NAME:SUCCESS:REWARD": (
         {"action": "append", "type": _line},
         [],
@@ -61,18 +66,12 @@ FLAGS: Flags = {
     ),
     "--title": (str, "", "title of the picture"),
     "-o --output FILE": (str, "curves.png", "picture to write: .png, .svg or .pdf (curves.png)"),
+    **OVERWRITE,
 }
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "groups",
-        nargs="+",
-        metavar="RUN",
-        help="run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
-    )
     add_flags(parser, FLAGS)
-    add_common(parser, "overwrite")
 
 
 def run(options: Namespace) -> int:

@@ -11,12 +11,11 @@ examples:
 from argparse import Namespace
 
 from sb3_quad.base.types import StrPath
-from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.cli.parser import OVERWRITE, Parser, add_flags
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument("folder", metavar="FOLDER", help="results folder of evaluate")
-    add_common(parser, "overwrite")
+    add_flags(parser, {"folder FOLDER": (str, None, "results folder of evaluate"), **OVERWRITE})
 
 
 def run(options: Namespace) -> int:

@@ -31,12 +31,14 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.parser import (
+    EXECUTOR,
     PAIRS,
+    PROGRESS,
     SEVERAL,
     SWITCH,
+    TRUST,
     Flags,
     Parser,
-    add_common,
     add_fields,
     add_flags,
     given,
@@ -47,6 +49,11 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 
 FLAGS: Flags = {
+    "sweep SWEEP": (
+        {"nargs": "?"},
+        None,
+        "YAML file, or the name of a sweep of the package; the flags below replace its keys",
+    ),
     "--seed N": ({"nargs": "+", "type": seed}, None, "seeds of each configuration (0)"),
     "-conf --conf-file FILE": (
         SEVERAL,
@@ -62,21 +69,17 @@ FLAGS: Flags = {
     "--workers N": (positive, None, "number of parallel runs (one per core)"),
     "--dry-run": (SWITCH, False, "list the runs and train nothing"),
     "--resume FOLDER": (str, None, "continue the sweep in its folder"),
+    **EXECUTOR,
+    **TRUST,
+    **PROGRESS,
 }
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "sweep",
-        nargs="?",
-        metavar="SWEEP",
-        help="YAML file, or the name of a sweep of the package; the flags below replace its keys",
-    )
     add_flags(parser, FLAGS)
     add_fields(parser, SettingsOptions)
     fields = (*RunOptions.model_fields, "log_folder")
     add_fields(parser, JobOptions, *fields, trained_agent={"type": agent_path})
-    add_common(parser, "executor", "trust", "progress")
 
 
 def run(options: Namespace) -> int:

@@ -40,11 +40,12 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     PAIRS,
+    PROGRESS,
     SEVERAL,
     SWITCH,
+    TRUST,
     Flags,
     Parser,
-    add_common,
     add_fields,
     add_flags,
     given,
@@ -91,6 +92,8 @@ SETTINGS_FLAGS: Flags = {
     "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
     "--num-threads N": (positive, None, "threads (the cores; one where PyTorch computes)"),
     "--gym-packages MODULE": (SEVERAL, [], "modules that register further environments"),
+    **TRUST,
+    **PROGRESS,
 }
 FLAGS: Flags = {
     "--thesis": (SWITCH, False, f"the thesis's method: --conf-file {THESIS}"),
@@ -113,7 +116,6 @@ def add_settings(parser: Parser) -> None:
     add_flags(parser, SETTINGS_FLAGS)
     add_fields(parser, SettingsOptions)
     add_fields(parser, JobOptions, *SHARED_FIELDS, trained_agent={"type": agent_path})
-    add_common(parser, "trust", "progress")
 
 
 def add_arguments(parser: Parser) -> None:
