@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich.console import Console
 from rich.progress import (
@@ -14,8 +13,6 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
-
-from sb3_quad.base.types import StrPath
 
 # Columns of a table in a file or a pipe, where lines need not wrap.
 FILE_WIDTH = 180
@@ -36,17 +33,6 @@ def warn(line: str) -> None:
 def shows_progress(wanted: bool | None) -> bool:
     """Whether to show a progress bar: as ``wanted``, or with None, in a terminal."""
     return sys.stderr.isatty() if wanted is None else wanted
-
-
-def output_file(given: StrPath | None, name: str) -> Path:
-    """Return the file that ``-o`` names, or the file ``name`` in the folder that it names.
-
-    Without ``-o``, the folder is the working directory.
-    """
-    path = Path(given or "")
-    if path.suffix and not path.is_dir():
-        return path
-    return path / name
 
 
 @contextmanager

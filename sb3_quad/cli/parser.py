@@ -11,7 +11,7 @@ from argparse import (
     Namespace,
     RawDescriptionHelpFormatter,
 )
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any, NoReturn
 
 from pydantic import BaseModel
@@ -221,3 +221,12 @@ def given(options: Namespace, *names: str) -> StrDict:
     """Return those of some options that the command has and that were given."""
     values = {name: getattr(options, name, None) for name in names}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def refuse(options: Namespace, names: Iterable[str], message: str) -> None:
+    """Refuse flags of these names; ``{}`` in the message stands for the flag.
+
+    :raises ConfigError: one of them is given.
+    """
+    for name in given(options, *names):
+        raise ConfigError(message.format(f"--{name.replace('_', '-')}"))

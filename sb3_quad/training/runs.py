@@ -115,18 +115,17 @@ def made_with() -> dict[str, str]:
 
     The commit has a mark where files differ from it.
     """
-    checkout = Path(__file__).resolve().parents[2]
-    describe = ["describe", "--always", "--abbrev=40", "--exclude=*"]
-    command = ["git", "-C", str(checkout), *describe, "--dirty= and changes"]
+    command = shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'")
+    here = Path(__file__).parent
     try:
-        commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        commit = subprocess.check_output(command, cwd=here, text=True, stderr=subprocess.DEVNULL)
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"
     versions = (
         f"sb3_quad {__version__}, stable-baselines3 {stable_baselines3.__version__}, "
         f"torch {torch.__version__}"
     )
-    return {"commit": commit, "versions": versions}
+    return {"commit": commit.strip(), "versions": versions}
 
 
 def file_name(env_id: str) -> str:

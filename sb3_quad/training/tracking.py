@@ -23,14 +23,12 @@ class HyperparameterLog(BaseCallback):
     def __init__(self, job: TrainingJob) -> None:
         super().__init__()
         config = job.config
-        self._shown: dict[str, bool | int | float | str] = {
-            "algo": config.algo,
-            "env": config.env_id,
-            "seed": job.seed,
-        }
+        shown = {"algo": config.algo, "env": config.env_id, "seed": job.seed, **config.settings}
         # TensorBoard takes plain values alone.
-        for name, value in config.settings.items():
-            self._shown[name] = value if isinstance(value, (bool, int, float)) else str(value)
+        self._shown = {
+            name: value if isinstance(value, (bool, int, float)) else str(value)
+            for name, value in shown.items()
+        }
 
     def _on_training_start(self) -> None:
         parameters = HParam(self._shown, dict.fromkeys(METRICS, 0.0))

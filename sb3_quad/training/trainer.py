@@ -6,7 +6,6 @@ that was not interrupted; elsewhere the episodes start again.
 """
 
 import copy
-import inspect
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -158,18 +157,16 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
         env = make_environments(config, config.n_envs, seed, staggered=True)
         stack.enter_context(closing(env))
         if job.eval_episodes > 0:
-            configs = {OWN_TASK: job.for_evaluation()}
-            for task in config.eval_tasks:
-                configs[task] = job.for_evaluation(task=task)
-            n_envs = job.n_eval_envs or 1
             # The batched environment flies all episodes of an evaluation at once.
-            if config.vec_env == "batch" and job.n_eval_envs is None:
-                n_envs = job.eval_episodes
+            n_envs = job.n_eval_envs
+            if n_envs is None:
+                n_envs = job.eval_episodes if config.vec_env == "batch" else 1
             n_envs = min(n_envs, job.eval_episodes)
             seed = seed_for("evaluation", job.seed)
-            for task, eval_config in configs.items():
-                eval_envs[task] = make_environments(eval_config, n_envs, seed)
-                stack.enter_context(closing(eval_envs[task]))
+            for task in (OWN_TASK, *config.eval_tasks):
+                eval_config = job.for_evaluation(**({"task": task} if task else {}))
+                eval_env = make_environments(eval_config, n_envs, seed)
+                eval_envs[task] = stack.enter_context(closing(eval_env))
         yield env, eval_envs
 
 
@@ -227,10 +224,6 @@ def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAl
     """
     algorithm = get_algorithm(config.algo)
     try:
-        inspect.signature(algorithm).bind(config.policy, env, **keywords)
-    except TypeError as error:
-        raise ConfigError(f"{config.algo}: {one_line(error)}") from None
-    try:
         return algorithm(config.policy, env, **keywords)
     except SB3QuadError:
         raise
@@ -272,23 +265,22 @@ class _Training:
             lambda: self.signals.received is not None,
         )
         self.best: BestModel | None = None
-        if self.eval_envs:
-            self.best = self._best_model()
-
-    def _best_model(self) -> BestModel:
-        job = self.job
-        return BestModel(
-            self.eval_envs[OWN_TASK],
-            every=job.eval_freq if job.eval_freq > 0 else NEVER,
-            n_episodes=job.eval_episodes,
-            seed=seed_for("evaluation", job.seed),
-            best_model=self.run.best_model,
-            evaluations=self.run.evaluations,
-            report=self.report,
-            others={task: self.eval_envs[task] for task in job.config.eval_tasks},
-            should_continue=self.should_continue,
-            by=job.config.best_by,
-        )
+        others = dict(self.eval_envs)
+        own = others.pop(OWN_TASK, None)
+        if own is not None:
+            job = self.job
+            self.best = BestModel(
+                own,
+                job.eval_freq if job.eval_freq > 0 else NEVER,
+                job.eval_episodes,
+                seed_for("evaluation", job.seed),
+                self.run.best_model,
+                self.run.evaluations,
+                self.report,
+                others,
+                self.should_continue,
+                job.config.best_by,
+            )
 
     def run_to_end(self, user_callbacks: list[BaseCallback]) -> TrainingResult:
         """Train until the job is done, or a signal or an error ends it, and save the model."""

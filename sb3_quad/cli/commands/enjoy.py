@@ -25,6 +25,7 @@ corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
 import io
+import itertools
 import sys
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Sequence
@@ -147,10 +148,12 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: Namespace) -> int:
     """Fly, print the results, show the flights. Returns the exit code."""
+    from PIL import Image
     from rich.console import Console
 
     from sb3_quad.show.episodes import fly_all
     from sb3_quad.show.film import show_in_window
+    from sb3_quad.show.sequence import sequence
 
     window = not (options.no_render or options.output)
     _check(options, window)
@@ -161,23 +164,28 @@ def run(options: Namespace) -> int:
             setting,
             options.seed,
             options.n_timesteps,
-            deterministic=not options.stochastic,
-            n_envs=options.n_envs,
+            not options.stochastic,
+            options.n_envs,
         )
         episodes = list(flights)
     for number, episode in enumerate(episodes, 1):
-        prefix = f"episode {number}, " if len(episodes) > 1 else ""
-        for recording in episode:
-            print(prefix + _result(recording))
+        for flight in episode:
+            prefix = f"episode {number}, " if len(episodes) > 1 else ""
+            end = flight.lost or f"{flight.state.distance[-1]:.3f} m from its target"
+            seconds = f"{flight.times[-1]:.2f} s"
+            print(f"{prefix}{flight.name}: {end} after {seconds}, reward {flight.reward:.2f}")
     size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
         if _is_picture(file):
-            _write_picture(file, episodes[0], size)
+            picture = io.BytesIO()
+            pixels = Image.fromarray(sequence(episodes[0], *size))
+            pixels.save(picture, format="png", optimize=True)
+            write_bytes(file, picture.getvalue())
+            print(f"saved {file}")
         else:
             _write_film(file, episodes, size, options)
     if window:
-        width, height = options.size or SINGLE
-        show_in_window(episodes, width, height, options.speed)
+        show_in_window(episodes, *(options.size or SINGLE), options.speed)
     return 0
 
 
@@ -238,14 +246,13 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
         setting = scenario_setting(options.scenario, first and first.vehicle)
     controllers = {}
     # What an agent observes stays as in its training, unless the command line says otherwise.
-    observed: dict[str, StrDict] = {}
+    observed = {}
     vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
         controllers[spec.label] = resolve_expert(spec.spec, vehicle, "controller")
-        observed[spec.label] = dict(spec.observed)
-        for name in options.env_kwargs:
-            observed[spec.label].pop(name, None)
+        kept = spec.observed.keys() - options.env_kwargs.keys()
+        observed[spec.label] = {name: spec.observed[name] for name in kept}
     return setting._replace(own=observed), controllers
 
 
@@ -258,17 +265,12 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
 
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)
+    changes: StrDict = {}
     # With --algo, --env names the environment of the run rather than the task.
-    if options.task:
-        task = options.task
-    elif options.env and not options.algo:
-        task = env_task
-    else:
-        task = settings.task
-    changes = {"task": task}
-    if task != settings.task:
+    task = options.task or (options.env and not options.algo and env_task)
+    if task and task != settings.task:
         # The agent's changes to its own task do not fit another one.
-        changes["task_kwargs"] = None
+        changes = {"task": task, "task_kwargs": None}
     return settings.with_changes(**changes | options.env_kwargs)
 
 
@@ -286,12 +288,12 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
         # Raises if there is no such algorithm.
         get_algorithm(options.algo)
     run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
-    if isinstance(options.which, int):
-        path = run.checkpoint(options.which)
-    elif options.which == "last":
+    if options.which == "last":
         path = run.latest_checkpoint()
     elif options.which == "best":
         path = run.best_model
+    elif options.which is not None:
+        path = run.checkpoint(options.which)
     else:
         path = run.result
     if not path.is_file():
@@ -307,24 +309,6 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     return f"{options.algo} {path.name}", str(path)
 
 
-def _result(recording: Any) -> str:
-    """Return the result of a flight in one line."""
-    end = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
-    seconds = recording.times[-1]
-    return f"{recording.name}: {end} after {seconds:.2f} s, reward {recording.reward:.2f}"
-
-
-def _write_picture(file: str, episode: Sequence[Any], size: tuple[int, int]) -> None:
-    from PIL import Image
-
-    from sb3_quad.show.sequence import sequence
-
-    buffer = io.BytesIO()
-    Image.fromarray(sequence(episode, *size)).save(buffer, format="png", optimize=True)
-    write_bytes(file, buffer.getvalue())
-    print(f"saved {file}")
-
-
 def _write_film(
     file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: Namespace
 ) -> None:
@@ -334,12 +318,10 @@ def _write_film(
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
 
     def frames() -> Iterator[Any]:
-        done = 0
-        for episode in episodes:
-            for frame in film_frames(episode, *size, options.speed):
-                yield frame
-                done += 1
-                show(done, total, "frames")
+        films = (film_frames(episode, *size, options.speed) for episode in episodes)
+        for done, frame in enumerate(itertools.chain.from_iterable(films), 1):
+            yield frame
+            show(done, total, "frames")
 
     with progress_bar(options.progress) as show:
         write_film(Path(file), frames())

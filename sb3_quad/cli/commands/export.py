@@ -67,7 +67,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: Namespace) -> int:
     """Export, check, write. Returns the exit code."""
-    from sb3_quad.cli.output import output_file, warn
+    from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import ControllerSpec
     from sb3_quad.export.c_header import c_name
     from sb3_quad.export.policy import FORMATS, export_policy
@@ -75,7 +75,10 @@ def run(options: Namespace) -> int:
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))
     model = Path(options.model)
-    file = output_file(options.file, model.stem + FORMATS[options.format])
+    file = Path(options.file or "")
+    # Without a suffix it is a folder; without -o, this one.
+    if file.is_dir() or not file.suffix:
+        file /= model.stem + FORMATS[options.format]
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
     refuse_existing(file, options.overwrite)

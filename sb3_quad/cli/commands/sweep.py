@@ -27,7 +27,6 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.parser import (
@@ -43,6 +42,7 @@ from sb3_quad.cli.parser import (
     add_flags,
     given,
     positive,
+    refuse,
     seed,
 )
 from sb3_quad.controllers.pretrained import agent_path
@@ -90,9 +90,8 @@ def run(options: Namespace) -> int:
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
-        for name in given(options, "sweep", *SweepSpec.model_fields, "suite", "episodes"):
-            flag = "SWEEP" if name == "sweep" else f"--{name.replace('_', '-')}"
-            raise ConfigError(f"--resume keeps the sweep's own settings; remove {flag}")
+        names = ("sweep", *SweepSpec.model_fields, "suite", "episodes")
+        refuse(options, names, "--resume keeps the sweep's own settings; remove {}")
         folder = SweepFolder(options.resume)
         return _execute(options, folder.read(), folder)
     spec = _spec(options)

@@ -32,7 +32,6 @@ examples:
 
 import time
 from argparse import Namespace
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +49,7 @@ from sb3_quad.cli.parser import (
     add_flags,
     given,
     positive,
+    refuse,
     seed,
 )
 from sb3_quad.controllers.pretrained import agent_path
@@ -145,7 +145,7 @@ def run(options: Namespace) -> int:
             return close_run(resume(options.resume, **job))
         result = pipeline.resume_pipeline(folder, **job)
     elif options.conf_file is not None and pipeline.is_pipeline(options.conf_file):
-        _refuse(
+        refuse(
             options,
             KEPT_BY_STAGES,
             "{} goes with a single run (--algo, --env); "
@@ -171,19 +171,10 @@ def _check_flags(options: Namespace) -> None:
             )
         options.conf_file = THESIS
     if options.resume is not None:
-        _refuse(options, KEPT_BY_RESUME, "--resume keeps the run's own settings; remove {}")
+        refuse(options, KEPT_BY_RESUME, "--resume keeps the run's own settings; remove {}")
     # Without any of these, the default is a pipeline rather than a single run.
     elif not given(options, "conf_file", "algo", "env"):
         options.conf_file = DEFAULT_PIPELINE
-
-
-def _refuse(options: Namespace, names: Iterable[str], message: str) -> None:
-    """Refuse flags of these names; ``{}`` in the message stands for the flag.
-
-    :raises ConfigError: one of them is given.
-    """
-    for name in given(options, *names):
-        raise ConfigError(message.format(f"--{name.replace('_', '-')}"))
 
 
 def prepare(options: Namespace) -> None:
