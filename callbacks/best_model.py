@@ -15,8 +15,6 @@ from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
 
-# Ends that SB3's Monitor may leave uncounted in one episode: Atari's wrappers report each life.
-LIVES = 20
 # By the name in the log: an array of an evaluation, and its statistic.
 LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "success_rate": ("successes", np.mean),
@@ -248,20 +246,13 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
     :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
     ends: list[StrDict] = []
-    n_uncounted = 0
 
     def note(local_variables: StrDict, global_variables: StrDict) -> None:
-        nonlocal n_uncounted
         if not local_variables["done"]:
             return
-        info = local_variables["info"]
-        # evaluate_policy counts an episode only where Monitor reports it.
-        if "episode" in info or not local_variables.get("is_monitor_wrapped"):
-            ends.append(info)
-            n_uncounted = 0
-            return
-        n_uncounted += 1
-        if n_uncounted > LIVES * env.num_envs:
+        ends.append(local_variables["info"])
+        # evaluate_policy would count no episode and never end.
+        if local_variables.get("is_monitor_wrapped") and "episode" not in ends[-1]:
             raise TrainingError(
                 "evaluation: a wrapper drops info['episode'], by which SB3 counts episodes"
             )

@@ -6,7 +6,7 @@ constructor. There, ``lin_1e-3`` falls linearly to 0 over the training; a learni
 n-th part, which it has in the last of n updates.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -16,8 +16,6 @@ from pydantic import (
     Field,
     NonNegativeFloat,
     PositiveInt,
-    ValidationInfo,
-    field_validator,
     model_validator,
 )
 
@@ -55,10 +53,10 @@ VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
 MAX_SINGLE = 1000
 
 
-def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
-    if str(value) not in valid:
-        raise ConfigError(unknown(str(info.field_name), value, valid))
-    return str(value)
+def _refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str]) -> None:
+    for name in names:
+        if name not in valid:
+            raise ConfigError(unknown(kind, name, valid))
 
 
 Whole: TypeAlias = Annotated[
@@ -171,48 +169,27 @@ class TrainingConfig(Frozen):
         batch_size = min(self.keyword("batch_size"), n_steps * self.n_envs)
         return {"n_steps": n_steps, "batch_size": batch_size}
 
-    @field_validator("policy", mode="before")
-    @classmethod
-    def _known_policy(cls, value: Any, info: ValidationInfo) -> str:
-        return _one_of(get_algorithm(info.data["algo"]).policy_aliases, value, info)
-
-    @field_validator("policy_kwargs")
-    @classmethod
-    def _fits_policy(cls, value: StrDict, info: ValidationInfo) -> StrDict:
-        if "policy" not in info.data:
-            return value
-        # The constructor of the policy takes these, not that of the algorithm.
-        policy = get_algorithm(info.data["algo"]).policy_aliases[info.data["policy"]]
-        parameters = constructor_parameters(policy)
-        for name in value:
-            if name not in parameters:
-                raise ConfigError(unknown(f"keyword of {policy.__name__}", name, parameters))
-        check(NetArch, value.get("net_arch"), "net_arch")
-        return value
-
-    @field_validator("env_kwargs", "eval_env_kwargs")
-    @classmethod
-    def _known_keywords(cls, value: StrDict, info: ValidationInfo) -> StrDict:
-        env_id = info.data["env_id"]
-        if env_id in ENVIRONMENTS:
-            valid = FlightSettings.model_fields
-            for name in value:
-                if name not in valid:
-                    raise ConfigError(unknown(f"keyword of {env_id}", name, valid))
-            # eval_env_kwargs go over env_kwargs, so they are checked together.
-            own = info.data.get("env_kwargs", {})
-            FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **own, **value})
-        return value
-
-    @field_validator("eval_tasks")
-    @classmethod
-    def _known_tasks(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        if value and info.data["env_id"] not in ENVIRONMENTS:
-            raise ConfigError(f"{info.data['env_id']} has no tasks; remove eval_tasks")
-        return tuple(_one_of(TASKS, name, info) for name in value)
+    @model_validator(mode="after")
+    def _fits_environment(self) -> "TrainingConfig":
+        if self.task is not None:
+            keywords = {**self.env_kwargs, **self.eval_env_kwargs}
+            _refuse_unknown(f"keyword of {self.env_id}", keywords, FlightSettings.model_fields)
+            # Evaluations fly with both; each of the two must fit.
+            self.flight_settings.with_changes(**self.eval_env_kwargs)
+            _refuse_unknown("eval_tasks", self.eval_tasks, TASKS)
+        elif self.eval_tasks:
+            raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
+        aliases = get_algorithm(self.algo).policy_aliases
+        _refuse_unknown("policy", [self.policy], aliases)
+        # The constructor of the policy takes these, not that of the algorithm.
+        policy = aliases[self.policy]
+        kind = f"keyword of {policy.__name__}"
+        _refuse_unknown(kind, self.policy_kwargs, constructor_parameters(policy))
+        check(NetArch, self.policy_kwargs.get("net_arch"), "policy_kwargs: net_arch")
         if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
             raise ConfigError(
                 f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"

@@ -4,7 +4,6 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -56,7 +55,7 @@ class Requirement(Frozen):
     """The least that a stage must reach in its best evaluation before the next stage begins."""
 
     success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
-    mean_reward: float = -math.inf
+    mean_reward: float | None = None
 
 
 class OffsetCorrection(Frozen):
@@ -343,7 +342,8 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
         success = np.nan_to_num(curve.values("success"))[index]
         reward = curve.reward[index]
         required = stage.require
-        if success < required.success_rate or reward < required.mean_reward:
+        misses_reward = required.mean_reward is not None and reward < required.mean_reward
+        if success < required.success_rate or misses_reward:
             raise TrainingError(
                 f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} "
                 f"miss what it requires ({required}); its run is {run.path}"

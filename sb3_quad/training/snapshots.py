@@ -92,8 +92,16 @@ class SnapshotFile(BaseCallback):
     def _on_training_start(self) -> None:
         path = self._run.resume_state
         # The log of a resumed run is to say what it would have said without the interruption.
-        if path.is_file():
-            set_log(self.logger, read_arrays(path, "log").get("log"), path)
+        if not path.is_file():
+            return
+        try:
+            records = LOG.validate_json(str(read_arrays(path, "log").get("log")))
+        except ValueError as error:
+            raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
+        for name, (value, count, excluded) in records.items():
+            self.logger.name_to_value[name] = value
+            self.logger.name_to_count[name] = count
+            self.logger.name_to_excluded[name] = excluded
 
     def _on_step(self) -> bool:
         return True
@@ -111,7 +119,15 @@ class SnapshotFile(BaseCallback):
                 )
         self._next_taken = start + PAUSE
         self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model))
-        self._state = self._around_model()
+        # The stores' rows are read when the snapshot is written. A rollout later they hold more,
+        # and the oldest of a full store are replaced; the resumed training adds the same rows again
+        # before it reads any.
+        self._state = _surroundings(self.training_env, self.model)
+        self._state["log"] = log_state(self.logger)
+        if self._run.episodes.is_file():
+            self._state["episodes"] = np.array(self._run.episodes.stat().st_size)
+        if self._run.best_model.is_file():
+            self._state["best_model"] = np.fromfile(self._run.best_model, np.uint8)
         start = time.monotonic()
         if self._every > 0 and start >= self._next_write:
             try:
@@ -120,21 +136,6 @@ class SnapshotFile(BaseCallback):
                 self._report(f"warning: no new snapshot, the one before is kept: {error}")
             took = time.monotonic() - start
             self._next_write = start + max(self._every, took / SHARE)
-
-    def _around_model(self) -> Arrays:
-        """Return what a resumed run needs besides the model and the rows of its stores.
-
-        The rows are read when the snapshot is written. A rollout later the stores hold more, and
-        the oldest of a full store are replaced; the resumed training adds the same rows again
-        before it reads any.
-        """
-        state = _surroundings(self.training_env, self.model)
-        state["log"] = log_state(self.logger)
-        if self._run.episodes.is_file():
-            state["episodes"] = np.array(self._run.episodes.stat().st_size)
-        if self._run.best_model.is_file():
-            state["best_model"] = np.fromfile(self._run.best_model, np.uint8)
-        return state
 
     def write(self) -> None:
         """Write the latest snapshot; until that is whole, the file holds the one before.
@@ -336,21 +337,6 @@ def log_state(logger: Logger) -> Any:
             count = logger.name_to_count[name]
             records[name] = (float(value), count, logger.name_to_excluded[name])
     return np.array(json.dumps(records))
-
-
-def set_log(logger: Logger, state: Any, path: Path) -> None:
-    """Record again what :func:`log_state` returned.
-
-    :raises ConfigError: something else, which the file at ``path`` holds.
-    """
-    try:
-        records = LOG.validate_json(str(state))
-    except ValueError as error:
-        raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
-    for name, (value, count, excluded) in records.items():
-        logger.name_to_value[name] = value
-        logger.name_to_count[name] = count
-        logger.name_to_excluded[name] = excluded
 
 
 def random_state() -> Arrays:

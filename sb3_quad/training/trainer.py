@@ -6,6 +6,7 @@ that was not interrupted; elsewhere the episodes start again.
 """
 
 import copy
+import inspect
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -29,8 +30,7 @@ from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint, ProgressLine
+from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
@@ -106,8 +106,15 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         damaged files; else as :func:`train`.
     """
     run = open_run(run_folder)
-    job = _read_job(run, changes)
-    config = job.config
+    settings, options = run.read_yaml()
+    if not {"algo", "env"} <= options.keys():
+        raise ConfigError(f"{run.arguments}: algo or env is missing")
+    config = build_config(str(options["algo"]), str(options["env"]), settings, str(run.config))
+    # These are in args.yml for its readers; they are not options.
+    for name in ("algo", "env", "env_kwargs", *MADE_WITH):
+        options.pop(name, None)
+    options |= {**changes, "config": config}
+    job = validate(TrainingJob, options, str(run.arguments))
     with (
         StopSignals() as signals,
         locked(run.path, "run folder"),
@@ -129,18 +136,6 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         with tracked(job):
             training = _Training(job, run, model, eval_envs, signals, report)
             return training.run_to_end(_user_callbacks(config))
-
-
-def _read_job(run: RunFolder, changes: StrDict) -> TrainingJob:
-    """Return the job of a run folder, with ``changes`` to its options."""
-    settings, options = run.read_yaml()
-    if not {"algo", "env"} <= options.keys():
-        raise ConfigError(f"{run.arguments}: algo or env is missing")
-    config = build_config(str(options["algo"]), str(options["env"]), settings, str(run.config))
-    # These are in args.yml for its readers; they are not options.
-    for name in ("algo", "env", "env_kwargs", *MADE_WITH):
-        options.pop(name, None)
-    return validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
 
 
 @contextmanager
@@ -224,6 +219,10 @@ def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAl
     """
     algorithm = get_algorithm(config.algo)
     try:
+        inspect.signature(algorithm).bind(config.policy, env, **keywords)
+    except TypeError as error:
+        raise ConfigError(f"{config.algo}: {one_line(error)}") from None
+    try:
         return algorithm(config.policy, env, **keywords)
     except SB3QuadError:
         raise
@@ -262,7 +261,7 @@ class _Training:
             self.run,
             self.job.snapshot_every,
             self.report,
-            lambda: self.signals.received is not None,
+            lambda: bool(self.signals.received),
         )
         self.best: BestModel | None = None
         others = dict(self.eval_envs)
@@ -320,16 +319,13 @@ class _Training:
         if self.job.save_freq > 0:
             path = str(self.run.checkpoint("{steps}"))
             callbacks.append(Checkpoint(self.job.save_freq, path))
-        callbacks += user_callbacks
-        if self.job.progress:
-            callbacks.append(ProgressBarCallback())
-        else:
-            callbacks.append(ProgressLine(self.report))
-        # A signal ends the training where the snapshot can still be completed.
-        callbacks.append(
-            ConvertCallback(lambda *_: self.signals.received is None or not self.snapshots.is_fresh)
-        )
-        return callbacks
+        return [
+            *callbacks,
+            *user_callbacks,
+            ProgressBarCallback() if self.job.progress else ProgressLine(self.report),
+            # A signal ends the training where the snapshot can still be completed.
+            ConvertCallback(lambda *_: not (self.signals.received and self.snapshots.is_fresh)),
+        ]
 
     def _learn(self, callbacks: list[BaseCallback]) -> None:
         config = self.job.config

@@ -121,6 +121,8 @@ def _spec(options: Namespace) -> Any:
     """
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
+    from sb3_quad.training.algorithms import as_list
+    from sb3_quad.training.pipeline import is_pipeline
 
     data: StrDict = {"name": "sweep"}
     if options.sweep is not None:
@@ -141,27 +143,13 @@ def _spec(options: Namespace) -> Any:
             grid[name] = flags.pop(name)
     evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
     data |= {**flags, "grid": grid, "evaluation": evaluation}
-    _add_defaults(data)
-    return validate(SweepSpec, data, options.sweep or "command line")
-
-
-def _add_defaults(data: StrDict) -> None:
-    """Let a sweep without settings train what ``train`` does by default: its pipeline, or its
-    algorithm and environment.
-    """
-    from sb3_quad.training.pipeline import is_pipeline
-
-    keys = {**data, **data["grid"]}
-    files = keys.get("conf_file", [])
-    if isinstance(files, str):
-        files = [files]
-    if data.get("configurations") or any(is_pipeline(file) for file in files):
-        return
-    if not keys.keys() & {"conf_file", "algo", "env"}:
+    keys = {**data, **grid}
+    # A sweep without settings trains what train does by default.
+    if not (data.get("configurations") or keys.keys() & {"conf_file", "algo", "env"}):
         data["conf_file"] = DEFAULT_PIPELINE
-        return
-    data.setdefault("algo", DEFAULT_ALGO)
-    data.setdefault("env", DEFAULT_ENV)
+    elif not (data.get("configurations") or any(map(is_pipeline, as_list(keys.get("conf_file"))))):
+        data = {"algo": DEFAULT_ALGO, "env": DEFAULT_ENV, **data}
+    return validate(SweepSpec, data, options.sweep or "command line")
 
 
 def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
@@ -174,7 +162,9 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
     from sb3_quad.base.process import StopSignals, available_cpus
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.executors import start_executor
+    from sb3_quad.sweep.folder import SweepFolder
     from sb3_quad.sweep.run import execute
+    from sb3_quad.training.runs import claim_folder
 
     start = time.perf_counter()
     workers = min(options.workers or available_cpus(), len(sweep.runs))
@@ -185,7 +175,9 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
     ) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
-            folder = _new_folder(options, sweep)
+            parent = Path(options.log_folder or "logs") / "sweep"
+            folder = SweepFolder(claim_folder(parent, sweep.spec.name or "sweep"))
+            folder.write(sweep)
         parallel = f"{executor.workers} in parallel, executor {options.executor}"
         print(f"sweep {folder.path}: {runs}, {parallel}")
         with (
@@ -208,16 +200,6 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
         print(f"to continue: --resume {folder.path}")
         return signals.exit_code
     return 1 if failures else 0
-
-
-def _new_folder(options: Namespace, sweep: Any) -> Any:
-    from sb3_quad.sweep.folder import SweepFolder
-    from sb3_quad.training.runs import claim_folder
-
-    parent = Path(options.log_folder or "logs") / "sweep"
-    folder = SweepFolder(claim_folder(parent, sweep.spec.name or "sweep"))
-    folder.write(sweep)
-    return folder
 
 
 def _write_results(folder: Any, sweep: Any, records: Any) -> Any:
