@@ -27,6 +27,8 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 RATES = {"success": ("successes", "success_rate"), "survival": ("survivals", "survival_rate")}
 # The key in ``info`` of each array that environments may report.
 REPORTED = {"successes": "is_success", "survivals": "survival", "final_errors": "distance"}
+# Whether to continue after an evaluation with this rate that decides, and this mean reward.
+ShouldContinue = Callable[[float, float], bool]
 # The rate that decides, and the mean reward.
 Score = tuple[float, float]
 
@@ -94,7 +96,7 @@ class BestModel(EveryTimesteps):
         evaluations: StrPath = "evaluations.npz",
         report: Report = lambda line: None,
         others: Mapping[str, VecEnv] | None = None,
-        should_continue: Callable[[float, float], bool] = lambda success, reward: True,
+        should_continue: ShouldContinue = lambda success, reward: True,
         by: str = "success",
         verbose: int = 0,
     ) -> None:

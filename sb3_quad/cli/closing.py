@@ -75,7 +75,7 @@ def close_run(result: TrainingResult) -> int:
     """Print the table of a single run's agent and where everything is. Returns the exit code."""
     if result.exit_code != 0:
         return result.exit_code
-    if result.job.config.task is not None:
+    if result.job.config.task:
         console().print(agent_and_expert(result.job, result.model))
     # A complete run without evaluations does not know how long it took.
     if result.seconds:

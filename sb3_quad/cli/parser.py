@@ -144,15 +144,16 @@ def above_zero(text: str) -> float:
     return number
 
 
-Flags = Mapping[str, tuple[Any, Any, str]]
-"""A table of arguments: by names and metavar, the type (or keywords of ``add_argument``), the
-default, and the help.
+Flags = Mapping[str, str | tuple[Any, Any, str]]
+"""A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
+default, and the help; the help alone for a text without a default.
 """
 
 
 def add_flags(parser: ArgumentParser, flags: Flags) -> None:
     """Add the flags of a table."""
-    for words, (kind, default, text) in flags.items():
+    for words, entry in flags.items():
+        kind, default, text = (str, None, entry) if isinstance(entry, str) else entry
         arguments = kind if isinstance(kind, dict) else {"type": kind}
         names = words.split()
         if len(names) > 1 and not names[-1].startswith("-"):
@@ -201,9 +202,7 @@ EXECUTOR: Flags = {
         "local (processes on this machine, default) or ray (docs/sweeps.md)",
     ),
     "--address WHERE": (
-        str,
-        None,
-        "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)",
+        "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)"
     ),
 }
 TRUST: Flags = {

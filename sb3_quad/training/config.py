@@ -171,7 +171,7 @@ class TrainingConfig(Frozen):
 
     @model_validator(mode="after")
     def _fits_environment(self) -> "TrainingConfig":
-        if self.task is not None:
+        if self.task:
             keywords = {**self.env_kwargs, **self.eval_env_kwargs}
             _refuse_unknown(f"keyword of {self.env_id}", keywords, FlightSettings.model_fields)
             # Evaluations fly with both; each of the two must fit.
@@ -194,7 +194,7 @@ class TrainingConfig(Frozen):
             raise ConfigError(
                 f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
             )
-        if self.vec_env == "batch" and self.task is None:
+        if self.vec_env == "batch" and not self.task:
             raise ConfigError(
                 f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
             )
@@ -203,7 +203,7 @@ class TrainingConfig(Frozen):
                 f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; "
                 "give steps"
             )
-        if self.noise_type is not None and not self.is_off_policy:
+        if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
         if self.expert and not takes_expert(get_algorithm(self.algo)):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
@@ -270,7 +270,7 @@ def describe(job: TrainingJob) -> str:
     task = config.env_kwargs.get("task")
     if isinstance(task, Mapping):
         line += f", tasks {in_words(task)}"
-    if config.expert is not None:
+    if config.expert:
         line += f", expert {config.expert}"
     line += f", seed {job.seed}"
     if job.trained_agent:
@@ -406,7 +406,7 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     :param config: the settings with ``changes`` alone.
     """
     own, source = agent_settings(path)
-    if source is None or config.task is None:
+    if source is None or not config.task:
         return changes
     # A new vehicle may be what the user wants, so this is only a warning.
     notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))

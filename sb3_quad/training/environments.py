@@ -60,8 +60,24 @@ def make_environments(
     :raises ConfigError: keywords that the environment does not take.
     :raises TrainingError: a worker process that ended.
     """
+    env: Any
     try:
-        env = _make(config, n_envs, seed, staggered)
+        if config.vec_env == "batch":
+            if config.env_wrapper:
+                raise ConfigError(
+                    "env_wrapper: the batched environment has no single environments to wrap; "
+                    "use vec_env dummy"
+                )
+            keywords = {"task": config.task, **config.env_kwargs}
+            env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **keywords)
+        else:
+            # A worker process could not say that PyBullet is missing.
+            if config.task:
+                importlib.import_module("sb3_quad.base.bullet")
+            phases = n_envs if staggered else 1
+            makers: list[Any] = [partial(_make_row, config, row, phases) for row in range(n_envs)]
+            env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
+            env.seed(seed)
     except SB3QuadError:
         raise
     except (EOFError, ConnectionError):
@@ -72,26 +88,7 @@ def make_environments(
         ) from error
     for path, kwargs in config.vec_env_wrapper:
         env = instance(path, "vec_env_wrapper", env, **kwargs)
-    return env
-
-
-def _make(config: TrainingConfig, n_envs: int, seed: int, staggered: bool) -> VecEnv:
-    if config.vec_env == "batch":
-        if config.env_wrapper:
-            raise ConfigError(
-                "env_wrapper: the batched environment has no single environments to wrap; "
-                "use vec_env dummy"
-            )
-        keywords = {"task": config.task, **config.env_kwargs}
-        return QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **keywords)
-    # A worker process could not say that PyBullet is missing.
-    if config.task is not None:
-        importlib.import_module("sb3_quad.base.bullet")
-    phases = n_envs if staggered else 1
-    makers: list[Any] = [partial(_make_row, config, row, phases) for row in range(n_envs)]
-    env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
-    env.seed(seed)
-    return env
+    return env  # type: ignore[no-any-return]
 
 
 def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:

@@ -252,9 +252,9 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
 
 def _check_correction(correction: OffsetCorrection | None, config: TrainingConfig) -> None:
     """Check that an agent with these settings can be corrected."""
-    if correction is None:
+    if not correction:
         return
-    if config.task is None:
+    if not config.task:
         raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
     if correction.kind == "arrival":
         config.flight_settings.with_changes(**correction.env_kwargs)
@@ -292,35 +292,35 @@ def _train_stages(
             write()
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
                 run = open_run(runs[number]) if number < len(runs) else None
-                if run is not None and run.timesteps >= job.config.n_timesteps:
+                if run and run.timesteps >= job.config.n_timesteps:
                     seconds = trained_seconds(run)
                 else:
                     if agent:
                         job = job.model_copy(update={"trained_agent": agent})
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
                     # A run that has a model and no snapshot cannot be resumed.
-                    if run is not None and (run.not_begun or run.resume_state.is_file()):
+                    if run and (run.not_begun or run.resume_state.is_file()):
                         trained = resume(runs[number], report, **changes)
                     else:
                         trained = train(job, report, on_start=partial(note, number))
                     run = trained.run
                     seconds = trained.seconds
                 # The signal that ended a training is noted here, too.
-                if signals.received is not None:
+                if signals.received:
                     break
                 agent = str(_agent(stage, job, run, report))
                 results[stage.name] = StageResult(str(run.path), agent, run.timesteps, seconds)
         except KeyboardInterrupt:
-            if signals.received is None:
+            if not signals.received:
                 raise
-    if signals.received is not None:
+    if signals.received:
         report(f"to resume the whole pipeline: --resume {folder}")
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
     """Return the zip that a stage passes on, after the offset correction where it has one."""
-    if stage.correct_offset is None:
+    if not stage.correct_offset:
         return _passed_on(stage, job, run)
     if not run.corrected_model.is_file():
         _correct(stage.correct_offset, job, run, _passed_on(stage, job, run), report)

@@ -29,7 +29,7 @@ from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
 from sb3_quad.base.validate import validate
-from sb3_quad.callbacks.best_model import BestModel
+from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
@@ -45,7 +45,6 @@ from sb3_quad.training.tracking import HyperparameterLog, tracked
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 NEVER = 2**62  # timesteps
 OWN_TASK = ""  # the name of the evaluations on the task of the training
-ShouldContinue = Callable[[float, float], bool]
 
 
 @dataclass(frozen=True)
@@ -187,7 +186,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     """
     config = job.config
     keywords = copy.deepcopy(config.hyperparams) | _expert(config)
-    if config.noise_type is not None:
+    if config.noise_type:
         zeros = np.zeros(env.action_space.shape or ())
         keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
@@ -205,7 +204,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     if isinstance(rate, LinearSchedule):
         n_updates = -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
         rate.end = rate.start / n_updates
-    if job.trained_agent is not None:
+    if job.trained_agent:
         transfer_policy(job.trained_agent, model)
     # SB3 has seeded the environments with the seed of the policy.
     env.seed(seed_for("training", job.seed))
@@ -257,12 +256,7 @@ class _Training:
     should_continue: ShouldContinue = lambda success, reward: True
 
     def __post_init__(self) -> None:
-        self.snapshots = SnapshotFile(
-            self.run,
-            self.job.snapshot_every,
-            self.report,
-            lambda: bool(self.signals.received),
-        )
+        self.snapshots = SnapshotFile(self.run, self.job.snapshot_every, self.report)
         self.best: BestModel | None = None
         others = dict(self.eval_envs)
         own = others.pop(OWN_TASK, None)
@@ -285,7 +279,7 @@ class _Training:
         """Train until the job is done, or a signal or an error ends it, and save the model."""
         config = self.job.config
         # A zip says how its agent flies, but a flight cannot have the user's wrappers.
-        if config.task is not None and not (config.env_wrapper or config.vec_env_wrapper):
+        if config.task and not (config.env_wrapper or config.vec_env_wrapper):
             self.job.flight_settings.write_into(self.model)
         self.run.error.unlink(missing_ok=True)
         start = time.perf_counter()
@@ -296,11 +290,11 @@ class _Training:
                 # From here on, no signal interrupts what is saved.
                 self.signals.hold()
         except (Exception, KeyboardInterrupt) as error:
-            if self.signals.received is None:
+            if not self.signals.received:
                 self._save_after(error)
                 raise
         seconds = time.perf_counter() - start
-        if self.signals.received is not None:
+        if self.signals.received:
             return self._interrupted(seconds)
         save_model(self.model, self.run.model)
         self.run.resume_state.unlink(missing_ok=True)
@@ -314,7 +308,7 @@ class _Training:
             EpisodeLog(self.run.episodes, self.job.config.env_id),
             HyperparameterLog(self.job),
         ]
-        if self.best is not None:
+        if self.best:
             callbacks.append(self.best)
         if self.job.save_freq > 0:
             path = str(self.run.checkpoint("{steps}"))
@@ -341,7 +335,7 @@ class _Training:
             reset_num_timesteps=self.model.num_timesteps == 0,
         )
         best = self.best
-        if best is None or best.stopped or self.signals.received is not None:
+        if best is None or best.stopped or self.signals.received:
             return
         # A user's callback may have ended the training early.
         if best.latest < self.model.num_timesteps:
@@ -351,7 +345,7 @@ class _Training:
         """Save the model and the snapshot after a signal."""
         snapshot = self.snapshots.snapshot
         when = "before the first rollout"
-        if snapshot is not None:
+        if snapshot:
             when = f"after {snapshot.timesteps:,} timesteps: model saved to {self.run.model}"
             # The model comes first, since it needs the least room.
             write_bytes(self.run.model, snapshot.model)
@@ -386,7 +380,7 @@ class _Training:
         """
         where = ""
         snapshot = self.snapshots.snapshot
-        if snapshot is not None:
+        if snapshot:
             write_bytes(self.run.model, snapshot.model)
             where = f"; the model after {snapshot.timesteps:,} timesteps is in {self.run.model}"
         # An error of this package says what is wrong; the place in the code adds nothing.

@@ -50,7 +50,7 @@ FLAGS: Flags = {
     "--n-envs N": (positive, 8, "environments of DummyVecEnv and SubprocVecEnv (8)"),
     "--seconds S": (above_zero, 3.0, "duration of each measurement (3)"),
     "--algo": (SEVERAL, ["dagger", "ppo_bc"], "algorithms of the training loops (dagger ppo_bc)"),
-    "-conf --conf-file FILE": (str, None, "settings of the training loops (ALGO.yml)"),
+    "-conf --conf-file FILE": "settings of the training loops (ALGO.yml)",
     "--training": (YES_OR_NO, None, "measure only, or no, training loops (both)"),
 }
 

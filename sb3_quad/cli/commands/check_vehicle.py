@@ -55,7 +55,7 @@ from command to thrust {lag:.1f} ms
 
 
 FLAGS: Flags = {
-    "vehicle VEHICLE": (str, None, "name or YAML file"),
+    "vehicle VEHICLE": "name or YAML file",
     "-n --episodes N": (
         natural,
         480,

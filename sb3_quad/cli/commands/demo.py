@@ -32,7 +32,7 @@ FLAGS: Flags = {
         "controllers to show (pid, geometric, and agents of the package)",
     ),
     "-o --output FILE": (str, "demo.html", "page to write (demo.html)"),
-    "--vehicle": (str, None, "first vehicle, by name or YAML file (that of the first agent)"),
+    "--vehicle": "first vehicle, by name or YAML file (that of the first agent)",
     **TRUST,
     **OVERWRITE,
 }

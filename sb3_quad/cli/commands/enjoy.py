@@ -69,7 +69,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 RUN_FLAGS: Flags = {
-    "--algo": (str, None, "algorithm of a trained agent, which is looked up in the log folder"),
+    "--algo": "algorithm of a trained agent, which is looked up in the log folder",
     "-f --folder --log-folder DIR": (str, "logs", "folder that holds the run folders (logs)"),
     "--exp-id N": (whole, 0, "number of the run (0: the latest one that has an agent)"),
 }
@@ -93,13 +93,9 @@ AGENT_FLAGS: Flags = {
 }
 """The flags that name the agent in it, one at most; likewise the next two tables."""
 EPISODE_FLAGS: Flags = {
-    "--env": (str, None, f"environment id ({DEFAULT_ENV})"),
-    "--task": (str, None, "a task such as target_tracking, instead of --env"),
-    "--scenario SUITE:NAME": (
-        str,
-        None,
-        "a scenario such as thesis:side_hit, instead of --env",
-    ),
+    "--env": f"environment id ({DEFAULT_ENV})",
+    "--task": "a task such as target_tracking, instead of --env",
+    "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
 }
 ACTION_FLAGS: Flags = {
     "--deterministic": (SWITCH, False, "fly the mean of a policy's actions (default)"),

@@ -62,18 +62,16 @@ FLAGS: Flags = {
         "thesis",
         "suite of scenarios: thesis (default), robustness, wind, quadcopters, quick or a file",
     ),
-    "-o --output FOLDER": (str, None, f"folder for the results ({DEFAULT_FOLDER}/SUITE)"),
+    "-o --output FOLDER": f"folder for the results ({DEFAULT_FOLDER}/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
     "--episodes N": (whole, None, "episodes of each scenario (the suite's number)"),
     "--seed N": (whole, None, "seed of each scenario (the suite's seed)"),
-    "--vehicle": (str, None, "vehicle, by name or YAML file (the suite's, else each agent's own)"),
+    "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
     "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
     "--workers N": (whole, 1, "number of parallel processes (1)"),
     "--overwrite": (SWITCH, False, "remove the results that the folder holds"),
     "--reward MODULE:FUNCTION": (
-        str,
-        None,
-        "show the mean of a reward of your own, function(state, actions) per control step",
+        "show the mean of a reward of your own, function(state, actions) per control step"
     ),
     "--report": (YES_OR_NO, True, "update report.html and its plots (yes)"),
     **EXECUTOR,
@@ -131,7 +129,7 @@ def run(options: Namespace) -> int:
     failures = [failure for failure in results.failures if failure.controller in labels]
     for failure in failures:
         where = failure.controller
-        if failure.scenario is not None:
+        if failure.scenario:
             where += f", scenario {failure.scenario}"
         print(f"failed: {where}: {failure.message}", file=sys.stderr)
     return 1 if failures else 0

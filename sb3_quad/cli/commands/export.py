@@ -50,12 +50,8 @@ FLAGS: Flags = {
         "thrusts",
         "result of the policy: thrusts (N, default) or speeds (rad/s)",
     ),
-    "--vehicle": (
-        str,
-        None,
-        "vehicle, by name or YAML file (that of the zip or its run folder)",
-    ),
-    "--name": (str, None, "call the C function NAME_policy (the name of the file)"),
+    "--vehicle": "vehicle, by name or YAML file (that of the zip or its run folder)",
+    "--name": "call the C function NAME_policy (the name of the file)",
     **TRUST,
     **OVERWRITE,
 }

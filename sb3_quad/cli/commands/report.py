@@ -15,7 +15,7 @@ from sb3_quad.cli.parser import OVERWRITE, Parser, add_flags
 
 
 def add_arguments(parser: Parser) -> None:
-    add_flags(parser, {"folder FOLDER": (str, None, "results folder of evaluate"), **OVERWRITE})
+    add_flags(parser, {"folder FOLDER": "results folder of evaluate", **OVERWRITE})
 
 
 def run(options: Namespace) -> int:

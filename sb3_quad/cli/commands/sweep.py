@@ -61,14 +61,14 @@ FLAGS: Flags = {
         "settings files, of single runs or pipelines (two_stage.yml)",
     ),
     "--algo": (SEVERAL, None, "algorithms of single runs (dagger)"),
-    "--env": (str, None, "environment id of single runs (QuadTargetTracking-v0)"),
+    "--env": "environment id of single runs (QuadTargetTracking-v0)",
     "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
-    "--suite": (str, None, "suite for the comparison (240 fresh episodes of each task)"),
+    "--suite": "suite for the comparison (240 fresh episodes of each task)",
     "--episodes N": (positive, None, "episodes of each scenario in the comparison"),
     "--gym-packages MODULE": (SEVERAL, None, "modules that register further environments"),
     "--workers N": (positive, None, "number of parallel runs (one per core)"),
     "--dry-run": (SWITCH, False, "list the runs and train nothing"),
-    "--resume FOLDER": (str, None, "continue the sweep in its folder"),
+    "--resume FOLDER": "continue the sweep in its folder",
     **EXECUTOR,
     **TRUST,
     **PROGRESS,
@@ -196,7 +196,7 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
     print(f"saved in {folder.path}: results.csv, results.json, runs/{report}")
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
-    if signals.received is not None:
+    if signals.received:
         print(f"to continue: --resume {folder.path}")
         return signals.exit_code
     return 1 if failures else 0

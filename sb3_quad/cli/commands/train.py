@@ -76,18 +76,14 @@ KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
 
 
 SETTINGS_FLAGS: Flags = {
-    "--algo": (str, None, f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})"),
+    "--algo": f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})",
     "--env": (
-        str,
-        None,
         f"environment id ({DEFAULT_ENV}); "
-        "any id that Gymnasium knows, with --vec-env dummy or subproc",
+        "any id that Gymnasium knows, with --vec-env dummy or subproc"
     ),
     "-conf --conf-file FILE": (
-        str,
-        None,
         "settings: a YAML file, or one of the package, such as thesis/dagger.yml "
-        "(ALGO.yml: undisturbed, PID expert)",
+        "(ALGO.yml: undisturbed, PID expert)"
     ),
     "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
     "--num-threads N": (positive, None, "threads (the cores; one where PyTorch computes)"),
@@ -98,11 +94,7 @@ SETTINGS_FLAGS: Flags = {
 FLAGS: Flags = {
     "--thesis": (SWITCH, False, f"the thesis's method: --conf-file {THESIS}"),
     "--seed N": (seed, None, "seed (0); negative: a random one, recorded in args.yml"),
-    "--resume RUN_FOLDER": (
-        str,
-        None,
-        "continue an interrupted or killed run with all its settings",
-    ),
+    "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
 }
 # Options of a run that tune has, and all others; seed and progress have flags of their own.
 SHARED_FIELDS = ("eval_env_kwargs", "trained_agent", "n_eval_envs", "device")
@@ -141,7 +133,7 @@ def run(options: Namespace) -> int:
     job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
         folder = Path(options.resume)
-        if not pipeline.is_pipeline_run(folder):
+        if not (folder / pipeline.STATUS_FILE).is_file():
             return close_run(resume(options.resume, **job))
         result = pipeline.resume_pipeline(folder, **job)
     elif options.conf_file is not None and pipeline.is_pipeline(options.conf_file):

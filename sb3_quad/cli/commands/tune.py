@@ -61,17 +61,9 @@ FLAGS: Flags = {
     ),
     "--n-startup-trials N": (whole, 10, "random trials before sampler and pruner start (10)"),
     "--n-evaluations N": (whole, 10, "evaluations per trial, for the pruner (10)"),
-    "--storage WHERE": (
-        str,
-        None,
-        "journal file, or URL of a database (study.log in the new folder)",
-    ),
-    "--study-name NAME": (str, None, "name of the study in the storage (ALGO_ENV)"),
-    "--search-space FILE": (
-        str,
-        None,
-        "YAML file of the settings to vary (the package's file for the algorithm)",
-    ),
+    "--storage WHERE": "journal file, or URL of a database (study.log in the new folder)",
+    "--study-name NAME": "name of the study in the storage (ALGO_ENV)",
+    "--search-space FILE": "YAML file of settings to vary (the package's file for the algorithm)",
     "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
     "--seed N": (seed, None, "seed of trainings and sampler, negative for a random one (0)"),
     "--eval-episodes N": (whole, None, "episodes per evaluation (batch: 240, else 48)"),
@@ -98,10 +90,10 @@ def run(options: Namespace) -> int:
             try:
                 for number in range(options.n_trials):
                     show(number, options.n_trials, "trials")
-                    if signals.received is not None:
+                    if signals.received:
                         break
                     trial = search.try_one(options.max_total_trials)
-                    if trial is None:
+                    if not trial:
                         break
                     write_results(search)
                     print(trial_line(search, trial))
@@ -168,7 +160,7 @@ def _print_results(search: Any) -> None:
         print(f"the best: {trial_line(search, best)}")
         path = Path(best.user_attrs[RUN])
         # A process on another machine may have trained it.
-        if config.task is not None and path.is_dir():
+        if config.task and path.is_dir():
             model = open_run(path).model
             flown = build_config(config.algo, config.env_id, settings_of(best))
             job = search.job.model_copy(update={"config": flown})
