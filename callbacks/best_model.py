@@ -238,8 +238,10 @@ class _Evaluations:
 
         :param by: the array of the rate.
         """
-        rate = np.nan_to_num(np.mean(self.rows[by][number])) if by in self.rows else 0.0
-        return float(rate), float(np.mean(self.rows["results"][number]))
+        reward = float(np.mean(self.rows["results"][number]))
+        if by not in self.rows:
+            return 0.0, reward
+        return float(np.nan_to_num(np.mean(self.rows[by][number]))), reward
 
 
 def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:

@@ -27,7 +27,7 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.training.config import TrainingJob, build_config
+from sb3_quad.training.config import TrainingJob, as_agent, build_config
 from sb3_quad.training.trainer import resume, train
 from sb3_quad.vehicles.vehicle import load_vehicle
 

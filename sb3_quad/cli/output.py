@@ -32,7 +32,9 @@ def warn(line: str) -> None:
 
 def shows_progress(wanted: bool | None) -> bool:
     """Whether to show a progress bar: as ``wanted``, or with None, in a terminal."""
-    return sys.stderr.isatty() if wanted is None else wanted
+    if wanted is None:
+        return sys.stderr.isatty()
+    return wanted
 
 
 @contextmanager

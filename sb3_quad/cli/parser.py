@@ -161,38 +161,36 @@ def add_flags(parser: ArgumentParser, flags: Flags) -> None:
         parser.add_argument(*names, default=default, help=text, **arguments)
 
 
-def add_fields(
-    parser: ArgumentParser, model: type[BaseModel], *names: str, **changes: StrDict
-) -> None:
+def add_fields(parser: ArgumentParser, model: type[BaseModel], *names: str, **changes: Any) -> None:
     """Add a flag for each field of a model, from the field's name, type, docstring and default.
 
     A flag that is not given is None.
 
     :param names: The fields; without any, all of them.
-    :param changes: Arguments of ``add_argument`` for a field, which replace those made from it.
+    :param changes: Types (or keywords of ``add_argument``) of fields, in place of their own.
     """
     for name in names or model.model_fields:
         field = model.model_fields[name]
         # The alternatives of a union such as `int | None`, or the type itself.
         kinds = {field.annotation, *typing.get_args(field.annotation)}
-        arguments: StrDict = {"help": field.description}
-        if field.default not in (None, False):
-            arguments["help"] += f" ({field.default})"
-        if name == "progress":
-            arguments |= YES_OR_NO
+        kind: Any = whole
+        if name in changes:
+            kind = changes[name]
         elif bool in kinds:
-            arguments |= {"action": "store_true", "default": None}
+            kind = SWITCH
         elif StrDict in kinds:
-            arguments |= PAIRS
-        else:
-            arguments["metavar"] = METAVARS.get(name, "N")
-            if float in kinds:
-                arguments["type"] = float
-            elif str not in kinds:
-                arguments["type"] = whole
-        short = [SHORT_FLAGS[name]] if name in SHORT_FLAGS else []
-        arguments |= changes.get(name, {})
-        parser.add_argument(*short, f"--{name.replace('_', '-')}", **arguments)
+            kind = PAIRS
+        elif float in kinds:
+            kind = float
+        elif str in kinds:
+            kind = str
+        text = str(field.description)
+        if field.default not in (None, False):
+            text += f" ({field.default})"
+        words = f"{SHORT_FLAGS.get(name, '')} --{name.replace('_', '-')}"
+        if not isinstance(kind, dict):
+            words += f" {METAVARS.get(name, 'N')}"
+        add_flags(parser, {words: (kind, None, text)})
 
 
 EXECUTOR: Flags = {

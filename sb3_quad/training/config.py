@@ -154,7 +154,9 @@ class TrainingConfig(Frozen):
         if isinstance(train_freq, int):
             return train_freq
         number, unit = train_freq
-        return number if unit == "step" else 1
+        if unit != "step":
+            return 1
+        return int(number)
 
     def shorter_rollout(self) -> dict[str, int]:
         """Return the settings that fit a rollout to a budget of less than one.
@@ -300,7 +302,7 @@ def load_config(
     # A misspelt name would otherwise be reported as a missing file.
     get_algorithm(algo)
     check_environment(env_id)
-    content, where = SETTINGS.read(f"{algo}.yml" if conf_file is None else conf_file)
+    content, where = SETTINGS.read(conf_file or f"{algo}.yml")
     if env_id not in content:
         missing = unknown("environment in this file", env_id, map(str, content))
         raise ConfigError(f"{where}: {missing}; give another with --conf-file")

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.process import ignore_interrupts
+from sb3_quad.base.types import StrDict
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.algorithms import as_list, instance
@@ -48,6 +49,9 @@ class _Subproc(RowSeeds, SubprocVecEnv):
         super().close()
 
 
+SINGLE: StrDict = {"dummy": _Dummy, "subproc": _Subproc}
+
+
 def make_environments(
     config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False
 ) -> VecEnv:
@@ -76,7 +80,7 @@ def make_environments(
                 importlib.import_module("sb3_quad.base.bullet")
             phases = n_envs if staggered else 1
             makers: list[Any] = [partial(_make_row, config, row, phases) for row in range(n_envs)]
-            env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
+            env = SINGLE[config.vec_env](makers)
             env.seed(seed)
     except SB3QuadError:
         raise

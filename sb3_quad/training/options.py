@@ -34,7 +34,6 @@ METAVARS = {
     "wandb_project_name": "NAME",
     "wandb_entity": "NAME",
     "wandb_group": "NAME",
-    "wandb_tags": "TAG",
 }
 """The values of flags that take no number, as ``--help`` shows them."""
 

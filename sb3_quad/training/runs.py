@@ -96,10 +96,11 @@ class RunFolder:
         """
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
+        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
         # A program of the user's may train, too.
-        program = Path(sys.argv[0]).name
-        start = ["sb3-quad"] if program in ("sb3-quad", "__main__.py") else ["python", program]
-        write_text(self.command, shlex.join([*start, *sys.argv[1:]]) + "\n")
+        if not command.startswith("sb3-quad"):
+            command = f"python {command}".replace("python __main__.py", "sb3-quad")
+        write_text(self.command, f"{command}\n")
         write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
 
     def read_yaml(self) -> tuple[StrDict, StrDict]:

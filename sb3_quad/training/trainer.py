@@ -15,9 +15,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.logger import HParam
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -40,10 +42,11 @@ from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
-from sb3_quad.training.tracking import HyperparameterLog, tracked
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 NEVER = 2**62  # timesteps
+# TensorBoard shows these next to the settings, under HPARAMS.
+METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")
 OWN_TASK = ""  # the name of the evaluations on the task of the training
 
 
@@ -401,4 +404,58 @@ class _Training:
 
 def trained_seconds(run: RunFolder) -> float:
     """Return the wall-clock time that a complete run took, as its evaluations say, or 0."""
-    return float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
+    if not run.evaluations.is_file():
+        return 0.0
+    return float(read_curve(run.path).seconds[-1])
+
+
+class HyperparameterLog(BaseCallback):
+    """Logs a job's settings when its training begins; only TensorBoard shows them."""
+
+    def __init__(self, job: TrainingJob) -> None:
+        super().__init__()
+        config = job.config
+        shown = {"algo": config.algo, "env": config.env_id, "seed": job.seed, **config.settings}
+        # TensorBoard takes plain values alone.
+        self._shown = {
+            name: value if isinstance(value, (bool, int, float)) else str(value)
+            for name, value in shown.items()
+        }
+
+    def _on_training_start(self) -> None:
+        parameters = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
+        self.logger.record("hparams", parameters, exclude=("stdout", "log", "json", "csv"))
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@contextmanager
+def tracked(job: TrainingJob) -> Iterator[None]:
+    """Track the block in a run of Weights & Biases, if the job asks for it.
+
+    The run is made as rl_zoo3 makes it, and shows what TensorBoard is given.
+
+    :raises ConfigError: it cannot begin, for example without a login.
+    """
+    if not job.track:
+        yield
+        return
+    # wandb is an extra, which JobOptions has checked.
+    import wandb
+
+    config = job.config
+    try:
+        run = wandb.init(
+            name=f"{config.env_id}__{config.algo}__{job.seed}__{int(time.time())}",
+            project=job.wandb_project_name,
+            entity=job.wandb_entity,
+            group=job.wandb_group,
+            tags=[*(job.wandb_tags or ()), f"v{stable_baselines3.__version__}"],
+            config={**job.arguments(), **config.settings, **made_with()},
+            sync_tensorboard=True,
+        )
+    except wandb.Error as error:
+        raise ConfigError(f"--track: {one_line(error)}") from None
+    with run:
+        yield

@@ -232,8 +232,7 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
         specs.insert(0, ControllerSpec(*_agent_of_run(options)))
         print(f"agent: {specs[0].spec}")
     # The settings of the first agent hold for all.
-    own_settings = [spec.own for spec in specs if spec.own is not None]
-    first = own_settings[0] if own_settings else None
+    first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
         setting = fixed_setting(_flight_settings(options, first), options.target)
     elif options.env_kwargs or options.target:

@@ -132,4 +132,4 @@ def run(options: Namespace) -> int:
         if failure.scenario:
             where += f", scenario {failure.scenario}"
         print(f"failed: {where}: {failure.message}", file=sys.stderr)
-    return 1 if failures else 0
+    return int(bool(failures))

@@ -93,7 +93,9 @@ def run(options: Namespace) -> int:
             lines[f"thesis: {name}"] = reference.model_dump(
                 include={"survival", "reward"}, exclude_none=True
             )
-    show = options.show or (["survival", "reward"] if options.thesis else [])
+    show = options.show
+    if options.thesis and not show:
+        show = ["survival", "reward"]
     curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
     refuse_existing(options.output, options.overwrite)
     write_bytes(options.output, picture(curves, kind, dpi=130))

@@ -79,7 +79,7 @@ def add_arguments(parser: Parser) -> None:
     add_flags(parser, FLAGS)
     add_fields(parser, SettingsOptions)
     fields = (*RunOptions.model_fields, "log_folder")
-    add_fields(parser, JobOptions, *fields, trained_agent={"type": agent_path})
+    add_fields(parser, JobOptions, *fields, trained_agent=agent_path)
 
 
 def run(options: Namespace) -> int:
@@ -199,7 +199,7 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
     if signals.received:
         print(f"to continue: --resume {folder.path}")
         return signals.exit_code
-    return 1 if failures else 0
+    return int(bool(failures))
 
 
 def _write_results(folder: Any, sweep: Any, records: Any) -> Any:

@@ -107,14 +107,14 @@ def add_settings(parser: Parser) -> None:
     """Add the flags for what is trained, which ``tune`` has as well."""
     add_flags(parser, SETTINGS_FLAGS)
     add_fields(parser, SettingsOptions)
-    add_fields(parser, JobOptions, *SHARED_FIELDS, trained_agent={"type": agent_path})
+    add_fields(parser, JobOptions, *SHARED_FIELDS, trained_agent=agent_path)
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
     add_flags(parser, FLAGS)
-    add_fields(parser, JobOptions, *TRAIN_FIELDS, wandb_tags={"nargs": "+", "type": str})
+    add_fields(parser, JobOptions, *TRAIN_FIELDS, wandb_tags=SEVERAL)
 
 
 def run(options: Namespace) -> int:
@@ -133,7 +133,7 @@ def run(options: Namespace) -> int:
     job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
         folder = Path(options.resume)
-        if not (folder / pipeline.STATUS_FILE).is_file():
+        if not pipeline.is_pipeline_run(folder):
             return close_run(resume(options.resume, **job))
         result = pipeline.resume_pipeline(folder, **job)
     elif options.conf_file is not None and pipeline.is_pipeline(options.conf_file):
