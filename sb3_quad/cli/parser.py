@@ -150,8 +150,8 @@ default, and the help; the help alone for a text without a default.
 """
 
 
-def add_flags(parser: ArgumentParser, flags: Flags) -> None:
-    """Add the flags of a table."""
+def add_flags(parser: Any, flags: Flags) -> None:
+    """Add the arguments of a table to a parser or a group of one."""
     for words, entry in flags.items():
         kind, default, text = (str, None, entry) if isinstance(entry, str) else entry
         arguments = kind if isinstance(kind, dict) else {"type": kind}

@@ -28,7 +28,7 @@ from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
-from sb3_quad.base.types import StrDict, StrMapping, StrPath
+from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
@@ -44,7 +44,7 @@ from sb3_quad.training.config import (
     with_vehicle_path,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import Report, resume, train, trained_seconds
+from sb3_quad.training.trainer import resume, train, trained_seconds
 
 STATUS_FILE = "pipeline.yml"
 # The keys that go with each kind of offset correction.

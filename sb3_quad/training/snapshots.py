@@ -166,7 +166,7 @@ def load_snapshot(
         raise ConfigError(message)
     state = read_arrays(path)
     try:
-        model = _restore(state, algo, env, device, attributes)
+        model: BaseAlgorithm = _restore(state, algo, env, device, attributes)
     except ConfigError as error:
         raise _misfit(path, error) from None
     _roll_back(run, state)

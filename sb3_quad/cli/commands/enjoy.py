@@ -181,7 +181,8 @@ def run(options: Namespace) -> int:
         else:
             _write_film(file, episodes, size, options)
     if window:
-        show_in_window(episodes, *(options.size or SINGLE), options.speed)
+        width, height = options.size or SINGLE
+        show_in_window(episodes, width, height, options.speed)
     return 0
 
 

@@ -21,6 +21,7 @@ The new folder receives the run folders, results.csv, results.json, report.md
 and report.html. For the keys of the file, see docs/sweeps.md.
 """
 
+import itertools
 import sys
 import time
 from argparse import Namespace
@@ -98,20 +99,17 @@ def run(options: Namespace) -> int:
     import_packages(spec.gym_packages, "gym_packages:")
     sweep = Sweep(spec=spec, runs=tuple(make_runs(spec)), suite=suite_of(spec))
     if options.dry_run:
-        _print_runs(sweep)
+        for planned in sweep.runs:
+            stages = [
+                f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
+                for stage in planned.stages
+            ]
+            print(f"{planned.name}: {', then '.join(stages)}")
+        configurations = {planned.configuration for planned in sweep.runs}
+        runs = _count(len(sweep.runs), "run")
+        print(f"{runs} of {_count(len(configurations), 'configuration')}")
         return 0
     return _execute(options, sweep, None)
-
-
-def _print_runs(sweep: Any) -> None:
-    for run in sweep.runs:
-        stages = [
-            f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
-            for stage in run.stages
-        ]
-        print(f"{run.name}: {', then '.join(stages)}")
-    configurations = {run.configuration for run in sweep.runs}
-    print(f"{_count(len(sweep.runs), 'run')} of {_count(len(configurations), 'configuration')}")
 
 
 def _spec(options: Namespace) -> Any:
@@ -160,9 +158,10 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
     """
     from sb3_quad.base.files import locked
     from sb3_quad.base.process import StopSignals, available_cpus
-    from sb3_quad.cli.output import progress_bar
+    from sb3_quad.cli.output import console, progress_bar
     from sb3_quad.executors import start_executor
     from sb3_quad.sweep.folder import SweepFolder
+    from sb3_quad.sweep.results import summarize, tables, write_report, write_results
     from sb3_quad.sweep.run import execute
     from sb3_quad.training.runs import claim_folder
 
@@ -188,7 +187,13 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
             records = execute(folder, sweep, executor, signals, show, print)
             # Nothing interrupts the results.
             signals.hold()
-            results = _write_results(folder, sweep, records)
+            results = summarize(sweep, records)
+            write_results(folder, results)
+            if results.groups:
+                sections = tables(results)
+                for table in itertools.chain.from_iterable(sections.values()):
+                    console().print(table)
+                write_report(folder, results, sections)
     failures = [record for record in records.values() if record.state == "failed"]
     seconds = time.perf_counter() - start
     print(f"{results.finished} of {runs} finished, {len(failures)} failed; {seconds:.1f} s")
@@ -200,22 +205,6 @@ def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
         print(f"to continue: --resume {folder.path}")
         return signals.exit_code
     return int(bool(failures))
-
-
-def _write_results(folder: Any, sweep: Any, records: Any) -> Any:
-    """Write and print the comparison of the finished runs, and return it."""
-    from sb3_quad.cli.output import console
-    from sb3_quad.sweep.results import summarize, tables, write_report, write_results
-
-    results = summarize(sweep, records)
-    write_results(folder, results)
-    if results.groups:
-        sections = tables(results)
-        for section in sections.values():
-            for table in section:
-                console().print(table)
-        write_report(folder, results, sections)
-    return results
 
 
 def _count(number: int, noun: str) -> str:
