@@ -87,7 +87,7 @@ class TrainingConfig(Frozen):
     algo: str
     env_id: str
     n_timesteps: Whole
-    """timesteps to train on, over all environments"""
+    """timesteps to train on, over all environments; -n on the command line"""
     n_envs: Whole = 1
     """number of parallel environments"""
     vec_env: VecEnvKind
@@ -358,8 +358,6 @@ def build_config(
             raise ConfigError(f"{source(key)}: {message}")
         elif value is not None:
             fields[key] = value
-    if "n_timesteps" not in fields:
-        raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
     fields |= {"algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": settings}
     return validate(TrainingConfig, fields, source)
 
@@ -414,15 +412,15 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
-    env_kwargs = {
-        name: own.observed[name]
-        for name in ("last_action", "history", "observation_mean", "observation_std")
+    observed = own.observed
+    del observed["rotor_layout"]
+    integral = observed.pop("position_integral")
+    merged = {
+        **changes,
+        "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
+        # The changes to these are in the settings already.
+        "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
     }
-    env_kwargs |= changes.get("env_kwargs", {})
-    eval_env_kwargs = {"position_integral": own.observed["position_integral"]}
-    eval_env_kwargs |= config.eval_env_kwargs
-    eval_env_kwargs |= changes.get("eval_env_kwargs", {})
-    merged = {**changes, "env_kwargs": env_kwargs, "eval_env_kwargs": eval_env_kwargs}
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
         policy: Any = load_model(path).policy

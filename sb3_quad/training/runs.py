@@ -204,14 +204,13 @@ def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> Ru
         raise ConfigError(
             f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f"
         )
-    number = exp_id
-    if number <= 0:
+    if exp_id <= 0:
         with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
-        number = max(with_agent or folders)
-    if number not in folders:
+        exp_id = max(with_agent or folders)
+    if exp_id not in folders:
         existing = ", ".join(folder.name for folder in folders.values())
         raise ConfigError(
-            f"{parent}: there is no run {name}_{number}; there is {existing}; "
+            f"{parent}: there is no run {name}_{exp_id}; there is {existing}; "
             "give another with --exp-id"
         )
-    return RunFolder(folders[number], name)
+    return RunFolder(folders[exp_id], name)
