@@ -1,7 +1,6 @@
 """Callbacks for any Stable-Baselines3 algorithm; docs/callbacks.md lists them."""
 
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint, ProgressLine
+from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 
 __all__ = ["BestModel", "Checkpoint", "EpisodeLog", "ProgressLine"]

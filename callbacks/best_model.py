@@ -12,10 +12,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
+from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
 
-# Ends that SB3's Monitor may leave uncounted in one episode: Atari's wrappers report each life.
-LIVES = 20
 # By the name in the log: an array of an evaluation, and its statistic.
 LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "success_rate": ("successes", np.mean),
@@ -26,6 +25,10 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 }
 # The array and the name in the log of each rate that may decide.
 RATES = {"success": ("successes", "success_rate"), "survival": ("survivals", "survival_rate")}
+# The key in ``info`` of each array that environments may report.
+REPORTED = {"successes": "is_success", "survivals": "survival", "final_errors": "distance"}
+# Whether to continue after an evaluation with this rate that decides, and this mean reward.
+ShouldContinue = Callable[[float, float], bool]
 # The rate that decides, and the mean reward.
 Score = tuple[float, float]
 
@@ -89,11 +92,11 @@ class BestModel(EveryTimesteps):
         every: int,
         n_episodes: int,
         seed: int,
-        best_model: str | Path = "best_model.zip",
-        evaluations: str | Path = "evaluations.npz",
-        report: Callable[[str], None] = lambda line: None,
+        best_model: StrPath = "best_model.zip",
+        evaluations: StrPath = "evaluations.npz",
+        report: Report = lambda line: None,
         others: Mapping[str, VecEnv] | None = None,
-        should_continue: Callable[[float, float], bool] = lambda success, reward: True,
+        should_continue: ShouldContinue = lambda success, reward: True,
         by: str = "success",
         verbose: int = 0,
     ) -> None:
@@ -110,9 +113,11 @@ class BestModel(EveryTimesteps):
         self._by = RATES[by][0]
         path = Path(evaluations)
         self._own = _Evaluations(env, path)
-        self._others = {}
+        # By the prefix of their part of a report.
+        self._evaluations = {"": self._own}
         for name, other in (others or {}).items():
-            self._others[name] = _Evaluations(other, path.with_name(f"{path.stem}_{name}.npz"))
+            further = _Evaluations(other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}")
+            self._evaluations[f"{name}: "] = further
         self._start = 0.0
         self._last = 0
         self.stopped = False  # by ``should_continue``
@@ -120,7 +125,7 @@ class BestModel(EveryTimesteps):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        for evaluations in (self._own, *self._others.values()):
+        for evaluations in self._evaluations.values():
             evaluations.read(self._n_episodes)
         # A resumed training continues the clock and knows the best model so far.
         rows = self._own.rows
@@ -146,17 +151,24 @@ class BestModel(EveryTimesteps):
     def evaluate(self) -> None:
         """Evaluate the model as it is now, note the results, and keep it if it is the best."""
         seconds = time.perf_counter() - self._start
-        values = {"timesteps": self.num_timesteps, "seconds": seconds}
+        values: StrDict = {"timesteps": self.num_timesteps, "seconds": seconds}
         # The log still holds the losses of the latest update.
-        losses = {
-            name: float(value)
-            for name, value in self.logger.name_to_value.items()
-            if fnmatchcase(name, "train/*loss")
-        }
-        text = self._evaluate_in(self._own, "eval", {**values, **losses})
-        for name, evaluations in self._others.items():
-            text += f"; {name}: {self._evaluate_in(evaluations, f'eval_{name}', values)}"
-        line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: {text}"
+        for name, value in self.logger.name_to_value.items():
+            if fnmatchcase(name, "train/*loss"):
+                values[name] = float(value)
+        texts = []
+        for prefix, evaluations in self._evaluations.items():
+            flown = _fly(self.model, evaluations.env, self._n_episodes, self._seed)
+            evaluations.append({**values, **flown})
+            latest = evaluations.latest()
+            for name, value in latest.items():
+                self.logger.record(f"{evaluations.group}/{name}", value)
+            text = prefix
+            for name, (_, rate) in RATES.items():
+                if rate in latest:
+                    text += f"{name} {100 * latest[rate]:.1f} %, "
+            texts.append(f"{text}mean reward {latest['mean_reward']:.2f}")
+        line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: {'; '.join(texts)}"
         if getattr(self.model, "policy_is_idle", False):
             line += " (critic warm-up: the policy does not learn yet)"
         score = self._own.score(self._by)
@@ -169,31 +181,17 @@ class BestModel(EveryTimesteps):
         self.logger.dump(self.num_timesteps)
         self.stopped = not self._should_continue(*score)
 
-    def _evaluate_in(self, evaluations: "_Evaluations", group: str, values: dict[str, Any]) -> str:
-        """Evaluate in some environments; write, log and return the results.
-
-        :param group: their group in the log.
-        :param values: noted with the results.
-        """
-        flown = _fly(self.model, evaluations.env, self._n_episodes, self._seed)
-        evaluations.append({**values, **flown})
-        latest = evaluations.latest()
-        for name, value in latest.items():
-            self.logger.record(f"{group}/{name}", value)
-        text = ""
-        for name, (_, rate) in RATES.items():
-            if rate in latest:
-                text += f"{name} {100 * latest[rate]:.1f} %, "
-        return f"{text}mean reward {latest['mean_reward']:.2f}"
-
 
 class _Evaluations:
-    """The evaluations in some environments: rows of arrays by name, and their file."""
+    """The evaluations in some environments: rows of arrays by name, their file, and their group in
+    the log.
+    """
 
-    def __init__(self, env: VecEnv, path: Path) -> None:
+    def __init__(self, env: VecEnv, path: Path, group: str = "eval") -> None:
         self.env = env
         self.path = path
-        self.rows: dict[str, Any] = {}
+        self.group = group
+        self.rows: StrDict = {}
 
     def read(self, n_episodes: int) -> None:
         """Continue the file, if it exists.
@@ -204,8 +202,7 @@ class _Evaluations:
             return
         self.rows = {name: list(array) for name, array in read_arrays(self.path).items()}
         if not self.rows.get("results"):
-            problem = "results: no such array, or an empty one"
-            raise ConfigError(f"{self.path}: cannot be read ({problem})")
+            raise ConfigError(f"{self.path}: cannot be read (results: no such array, or empty)")
         flown = len(self.rows["results"][-1])
         if flown != n_episodes:
             raise ConfigError(
@@ -213,7 +210,7 @@ class _Evaluations:
                 f"n_episodes (--eval-episodes) must be {flown}"
             )
 
-    def append(self, values: dict[str, Any]) -> None:
+    def append(self, values: StrDict) -> None:
         """Add an evaluation and write the file.
 
         NaN stands for what one of the evaluations does not have, such as losses before the first
@@ -241,45 +238,39 @@ class _Evaluations:
 
         :param by: the array of the rate.
         """
-        rate = np.nan_to_num(np.mean(self.rows[by][number])) if by in self.rows else 0.0
-        return float(rate), float(np.mean(self.rows["results"][number]))
+        reward = float(np.mean(self.rows["results"][number]))
+        if by not in self.rows:
+            return 0.0, reward
+        return float(np.nan_to_num(np.mean(self.rows[by][number]))), reward
 
 
-def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> dict[str, Any]:
+def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
     """Return the arrays of an evaluation, (n_episodes,) each; those that are reported.
 
     :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
-    reported = {"successes": "is_success", "survivals": "survival", "final_errors": "distance"}
-    arrays: dict[str, list[float]] = {name: [] for name in reported}
-    n_uncounted = 0
+    ends: list[StrDict] = []
 
-    def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
-        nonlocal n_uncounted
+    def note(local_variables: StrDict, global_variables: StrDict) -> None:
         if not local_variables["done"]:
             return
-        info = local_variables["info"]
-        # evaluate_policy counts an episode only where Monitor reports it.
-        if local_variables.get("is_monitor_wrapped") and "episode" not in info:
-            n_uncounted += 1
-            if n_uncounted > LIVES * env.num_envs:
-                raise TrainingError(
-                    "evaluation: a wrapper drops info['episode'], by which SB3 counts episodes"
-                )
-            return
-        n_uncounted = 0
-        for name, key in reported.items():
-            arrays[name].append(float(info.get(key, np.nan)))
-        # There is no final error without a final position.
-        if not info.get("survival"):
-            arrays["final_errors"][-1] = np.nan
+        ends.append(local_variables["info"])
+        # evaluate_policy would count no episode and never end.
+        if local_variables.get("is_monitor_wrapped") and "episode" not in ends[-1]:
+            raise TrainingError(
+                "evaluation: a wrapper drops info['episode'], by which SB3 counts episodes"
+            )
 
     env.seed(seed)
     rewards, lengths = evaluate_policy(
         model, env, n_episodes, callback=note, return_episode_rewards=True, warn=False
     )
-    values: dict[str, Any] = {"results": rewards, "ep_lengths": lengths}
-    for name, array in arrays.items():
+    values: StrDict = {"results": rewards, "ep_lengths": lengths}
+    for name, key in REPORTED.items():
+        array = np.array([info.get(key, np.nan) for info in ends], np.float64)
+        if key == "distance":
+            # There is no final error without a final position.
+            array[[not info.get("survival") for info in ends]] = np.nan
         if not np.isnan(array).all():
             values[name] = array
     # Some environments report successes and no failures.

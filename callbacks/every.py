@@ -1,18 +1,21 @@
-"""Callbacks that do something at regular intervals, of timesteps or of seconds."""
+"""Callbacks that do something at regular intervals: timesteps, seconds, or ends of episodes."""
 
 import time
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import save_model
+from sb3_quad.base.files import read_text, save_model
+from sb3_quad.base.types import Report, StrPath
 
 
 class EveryTimesteps(EventCallback):
@@ -89,9 +92,7 @@ class ProgressLine(BaseCallback):
     :param seconds: between two lines.
     """
 
-    def __init__(
-        self, report: Callable[[str], None] = print, seconds: float = 60.0, verbose: int = 0
-    ) -> None:
+    def __init__(self, report: Report = print, seconds: float = 60.0, verbose: int = 0) -> None:
         super().__init__(verbose)
         self._report = report
         self._seconds = seconds
@@ -121,6 +122,64 @@ class ProgressLine(BaseCallback):
         seconds_per_step = elapsed / (self.num_timesteps - self._first_timestep)
         minutes = seconds_per_step * (total - self.num_timesteps) / 60
         return f"{line}, {minutes:.0f} min left"
+
+
+class EpisodeLog(BaseCallback):
+    """Adds a line for each episode that ends: return, length, seconds since the start, success.
+
+    It reads ``info["episode"]``, which costs nothing until an episode ends. ``load_results`` and
+    rl-zoo's plots read the file. An existing file is continued, its seconds too.
+
+    >>> from stable_baselines3 import PPO
+    >>> from stable_baselines3.common.results_plotter import load_results
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> env = QuadcopterVecEnv(8, max_episode_steps=50, seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
+    >>> _ = model.learn(800, callback=EpisodeLog("0.monitor.csv"))
+    >>> len(load_results("."))
+    16
+
+    :param path: must be named ``<number>.monitor.csv``.
+    :param env_id: noted in the file.
+    """
+
+    def __init__(self, path: StrPath, env_id: str = "", verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self._path = Path(path)
+        self._env_id = env_id
+
+    def _on_training_start(self) -> None:
+        self._start = time.time()
+        header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
+        is_new = not self._path.exists()
+        if not is_new:
+            # A crash may have cut the last row.
+            with self._path.open("rb+") as file:
+                file.truncate(file.read().rfind(b"\n") + 1)
+            # The seconds of an earlier training count, too; two lines are the file's head.
+            rows = read_text(self._path).splitlines()[2:]
+            if rows:
+                self._start -= float(rows[-1].split(",")[2])
+        self._writer = ResultsWriter(
+            str(self._path), header, ("is_success",), override_existing=is_new
+        )
+
+    def _on_step(self) -> bool:
+        seconds = round(time.time() - self._start, 3)
+        for row in np.flatnonzero(self.locals["dones"]):
+            info = self.locals["infos"][row]
+            if "episode" in info:
+                values = {
+                    "r": round(float(info["episode"]["r"]), 6),
+                    "l": int(info["episode"]["l"]),
+                    "t": seconds,
+                    "is_success": info.get("is_success", ""),
+                }
+                self._writer.write_row(values)
+        return True
+
+    def _on_training_end(self) -> None:
+        self._writer.close()
 
 
 def last_timestep(model: BaseAlgorithm) -> int:

@@ -42,7 +42,7 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli import app
-from sb3_quad.cli.parser import Parser, add_common, positive
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Parser, add_flags, positive
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
@@ -107,7 +107,7 @@ def add_arguments(parser: Parser) -> None:
         help="lay out a folder NAME as huggingface_sb3 does, instead of the two files",
     )
     add("--push", metavar="USER/REPO", help="also upload that folder to the Hugging Face Hub")
-    add_common(parser, "trust", "overwrite")
+    add_flags(parser, {**TRUST, **OVERWRITE})
 
 
 def run(options: argparse.Namespace) -> int:

@@ -52,7 +52,7 @@ def test_the_example_runs(name, tmp_path, monkeypatch):
 
 def test_the_page_lists_every_callback_and_its_settings_are_read():
     from sb3_quad.base.yaml_files import parse_yaml
-    from sb3_quad.training.classes import import_class
+    from sb3_quad.training.algorithms import import_class
     from sb3_quad.training.config import build_config
 
     page = (ROOT / "docs" / "callbacks.md").read_text(encoding="utf-8")

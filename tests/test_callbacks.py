@@ -19,8 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.callbacks import best_model, every
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint, ProgressLine
+from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.training.snapshots import random_state, set_random_state

@@ -27,8 +27,7 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.training.config import TrainingJob, build_config
-from sb3_quad.training.successor import as_agent
+from sb3_quad.training.config import TrainingJob, as_agent, build_config
 from sb3_quad.training.trainer import resume, train
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -482,7 +481,7 @@ def test_the_benchmark_measures_each_kind_of_environments(capsys):
     )
 
 
-def test_the_benchmark_measures_rollouts_and_updates(tmp_path, capsys):
+def test_the_benchmark_measures_training_loops(tmp_path, capsys):
     sizes = "n_timesteps: 100, n_envs: 4, n_steps: 10, batch_size: 20, n_epochs: 1"
     (tmp_path / "tiny.yml").write_text(f"QuadStateRecovery-v0: {{{sizes}}}")
     assert main(["benchmark", "--training", "--conf-file", str(tmp_path / "tiny.yml")]) == 0

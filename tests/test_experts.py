@@ -21,7 +21,7 @@ from sb3_quad.experts.geometric_gains import derived_gains
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.simulation.state import BODY_RATES, QUATERNION, VELOCITY, QuadcopterState
-from sb3_quad.training.classes import import_class
+from sb3_quad.training.algorithms import import_class
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 TO_R0 = np.array([0.0, 0.0, 15.0])

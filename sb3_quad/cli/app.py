@@ -1,11 +1,11 @@
 """The commands, their errors and exit codes."""
 
-import argparse
 import importlib
 import io
 import pkgutil
 import sys
 import traceback
+from argparse import Namespace
 from collections.abc import Container, Sequence
 from pathlib import Path
 
@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _parse(arguments: list[str]) -> argparse.Namespace | None:
+def _parse(arguments: list[str]) -> Namespace | None:
     """Return the options of a command, or None after printing help.
 
     :raises ConfigError: An unknown command or option, or a bad value.
@@ -122,20 +122,12 @@ def _parse(arguments: list[str]) -> argparse.Namespace | None:
     if options.command is None:
         parser.print_help()
         return None
-    _check_agent(getattr(options, "trained_agent", None))
-    return options
-
-
-def _check_agent(agent: str | None) -> None:
-    """Refuse a missing file at once, since the imports of a command take seconds.
-
-    :raises ConfigError: There is no such file.
-    """
-    if agent is None or Path(agent).is_file():
-        return
+    # A missing file is refused at once, since the imports of a command take seconds.
+    agent = getattr(options, "trained_agent", None)
     # SB3 adds the suffix, too.
-    if not Path(f"{agent}.zip").is_file():
+    if agent and not (Path(agent).is_file() or Path(f"{agent}.zip").is_file()):
         raise ConfigError(f"-i {agent}: no such file")
+    return options
 
 
 def _unexpected(error: BaseException) -> str:

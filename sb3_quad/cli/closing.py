@@ -4,14 +4,14 @@ The tables are of fresh episodes, the same for all.
 """
 
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.types import StrMapping
 from sb3_quad.cli.output import console
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.tables import Table
@@ -22,11 +22,16 @@ from sb3_quad.training.trainer import TrainingResult
 
 FRESH_EPISODES = 240  # in the table after a single run
 PIPELINE_EPISODES = 480  # in each table after a pipeline
+NEXT = """next:
+  sb3-quad enjoy {agent} --env {env} -o {label}.png
+  sb3-quad demo {agent} pid -o {label}.html
+  sb3-quad evaluate {agent} --suite quick -o evaluations/{label}
+  sb3-quad export {agent} --format torchscript{vehicle}"""
 
 
 def print_tables(
-    controllers: Mapping[str, Any],
-    settings: Mapping[str, Any],
+    controllers: StrMapping,
+    settings: StrMapping,
     n: int,
     seed: int,
     thesis_columns: Iterable[str] = (),
@@ -70,7 +75,7 @@ def close_run(result: TrainingResult) -> int:
     """Print the table of a single run's agent and where everything is. Returns the exit code."""
     if result.exit_code != 0:
         return result.exit_code
-    if result.job.config.task is not None:
+    if result.job.config.task:
         console().print(agent_and_expert(result.job, result.model))
     # A complete run without evaluations does not know how long it took.
     if result.seconds:
@@ -90,16 +95,19 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
         return result.exit_code
     controllers = {"expert": _expert(result.job)}
     for name, stage in result.stages.items():
-        controllers[name] = load_model(stage.agent)
-    settings = result.job.flight_settings.in_any_task()
-    seed = seed_for("table", result.job.seed)
-    thesis_columns = ("expert", "IL-agent", "RL-agent")
-    print_tables(controllers, settings, PIPELINE_EPISODES, seed, thesis_columns)
+        controllers[name] = stage.agent
+    print_tables(
+        controllers,
+        result.job.flight_settings.in_any_task(),
+        PIPELINE_EPISODES,
+        seed_for("table", result.job.seed),
+        ("expert", "IL-agent", "RL-agent"),
+    )
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print(f"saved in {result.folder}, {seconds:.0f} s in all")
-    last = [*result.stages.values()][-1]
-    _print_next(open_run(last.run))
+    # The last stage is the one that was named last.
+    _print_next(open_run(stage.run))
     return 0
 
 
@@ -110,12 +118,12 @@ def _print_next(run: RunFolder) -> None:
     """
     if run.name not in ENVIRONMENTS:
         return
-    agent = shlex.quote(str(run.result))
-    label = shlex.quote(f"{run.path.parent.name}_{run.path.name}")
     # An agent of many vehicles has none that export could take by itself.
     settings, _ = agent_settings(run.result)
-    vehicle = " --vehicle itm" if settings.vehicles else ""
-    print(f"next:\n  sb3-quad enjoy {agent} --env {run.name} -o {label}.png")
-    print(f"  sb3-quad demo {agent} pid -o {label}.html")
-    print(f"  sb3-quad evaluate {agent} --suite quick -o evaluations/{label}")
-    print(f"  sb3-quad export {agent} --format torchscript{vehicle}")
+    text = NEXT.format(
+        agent=shlex.quote(str(run.result)),
+        label=shlex.quote(f"{run.path.parent.name}_{run.path.name}"),
+        env=run.name,
+        vehicle=" --vehicle itm" if settings.vehicles else "",
+    )
+    print(text)

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich.console import Console
 from rich.progress import (
@@ -33,18 +32,9 @@ def warn(line: str) -> None:
 
 def shows_progress(wanted: bool | None) -> bool:
     """Whether to show a progress bar: as ``wanted``, or with None, in a terminal."""
-    return sys.stderr.isatty() if wanted is None else wanted
-
-
-def output_file(given: str | Path | None, name: str) -> Path:
-    """Return the file that ``-o`` names, or the file ``name`` in the folder that it names.
-
-    Without ``-o``, the folder is the working directory.
-    """
-    path = Path(given or "")
-    if path.suffix and not path.is_dir():
-        return path
-    return path / name
+    if wanted is None:
+        return sys.stderr.isatty()
+    return wanted
 
 
 @contextmanager

@@ -1,38 +1,39 @@
 """Argument parsing with one-line errors, types of arguments, and flags of several commands."""
 
-import argparse
 import math
 import random
 import typing
-from collections.abc import Container, Mapping
+from argparse import (
+    Action,
+    ArgumentParser,
+    ArgumentTypeError,
+    BooleanOptionalAction,
+    Namespace,
+    RawDescriptionHelpFormatter,
+)
+from collections.abc import Container, Iterable, Mapping
 from typing import Any, NoReturn
 
 from pydantic import BaseModel
 
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
+from sb3_quad.base.types import StrDict
+from sb3_quad.training.options import METAVARS, SHORT_FLAGS
 
 # Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
 SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
 
 
-class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the line breaks of examples, and shows the value of a number as N."""
-
-    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
-        if action.type in (whole, natural, positive, seed):
-            return "N"
-        return super()._get_default_metavar_for_optional(action)
-
-
-class Parser(argparse.ArgumentParser):
+class Parser(ArgumentParser):
     """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
 
     siblings: Mapping[str, Container[str]] = {}
     """The options of each command."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(allow_abbrev=False, formatter_class=HelpFormatter, **kwargs)
+        # This formatter keeps the line breaks of examples.
+        super().__init__(allow_abbrev=False, formatter_class=RawDescriptionHelpFormatter, **kwargs)
 
     def error(self, message: str) -> NoReturn:
         """Raise the error instead of exiting.
@@ -78,11 +79,11 @@ class Parser(argparse.ArgumentParser):
         return "see --help, and docs/zoo.md for flags of rl_zoo3"
 
 
-class Pairs(argparse.Action):
+class Pairs(Action):
     """Stores ``k:v`` entries as a mapping."""
 
     def __call__(
-        self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None
+        self, parser: Any, namespace: Namespace, values: Any, option: str | None = None
     ) -> None:
         """Add the entries of one flag to those of the flags before it.
 
@@ -100,15 +101,17 @@ class Pairs(argparse.Action):
         setattr(namespace, self.dest, pairs)
 
 
-PAIRS: dict[str, Any] = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
-YES_OR_NO: dict[str, Any] = {"action": argparse.BooleanOptionalAction}
+PAIRS: StrDict = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
+YES_OR_NO: StrDict = {"action": BooleanOptionalAction}
+SWITCH: StrDict = {"action": "store_true"}
+SEVERAL: StrDict = {"nargs": "+"}
 
 
 def whole(text: str) -> int:
     """Return a whole number, also from a text such as ``1e6``."""
     number = parse_number(text)
     if isinstance(number, str) or not abs(number) < 2**63 or number != int(number):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number below 2**63")
+        raise ArgumentTypeError(f"{text!r} is not a whole number below 2**63")
     return int(number)
 
 
@@ -116,7 +119,7 @@ def natural(text: str, least: int = 0) -> int:
     """Return a whole number of at least 0."""
     number = whole(text)
     if number < least:
-        raise argparse.ArgumentTypeError(f"{text}: must be at least {least}")
+        raise ArgumentTypeError(f"{text}: must be at least {least}")
     return number
 
 
@@ -137,74 +140,90 @@ def above_zero(text: str) -> float:
     """Return a finite number above 0."""
     number = float(text)
     if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text}: must be above 0, and finite")
+        raise ArgumentTypeError(f"{text}: must be above 0, and finite")
     return number
 
 
-def add_fields(
-    parser: argparse.ArgumentParser,
-    model: type[BaseModel],
-    *names: str,
-    **changes: Mapping[str, Any],
-) -> None:
-    """Add a flag for each field of a model, from the field's name, type, description and default.
+Flags = Mapping[str, str | tuple[Any, Any, str]]
+"""A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
+default, and the help; the help alone for a text without a default.
+"""
+
+
+def add_flags(parser: Any, flags: Flags) -> None:
+    """Add the arguments of a table to a parser or a group of one."""
+    for words, entry in flags.items():
+        kind, default, text = (str, None, entry) if isinstance(entry, str) else entry
+        arguments = kind if isinstance(kind, dict) else {"type": kind}
+        names = words.split()
+        if len(names) > 1 and not names[-1].startswith("-"):
+            arguments = {**arguments, "metavar": names.pop()}
+        parser.add_argument(*names, default=default, help=text, **arguments)
+
+
+def add_fields(parser: ArgumentParser, model: type[BaseModel], *names: str, **changes: Any) -> None:
+    """Add a flag for each field of a model, from the field's name, type, docstring and default.
 
     A flag that is not given is None.
 
-    :param model: A model whose fields are made by :func:`sb3_quad.training.options.option`.
     :param names: The fields; without any, all of them.
-    :param changes: Arguments of ``add_argument`` for a field, which replace those made from it.
+    :param changes: Types (or keywords of ``add_argument``) of fields, in place of their own.
     """
     for name in names or model.model_fields:
         field = model.model_fields[name]
-        metadata: Any = field.json_schema_extra
         # The alternatives of a union such as `int | None`, or the type itself.
         kinds = {field.annotation, *typing.get_args(field.annotation)}
-        arguments: dict[str, Any] = {"help": field.description, "metavar": metadata["metavar"]}
-        if field.default not in (None, False):
-            arguments["help"] += f" ({field.default})"
-        if name == "progress":
-            arguments |= YES_OR_NO
+        kind: Any = whole
+        if name in changes:
+            kind = changes[name]
         elif bool in kinds:
-            # argparse knows no metavar for a flag without a value.
-            arguments = {"help": arguments["help"], "action": "store_true", "default": None}
-        elif dict[str, Any] in kinds:
-            arguments |= PAIRS
+            kind = SWITCH
+        elif StrDict in kinds:
+            kind = PAIRS
         elif float in kinds:
-            arguments["type"] = float
-        elif str not in kinds:
-            arguments["type"] = whole
-        arguments |= changes.get(name, {})
-        parser.add_argument(*metadata["flags"], f"--{name.replace('_', '-')}", **arguments)
+            kind = float
+        elif str in kinds:
+            kind = str
+        text = str(field.description)
+        if field.default not in (None, False):
+            text += f" ({field.default})"
+        words = f"{SHORT_FLAGS.get(name, '')} --{name.replace('_', '-')}"
+        if not isinstance(kind, dict):
+            words += f" {METAVARS.get(name, 'N')}"
+        add_flags(parser, {words: (kind, None, text)})
 
 
-def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add flags that several commands have: ``executor`` (with ``--address``), ``trust``,
-    ``overwrite`` and ``progress``.
-    """
-    add = parser.add_argument
-    if "executor" in names:
-        add(
-            "--executor",
-            default="local",
-            metavar="KIND",
-            help="local (processes on this machine, default) or ray (docs/sweeps.md)",
-        )
-        add(
-            "--address",
-            metavar="WHERE",
-            help="Ray cluster: auto, host:port or ray://host:port (a new one on this machine)",
-        )
-    if "trust" in names:
-        trust = "let zips run code that is pickled in them; only for files you trust"
-        add("--trust", action="store_true", help=f"{trust} (docs/security.md)")
-    if "overwrite" in names:
-        add("--overwrite", action="store_true", help="replace existing files")
-    if "progress" in names:
-        add("-P", "--progress", help="show a progress bar (yes in a terminal)", **YES_OR_NO)
+EXECUTOR: Flags = {
+    "--executor KIND": (
+        str,
+        "local",
+        "local (processes on this machine, default) or ray (docs/sweeps.md)",
+    ),
+    "--address WHERE": (
+        "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)"
+    ),
+}
+TRUST: Flags = {
+    "--trust": (
+        SWITCH,
+        False,
+        "let zips run code that is pickled in them; only for files you trust (docs/security.md)",
+    )
+}
+OVERWRITE: Flags = {"--overwrite": (SWITCH, False, "replace existing files")}
+PROGRESS: Flags = {"-P --progress": (YES_OR_NO, None, "show a progress bar (yes in a terminal)")}
 
 
-def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+def given(options: Namespace, *names: str) -> StrDict:
     """Return those of some options that the command has and that were given."""
     values = {name: getattr(options, name, None) for name in names}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def refuse(options: Namespace, names: Iterable[str], message: str) -> None:
+    """Refuse flags of these names; ``{}`` in the message stands for the flag.
+
+    :raises ConfigError: one of them is given.
+    """
+    for name in given(options, *names):
+        raise ConfigError(message.format(f"--{name.replace('_', '-')}"))

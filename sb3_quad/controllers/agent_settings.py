@@ -13,7 +13,7 @@ from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
-from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle
+from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle
 
 
 def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
@@ -45,6 +45,21 @@ def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
             f"{zip_file}: several config.yml files lie next to it ({', '.join(map(str, configs))})"
         )
     return _settings_of_run(configs[0]), configs[0]
+
+
+def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
+    """Return a warning if an agent was trained on another vehicle than ``flown``; else empty.
+
+    :param own: the agent's settings.
+    """
+    trained = first_vehicle(own.vehicle)
+    # An agent that was trained on many vehicles knows none of them in particular.
+    if own.vehicles is not None or trained.flies_as(flown):
+        return ""
+    warning = f"{label}: was trained on the vehicle {trained.name} and flies {flown.name}"
+    if trained.name == flown.name:
+        warning += " of other parameters"
+    return warning
 
 
 def _settings_of_zip(record: dict[str, Any], where: str) -> FlightSettings:

@@ -10,14 +10,14 @@ from typing import Literal
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory
 from sb3_quad.controllers.zips import saved_algorithm
 from sb3_quad.evaluation.flights import OwnReward, Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
 @dataclass(frozen=True)
@@ -84,21 +84,6 @@ class ControllerSpec:
             f"{self.label}: {self.spec} does not say how its agent flies; it flies {flown.name},"
             " with the scaling of Table A.2"
         )
-
-
-def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
-    """Return a warning if an agent was trained on another vehicle than ``flown``; else empty.
-
-    :param own: the agent's settings.
-    """
-    trained = first_vehicle(own.vehicle)
-    # An agent that was trained on many vehicles knows none of them in particular.
-    if own.vehicles is not None or trained.flies_as(flown):
-        return ""
-    warning = f"{label}: was trained on the vehicle {trained.name} and flies {flown.name}"
-    if trained.name == flown.name:
-        warning += " of other parameters"
-    return warning
 
 
 def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -15,6 +16,8 @@ from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
 
 Start = Mapping[str, FloatArray]
+# The environment on PyBullet; its task comes with the settings.
+ENV_ID = "QuadTargetTracking-v0"
 
 
 class Fleet:
@@ -90,11 +93,11 @@ class PyBulletFleet(Fleet):
     """
 
     def _open(self, seeds: Sequence[int], settings: FlightSettings) -> list[QuadcopterBatch]:
-        # PyBullet may be missing, which matters here only.
-        from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-
+        # Flights end by their plan; -1 is Gymnasium's word for an environment that truncates none.
+        keywords = {**dict(settings), "max_episode_steps": -1, "disable_env_checker": True}
         self._seeds = seeds
-        self._envs = [QuadcopterEnv(**dict(settings)) for _ in seeds]
+        # By its id, since PyBullet may be missing, which matters here only.
+        self._envs: list[Any] = [gymnasium.make(ENV_ID, **keywords).unwrapped for _ in seeds]
         return [*map(attrgetter("batch"), self._envs)]
 
     def reset(self, start: Start) -> Float32Array:

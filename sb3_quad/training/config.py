@@ -6,7 +6,7 @@ constructor. There, ``lin_1e-3`` falls linearly to 0 over the training; a learni
 n-th part, which it has in the last of n updates.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -16,31 +16,34 @@ from pydantic import (
     Field,
     NonNegativeFloat,
     PositiveInt,
-    ValidationInfo,
-    field_validator,
     model_validator,
 )
 
 from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
+from sb3_quad.base.process import print_once
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
+from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.tasks import TASK_NAMES, in_words
 from sb3_quad.training.algorithms import (
+    as_list,
     check,
     constructor_parameters,
     convert,
     get_algorithm,
     is_off_policy,
+    qualified_classes,
     takes_expert,
 )
-from sb3_quad.training.classes import as_list, qualified_classes
 from sb3_quad.training.options import JobOptions
-from sb3_quad.vehicles.vehicle import VEHICLES
+from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 
 _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
@@ -50,10 +53,10 @@ VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
 MAX_SINGLE = 1000
 
 
-def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
-    if str(value) not in valid:
-        raise ConfigError(unknown(str(info.field_name), value, valid))
-    return str(value)
+def _refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str]) -> None:
+    for name in names:
+        if name not in valid:
+            raise ConfigError(unknown(kind, name, valid))
 
 
 Whole: TypeAlias = Annotated[
@@ -62,10 +65,10 @@ Whole: TypeAlias = Annotated[
     BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
 ]
 Keywords: TypeAlias = Annotated[
-    dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
+    StrDict, BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
 ]
 Classes: TypeAlias = Annotated[
-    list[tuple[str, dict[str, Any]]],
+    list[tuple[str, StrDict]],
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
 Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
@@ -83,52 +86,40 @@ class TrainingConfig(Frozen):
 
     algo: str
     env_id: str
-    n_timesteps: Whole = Field(description="timesteps to train on, over all environments")
-    n_envs: Whole = Field(default=1, description="number of parallel environments")
-    vec_env: VecEnvKind = Field(
-        description="batch by default for this package's environments, dummy for others"
-    )
-    env_kwargs: Keywords = Field(
-        default={}, description="keywords of the environment's constructor"
-    )
-    eval_env_kwargs: Keywords = Field(
-        default={}, description="put over env_kwargs in the evaluation's environments"
-    )
-    eval_tasks: Tasks = Field(
-        default=(),
-        description="more tasks to evaluate on; the job's own task decides which model is best",
-    )
-    best_by: Literal["success", "survival"] = Field(
-        default="success", description="the rate that decides which model is best"
-    )
+    n_timesteps: Whole
+    """timesteps to train on, over all environments; -n on the command line"""
+    n_envs: Whole = 1
+    """number of parallel environments"""
+    vec_env: VecEnvKind
+    """batch by default for this package's environments, dummy for others"""
+    env_kwargs: Keywords = {}
+    """keywords of the environment's constructor"""
+    eval_env_kwargs: Keywords = {}
+    """put over env_kwargs in the evaluation's environments"""
+    eval_tasks: Tasks = ()
+    """more tasks to evaluate on; the job's own task decides which model is best"""
+    best_by: Literal["success", "survival"] = "success"
+    """the rate that decides which model is best"""
     policy: str = "MlpPolicy"
-    policy_kwargs: Keywords = Field(
-        default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'"
-    )
-    expert: Any = Field(
-        default=None,
-        description="pid, geometric, path/to/model.zip or package.module:factory, to learn from",
-    )
-    callback: Classes = Field(default=[], description="callbacks of the training")
-    env_wrapper: Classes = Field(
-        default=[], description="wrappers around each environment, for dummy and subproc"
-    )
-    vec_env_wrapper: Classes = Field(
-        default=[], description="wrappers around the vectorised environment"
-    )
-    normalize: Literal[False] | None = Field(
-        default=None, description="its statistics would not be part of a model's zip"
-    )
-    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = Field(
-        default=None, description="action noise, for off-policy algorithms"
-    )
-    noise_std: NonNegativeFloat = Field(
-        default=0.1, description="standard deviation of the action noise; actions are in [-1, 1]"
-    )
-    hyperparams: dict[str, Any] = Field(
-        description="keywords of the algorithm's constructor, converted"
-    )
-    settings: dict[str, Any] = Field(repr=False)
+    policy_kwargs: Keywords = {}
+    """mapping, or a string such as 'dict(net_arch=[64, 64])'"""
+    expert: Any = None
+    """pid, geometric, path/to/model.zip or package.module:factory, to learn from"""
+    callback: Classes = []
+    """callbacks of the training"""
+    env_wrapper: Classes = []
+    """wrappers around each environment, for dummy and subproc"""
+    vec_env_wrapper: Classes = []
+    """wrappers around the vectorised environment"""
+    normalize: Literal[False] | None = None
+    """its statistics would not be part of a model's zip"""
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
+    """action noise, for off-policy algorithms"""
+    noise_std: NonNegativeFloat = 0.1
+    """standard deviation of the action noise; actions are in [-1, 1]"""
+    hyperparams: StrDict
+    """keywords of the algorithm's constructor, converted"""
+    settings: StrDict = Field(repr=False)
 
     @property
     def task(self) -> str | None:
@@ -163,7 +154,9 @@ class TrainingConfig(Frozen):
         if isinstance(train_freq, int):
             return train_freq
         number, unit = train_freq
-        return number if unit == "step" else 1
+        if unit != "step":
+            return 1
+        return int(number)
 
     def shorter_rollout(self) -> dict[str, int]:
         """Return the settings that fit a rollout to a budget of less than one.
@@ -178,53 +171,32 @@ class TrainingConfig(Frozen):
         batch_size = min(self.keyword("batch_size"), n_steps * self.n_envs)
         return {"n_steps": n_steps, "batch_size": batch_size}
 
-    @field_validator("policy", mode="before")
-    @classmethod
-    def _known_policy(cls, value: Any, info: ValidationInfo) -> str:
-        return _one_of(get_algorithm(info.data["algo"]).policy_aliases, value, info)
-
-    @field_validator("policy_kwargs")
-    @classmethod
-    def _fits_policy(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-        if "policy" not in info.data:
-            return value
-        # The constructor of the policy takes these, not that of the algorithm.
-        policy = get_algorithm(info.data["algo"]).policy_aliases[info.data["policy"]]
-        parameters = constructor_parameters(policy)
-        for name in value:
-            if name not in parameters:
-                raise ConfigError(unknown(f"keyword of {policy.__name__}", name, parameters))
-        check(NetArch, value.get("net_arch"), "net_arch")
-        return value
-
-    @field_validator("env_kwargs", "eval_env_kwargs")
-    @classmethod
-    def _known_keywords(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-        env_id = info.data["env_id"]
-        if env_id in ENVIRONMENTS:
-            valid = FlightSettings.model_fields
-            for name in value:
-                if name not in valid:
-                    raise ConfigError(unknown(f"keyword of {env_id}", name, valid))
-            # eval_env_kwargs go over env_kwargs, so they are checked together.
-            own = info.data.get("env_kwargs", {})
-            FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **own, **value})
-        return value
-
-    @field_validator("eval_tasks")
-    @classmethod
-    def _known_tasks(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        if value and info.data["env_id"] not in ENVIRONMENTS:
-            raise ConfigError(f"{info.data['env_id']} has no tasks; remove eval_tasks")
-        return tuple(_one_of(TASK_NAMES, name, info) for name in value)
+    @model_validator(mode="after")
+    def _fits_environment(self) -> "TrainingConfig":
+        if self.task:
+            keywords = {**self.env_kwargs, **self.eval_env_kwargs}
+            _refuse_unknown(f"keyword of {self.env_id}", keywords, FlightSettings.model_fields)
+            # Evaluations fly with both; each of the two must fit.
+            self.flight_settings.with_changes(**self.eval_env_kwargs)
+            _refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
+        elif self.eval_tasks:
+            raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
+        aliases = get_algorithm(self.algo).policy_aliases
+        _refuse_unknown("policy", [self.policy], aliases)
+        # The constructor of the policy takes these, not that of the algorithm.
+        policy = aliases[self.policy]
+        kind = f"keyword of {policy.__name__}"
+        _refuse_unknown(kind, self.policy_kwargs, constructor_parameters(policy))
+        check(NetArch, self.policy_kwargs.get("net_arch"), "policy_kwargs: net_arch")
         if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
             raise ConfigError(
                 f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
             )
-        if self.vec_env == "batch" and self.task is None:
+        if self.vec_env == "batch" and not self.task:
             raise ConfigError(
                 f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
             )
@@ -233,7 +205,7 @@ class TrainingConfig(Frozen):
                 f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; "
                 "give steps"
             )
-        if self.noise_type is not None and not self.is_off_policy:
+        if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
         if self.expert and not takes_expert(get_algorithm(self.algo)):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
@@ -247,7 +219,8 @@ JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams"
 class TrainingJob(JobOptions):
     """One job of the trainer: settings and options."""
 
-    config: TrainingConfig = Field(description="the settings")
+    config: TrainingConfig
+    """the settings"""
 
     def for_evaluation(self, **changes: Any) -> TrainingConfig:
         """Return the settings with the environments as evaluations have them.
@@ -267,7 +240,7 @@ class TrainingJob(JobOptions):
         """How the agent is evaluated, in an environment of this package."""
         return self.for_evaluation().flight_settings
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self) -> StrDict:
         """Return what args.yml holds: all but the settings, and how evaluations fly.
 
         The settings are in config.yml.
@@ -299,7 +272,7 @@ def describe(job: TrainingJob) -> str:
     task = config.env_kwargs.get("task")
     if isinstance(task, Mapping):
         line += f", tasks {in_words(task)}"
-    if config.expert is not None:
+    if config.expert:
         line += f", expert {config.expert}"
     line += f", seed {job.seed}"
     if job.trained_agent:
@@ -312,8 +285,8 @@ def describe(job: TrainingJob) -> str:
 def load_config(
     algo: str,
     env_id: str,
-    conf_file: str | Path | None = None,
-    overrides: dict[str, Any] | None = None,
+    conf_file: StrPath | None = None,
+    overrides: StrDict | None = None,
 ) -> TrainingConfig:
     """Read the settings of ``env_id`` from a YAML file and put ``overrides`` over them.
 
@@ -329,7 +302,7 @@ def load_config(
     # A misspelt name would otherwise be reported as a missing file.
     get_algorithm(algo)
     check_environment(env_id)
-    content, where = SETTINGS.read(f"{algo}.yml" if conf_file is None else conf_file)
+    content, where = SETTINGS.read(conf_file or f"{algo}.yml")
     if env_id not in content:
         missing = unknown("environment in this file", env_id, map(str, content))
         raise ConfigError(f"{where}: {missing}; give another with --conf-file")
@@ -350,7 +323,7 @@ def load_config(
 def build_config(
     algo: str,
     env_id: str,
-    settings: dict[str, Any],
+    settings: StrDict,
     where: str = "settings",
     changes: Collection[str] = (),
 ) -> TrainingConfig:
@@ -374,7 +347,7 @@ def build_config(
     def source(key: str) -> str:
         return "command line" if key in changes else where
 
-    fields: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
+    fields: StrDict = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
     hyperparams = {}
     for key, value in settings.items():
         if key in parameters:
@@ -385,8 +358,6 @@ def build_config(
             raise ConfigError(f"{source(key)}: {message}")
         elif value is not None:
             fields[key] = value
-    if "n_timesteps" not in fields:
-        raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
     fields |= {"algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": settings}
     return validate(TrainingConfig, fields, source)
 
@@ -424,3 +395,39 @@ def check_environment(env_id: str) -> None:
         f"unknown environment {env_id!r}: {hint}(of this package: {', '.join(ENVIRONMENTS)}; "
         "others: --gym-packages)"
     )
+
+
+def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict:
+    """Return ``changes`` to a settings file with the observation and networks of a zip added.
+
+    What is in ``changes`` takes precedence. Evaluations fly with the agent's position integral, if
+    it has one; training does without. A zip that does not say how its agent flies adds nothing.
+
+    :param config: the settings with ``changes`` alone.
+    """
+    own, source = agent_settings(path)
+    if source is None or not config.task:
+        return changes
+    # A new vehicle may be what the user wants, so this is only a warning.
+    notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))
+    if notice:
+        print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
+    observed = own.observed
+    del observed["rotor_layout"]
+    integral = observed.pop("position_integral")
+    merged = {
+        **changes,
+        "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
+        # The changes to these are in the settings already.
+        "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
+    }
+    # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
+    if "policy_kwargs" not in changes and not config.is_off_policy:
+        policy: Any = load_model(path).policy
+        merged["policy_kwargs"] = {
+            **config.policy_kwargs,
+            "net_arch": policy.net_arch,
+            # As config.yml names it.
+            "activation_fn": f"nn.{policy.activation_fn.__name__}",
+        }
+    return merged

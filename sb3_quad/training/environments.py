@@ -4,7 +4,6 @@ The learning problem is the same in all of them.
 """
 
 import importlib
-from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -15,9 +14,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.process import ignore_interrupts
+from sb3_quad.base.types import StrDict
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.simulation.settings import ENDLESS
-from sb3_quad.training.classes import instance
+from sb3_quad.training.algorithms import as_list, instance
 from sb3_quad.training.config import TrainingConfig
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
@@ -49,6 +49,9 @@ class _Subproc(RowSeeds, SubprocVecEnv):
         super().close()
 
 
+SINGLE: StrDict = {"dummy": _Dummy, "subproc": _Subproc}
+
+
 def make_environments(
     config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False
 ) -> VecEnv:
@@ -61,11 +64,24 @@ def make_environments(
     :raises ConfigError: keywords that the environment does not take.
     :raises TrainingError: a worker process that ended.
     """
+    env: Any
     try:
         if config.vec_env == "batch":
-            env = _make_batch(config, n_envs, seed, staggered)
+            if config.env_wrapper:
+                raise ConfigError(
+                    "env_wrapper: the batched environment has no single environments to wrap; "
+                    "use vec_env dummy"
+                )
+            keywords = {"task": config.task, **config.env_kwargs}
+            env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **keywords)
         else:
-            env = _make_single(config, n_envs, seed, staggered)
+            # A worker process could not say that PyBullet is missing.
+            if config.task:
+                importlib.import_module("sb3_quad.base.bullet")
+            phases = n_envs if staggered else 1
+            makers: list[Any] = [partial(_make_row, config, row, phases) for row in range(n_envs)]
+            env = SINGLE[config.vec_env](makers)
+            env.seed(seed)
     except SB3QuadError:
         raise
     except (EOFError, ConnectionError):
@@ -76,32 +92,7 @@ def make_environments(
         ) from error
     for path, kwargs in config.vec_env_wrapper:
         env = instance(path, "vec_env_wrapper", env, **kwargs)
-    return env
-
-
-def _make_batch(config: TrainingConfig, n_envs: int, seed: int, staggered: bool) -> VecEnv:
-    if config.env_wrapper:
-        raise ConfigError(
-            "env_wrapper: the batched environment has no single environments to wrap; "
-            "use vec_env dummy"
-        )
-    keywords = {"task": config.task, **config.env_kwargs}
-    return QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **keywords)
-
-
-def _make_single(config: TrainingConfig, n_envs: int, seed: int, staggered: bool) -> VecEnv:
-    # A worker process could not say that PyBullet is missing.
-    if config.task is not None:
-        importlib.import_module("sb3_quad.base.bullet")
-    phases = 1
-    if staggered:
-        phases = n_envs
-    makers: list[Callable[[], Env]] = [
-        partial(_make_row, config, row, phases) for row in range(n_envs)
-    ]
-    env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
-    env.seed(seed)
-    return env
+    return env  # type: ignore[no-any-return]
 
 
 def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
@@ -115,10 +106,9 @@ def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
         ignore_interrupts()
     # One environment flies one vehicle, where the batched one takes a list.
     keywords = dict(config.env_kwargs)
-    for name in ("vehicle", "max_episode_steps"):
-        values = keywords.get(name)
-        if isinstance(values, (list, tuple)) and values:
-            keywords[name] = values[row % len(values)]
+    for name in keywords.keys() & {"vehicle", "max_episode_steps"}:
+        values = as_list(keywords[name]) or [None]
+        keywords[name] = values[row % len(values)]
     env: Env = gymnasium.make(config.env_id, **keywords)
     limit = env.spec and env.spec.max_episode_steps
     # The rows would otherwise end all their episodes in the same step.

@@ -4,7 +4,6 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
+from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
@@ -44,7 +44,7 @@ from sb3_quad.training.config import (
     with_vehicle_path,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import Report, resume, train, trained_seconds
+from sb3_quad.training.trainer import resume, train, trained_seconds
 
 STATUS_FILE = "pipeline.yml"
 # The keys that go with each kind of offset correction.
@@ -61,22 +61,16 @@ class Requirement(Frozen):
 class OffsetCorrection(Frozen):
     """How the agent of a stage is corrected after its training."""
 
-    kind: Literal["position", "hover", "arrival"] = Field(
-        description="see algorithms/offset_correction.py, and training/arrival_correction.py"
-    )
-    scale: PositiveFloat = Field(
-        default=1.0, description="position: α, which becomes a part of the agent"
-    )
-    rounds: PositiveInt = Field(
-        default=1, description="arrival: number of searches, each from the result of the one before"
-    )
-    overshoot_cost: NonNegativeFloat = Field(
-        default=OVERSHOOT_COST,
-        description="arrival: penalty in seconds for leaving a target after reaching it",
-    )
-    env_kwargs: dict[str, Any] = Field(
-        default={}, description="arrival: changes to env_kwargs of the flights that are optimised"
-    )
+    kind: Literal["position", "hover", "arrival"]
+    """see algorithms/offset_correction.py, and training/arrival_correction.py"""
+    scale: PositiveFloat = 1.0
+    """position: α, which becomes a part of the agent"""
+    rounds: PositiveInt = 1
+    """arrival: number of searches, each from the result of the one before"""
+    overshoot_cost: NonNegativeFloat = OVERSHOOT_COST
+    """arrival: penalty in seconds for leaving a target after reaching it"""
+    env_kwargs: StrDict = {}
+    """arrival: changes to env_kwargs of the flights that are optimised"""
 
     @model_validator(mode="after")
     def _keys_of_kind(self) -> "OffsetCorrection":
@@ -89,36 +83,31 @@ class OffsetCorrection(Frozen):
 class Stage(Frozen):
     """One stage of a pipeline."""
 
-    name: str = Field(min_length=1, description="what the stage is called in tables")
-    algo: str = Field(description="as for a single run")
-    env: str = Field(description="as for a single run")
-    conf_file: str | None = Field(
-        default=None, description="settings file; <algo>.yml of the package without it"
-    )
-    settings: dict[str, Any] = Field(
-        default={}, description="changes to these settings, such as n_timesteps: 5_000_000"
-    )
-    seed_offset: NonNegativeInt = Field(
-        default=0,
-        description="added to the seed, so that stages on the same task fly different episodes",
-    )
-    pass_on: Literal["best", "last"] = Field(
-        default="best", description="the best evaluation, as best_by of its settings says"
-    )
+    name: str = Field(min_length=1)
+    """what the stage is called in tables"""
+    algo: str
+    """as for a single run"""
+    env: str
+    """as for a single run"""
+    conf_file: str | None = None
+    """settings file; <algo>.yml of the package without it"""
+    settings: StrDict = {}
+    """changes to these settings, such as n_timesteps: 5_000_000"""
+    seed_offset: NonNegativeInt = 0
+    """added to the seed, so that stages on the same task fly different episodes"""
+    pass_on: Literal["best", "last"] = "best"
+    """the best evaluation, as best_by of its settings says"""
     correct_offset: Annotated[
         OffsetCorrection | None,
         BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value),
-    ] = Field(
-        default=None,
-        description="offset correction after the stage: {kind: arrival, rounds: 2}, or its kind",
-    )
-    require: Requirement = Field(
-        default=Requirement(), description="the pipeline stops where this is missed"
-    )
-    eval_freq: int | None = Field(
-        default=None, description="timesteps between evaluations of this stage"
-    )
-    eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
+    ] = None
+    """offset correction after the stage: {kind: arrival, rounds: 2}, or its kind"""
+    require: Requirement = Requirement()
+    """the pipeline stops where this is missed"""
+    eval_freq: int | None = None
+    """timesteps between evaluations of this stage"""
+    eval_episodes: PositiveInt | None = None
+    """episodes in each"""
 
 
 class Pipeline(Frozen):
@@ -138,8 +127,10 @@ class Pipeline(Frozen):
 class Status(Pipeline):
     """The content of ``pipeline.yml`` in a pipeline's folder."""
 
-    job: dict[str, Any] = Field(description="options of every job")
-    runs: tuple[str, ...] = Field(description="the run folders of the stages that have begun")
+    job: StrDict
+    """options of every job"""
+    runs: tuple[str, ...]
+    """the run folders of the stages that have begun"""
 
 
 class StageResult(NamedTuple):
@@ -171,7 +162,7 @@ class PipelineResult:
     exit_code: int = 0
 
 
-def is_pipeline(conf_file: str | Path) -> bool:
+def is_pipeline(conf_file: StrPath) -> bool:
     """Whether a settings file holds stages rather than the settings of one run."""
     return "stages" in SETTINGS.read(conf_file)[0]
 
@@ -181,7 +172,7 @@ def is_pipeline_run(folder: Path) -> bool:
     return (folder / STATUS_FILE).is_file()
 
 
-def load_pipeline(conf_file: str | Path) -> Pipeline:
+def load_pipeline(conf_file: StrPath) -> Pipeline:
     """Load the pipeline in a file, by path or by the name of one in the package.
 
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
@@ -189,7 +180,7 @@ def load_pipeline(conf_file: str | Path) -> Pipeline:
     return validate(Pipeline, *SETTINGS.read(conf_file))
 
 
-def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
+def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
     """Return the pipeline with ``changes`` put over the settings of every stage.
 
     ``env_kwargs`` are merged key by key.
@@ -207,7 +198,7 @@ def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
 
 
 def run_pipeline(
-    pipeline: Pipeline, job: Mapping[str, Any], name: str, report: Report = print
+    pipeline: Pipeline, job: StrMapping, name: str, report: Report = print
 ) -> PipelineResult:
     """Train the stages one after the other, each from the agent that the one before passed on.
 
@@ -239,7 +230,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     return _train_stages(folder, status, stage_jobs(status, status.job), report, **changes)
 
 
-def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
+def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     """Return the checked job of each stage.
 
     :raises ConfigError: settings of a stage, or options of its job, that do not fit.
@@ -261,9 +252,9 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
 
 def _check_correction(correction: OffsetCorrection | None, config: TrainingConfig) -> None:
     """Check that an agent with these settings can be corrected."""
-    if correction is None:
+    if not correction:
         return
-    if config.task is None:
+    if not config.task:
         raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
     if correction.kind == "arrival":
         config.flight_settings.with_changes(**correction.env_kwargs)
@@ -282,14 +273,13 @@ def _train_stages(
     **changes: Any,
 ) -> PipelineResult:
     """Train the stages that are not complete."""
-    runs = [*status.runs]
+    # The stages are written, too, since the settings file may change before a resume.
+    content = status.model_dump(mode="json", exclude_defaults=True)
+    runs = content["runs"]
     results: dict[str, StageResult] = {}
-    agent: str | None = None
+    agent = ""
 
     def write() -> None:
-        # The stages are written, too, since the settings file may change before a resume.
-        current = status.model_copy(update={"runs": tuple(runs)})
-        content = current.model_dump(mode="json", exclude_defaults=True)
         write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
 
     def note(number: int, run: RunFolder) -> None:
@@ -301,37 +291,36 @@ def _train_stages(
         try:
             write()
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
-                if agent is not None:
-                    job = job.model_copy(update={"trained_agent": agent})
                 run = open_run(runs[number]) if number < len(runs) else None
-                if run is not None and run.timesteps >= job.config.n_timesteps:
+                if run and run.timesteps >= job.config.n_timesteps:
                     seconds = trained_seconds(run)
                 else:
+                    if agent:
+                        job = job.model_copy(update={"trained_agent": agent})
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
                     # A run that has a model and no snapshot cannot be resumed.
-                    if run is not None and (run.not_begun or run.resume_state.is_file()):
+                    if run and (run.not_begun or run.resume_state.is_file()):
                         trained = resume(runs[number], report, **changes)
                     else:
                         trained = train(job, report, on_start=partial(note, number))
-                    if trained.exit_code:
-                        break
                     run = trained.run
                     seconds = trained.seconds
-                if signals.received is not None:
+                # The signal that ended a training is noted here, too.
+                if signals.received:
                     break
                 agent = str(_agent(stage, job, run, report))
                 results[stage.name] = StageResult(str(run.path), agent, run.timesteps, seconds)
         except KeyboardInterrupt:
-            if signals.received is None:
+            if not signals.received:
                 raise
-    if signals.received is not None:
+    if signals.received:
         report(f"to resume the whole pipeline: --resume {folder}")
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
     """Return the zip that a stage passes on, after the offset correction where it has one."""
-    if stage.correct_offset is None:
+    if not stage.correct_offset:
         return _passed_on(stage, job, run)
     if not run.corrected_model.is_file():
         _correct(stage.correct_offset, job, run, _passed_on(stage, job, run), report)
@@ -345,18 +334,18 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
     """
     if run.evaluations.is_file():
         curve = read_curve(run.path)
-        rate = np.nan_to_num(curve.values(job.config.best_by))
-        success = np.nan_to_num(curve.values("success"))
-        # Ordered as BestModel orders models: by the rate, then by the reward.
-        scores = list(zip(rate, curve.reward, success, strict=True))
+        index = -1
         if stage.pass_on == "best":
-            scores.sort()
-        _, reward, success_rate = scores[-1]
+            # Ordered as BestModel orders models: by the rate, then by the reward.
+            rate = np.nan_to_num(curve.values(job.config.best_by))
+            index = np.lexsort((curve.reward, rate))[-1]
+        success = np.nan_to_num(curve.values("success"))[index]
+        reward = curve.reward[index]
         required = stage.require
         misses_reward = required.mean_reward is not None and reward < required.mean_reward
-        if success_rate < required.success_rate or misses_reward:
+        if success < required.success_rate or misses_reward:
             raise TrainingError(
-                f"stage {stage.name!r}: success {success_rate:.3f} and mean reward {reward:.2f} "
+                f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} "
                 f"miss what it requires ({required}); its run is {run.path}"
             )
     if stage.pass_on == "best" and run.best_model.is_file():

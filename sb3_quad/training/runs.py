@@ -5,7 +5,6 @@ import subprocess
 import sys
 import uuid
 from pathlib import Path
-from typing import Any
 
 import stable_baselines3
 import torch
@@ -14,6 +13,7 @@ import yaml
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import make_folder, write_text
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.controllers.zips import saved_data
@@ -89,20 +89,21 @@ class RunFolder:
             )
         return self.checkpoint(max(steps))
 
-    def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
+    def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
 
         args.yml comes last, so that a run that has it lacks nothing.
         """
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
+        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
         # A program of the user's may train, too.
-        program = Path(sys.argv[0]).name
-        start = ["sb3-quad"] if program in ("sb3-quad", "__main__.py") else ["python", program]
-        write_text(self.command, shlex.join([*start, *sys.argv[1:]]) + "\n")
+        if not command.startswith("sb3-quad"):
+            command = f"python {command}".replace("python __main__.py", "sb3-quad")
+        write_text(self.command, f"{command}\n")
         write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
 
-    def read_yaml(self) -> tuple[dict[str, Any], dict[str, Any]]:
+    def read_yaml(self) -> tuple[StrDict, StrDict]:
         """Read config.yml and args.yml, also those of rl_zoo3.
 
         :raises ConfigError: either is missing, unreadable or not a mapping.
@@ -115,18 +116,17 @@ def made_with() -> dict[str, str]:
 
     The commit has a mark where files differ from it.
     """
-    checkout = Path(__file__).resolve().parents[2]
-    describe = ["describe", "--always", "--abbrev=40", "--exclude=*"]
-    command = ["git", "-C", str(checkout), *describe, "--dirty= and changes"]
+    command = shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'")
+    here = Path(__file__).parent
     try:
-        commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        commit = subprocess.check_output(command, cwd=here, text=True, stderr=subprocess.DEVNULL)
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"
     versions = (
         f"sb3_quad {__version__}, stable-baselines3 {stable_baselines3.__version__}, "
         f"torch {torch.__version__}"
     )
-    return {"commit": commit, "versions": versions}
+    return {"commit": commit.strip(), "versions": versions}
 
 
 def file_name(env_id: str) -> str:
@@ -134,7 +134,7 @@ def file_name(env_id: str) -> str:
     return env_id.replace("/", "-").replace(":", "-")
 
 
-def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> RunFolder:
+def claim_run(log_folder: StrPath, algo: str, env_id: str, unique: bool = False) -> RunFolder:
     """Make the folder of a new run, with the next free number.
 
     No other process can get the same one.
@@ -177,7 +177,7 @@ def _numbered(parent: Path, name: str) -> dict[int, Path]:
     return folders
 
 
-def open_run(path: str | Path) -> RunFolder:
+def open_run(path: StrPath) -> RunFolder:
     """Open the folder of an existing run.
 
     :raises ConfigError: a folder that holds no run.
@@ -191,7 +191,7 @@ def open_run(path: str | Path) -> RunFolder:
     return RunFolder(folder, configs[0].parent.name)
 
 
-def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
+def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
     """Find a run by rl-zoo's ``--exp-id``.
 
     :param exp_id: number of the run; 0: the latest that has an agent.
@@ -204,14 +204,13 @@ def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) ->
         raise ConfigError(
             f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f"
         )
-    number = exp_id
-    if number <= 0:
+    if exp_id <= 0:
         with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
-        number = max(with_agent or folders)
-    if number not in folders:
+        exp_id = max(with_agent or folders)
+    if exp_id not in folders:
         existing = ", ".join(folder.name for folder in folders.values())
         raise ConfigError(
-            f"{parent}: there is no run {name}_{number}; there is {existing}; "
+            f"{parent}: there is no run {name}_{exp_id}; there is {existing}; "
             "give another with --exp-id"
         )
-    return RunFolder(folders[number], name)
+    return RunFolder(folders[exp_id], name)

@@ -5,9 +5,8 @@ import json
 import os
 import random
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -22,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import model_bytes, one_line, read_arrays, write_arrays, write_bytes
+from sb3_quad.base.types import Report, StrDict
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
@@ -59,21 +59,17 @@ class SnapshotFile(BaseCallback):
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
     :param report: called with one line if a snapshot cannot be written; the training continues.
-    :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
     :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from
         before that update.
     """
 
     snapshot: Snapshot | None = None
 
-    def __init__(
-        self, run: RunFolder, every: float, report: Callable[[str], None], hurry: Callable[[], bool]
-    ) -> None:
+    def __init__(self, run: RunFolder, every: float, report: Report) -> None:
         super().__init__()
         self._run = run
         self._every = every
         self._report = report
-        self._hurry = hurry
         self._state: Arrays = {}
         self._next_taken = -np.inf  # s
         self._next_write = -np.inf  # s
@@ -84,23 +80,30 @@ class SnapshotFile(BaseCallback):
 
         No buffer holds more than the snapshot then.
         """
-        if self.snapshot is None or not isinstance(self.model, OffPolicyAlgorithm):
+        if not self.snapshot or not isinstance(self.model, OffPolicyAlgorithm):
             return True
         return self.snapshot.timesteps == self.num_timesteps - self.training_env.num_envs
 
     def _on_training_start(self) -> None:
         path = self._run.resume_state
         # The log of a resumed run is to say what it would have said without the interruption.
-        if path.is_file():
-            set_log(self.logger, read_arrays(path, "log").get("log"), path)
+        if not path.is_file():
+            return
+        try:
+            records = LOG.validate_json(str(read_arrays(path, "log").get("log")))
+        except ValueError as error:
+            raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
+        for name, (value, count, excluded) in records.items():
+            self.logger.name_to_value[name] = value
+            self.logger.name_to_count[name] = count
+            self.logger.name_to_excluded[name] = excluded
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
         start = time.monotonic()
-        is_off_policy = isinstance(self.model, OffPolicyAlgorithm)
-        if is_off_policy and start < self._next_taken and not self._hurry():
+        if isinstance(self.model, OffPolicyAlgorithm) and start < self._next_taken:
             return
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
@@ -110,7 +113,15 @@ class SnapshotFile(BaseCallback):
                 )
         self._next_taken = start + PAUSE
         self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model))
-        self._state = self._around_model()
+        # The stores' rows are read when the snapshot is written. A rollout later they hold more,
+        # and the oldest of a full store are replaced; the resumed training adds the same rows again
+        # before it reads any.
+        self._state = _surroundings(self.training_env, self.model)
+        self._state["log"] = log_state(self.logger)
+        if self._run.episodes.is_file():
+            self._state["episodes"] = np.array(self._run.episodes.stat().st_size)
+        if self._run.best_model.is_file():
+            self._state["best_model"] = np.fromfile(self._run.best_model, np.uint8)
         start = time.monotonic()
         if self._every > 0 and start >= self._next_write:
             try:
@@ -120,34 +131,13 @@ class SnapshotFile(BaseCallback):
             took = time.monotonic() - start
             self._next_write = start + max(self._every, took / SHARE)
 
-    def _around_model(self) -> Arrays:
-        """Return random numbers, environments, lengths of files, and fill counters of the stores.
-
-        The stores' rows are read when the snapshot is written. A rollout later they hold more, and
-        the oldest of a full store are replaced; the resumed training adds the same rows again
-        before it reads any.
-        """
-        state = {
-            **random_state(),
-            **_environment_state(self.training_env),
-            **_counters(self.model),
-            "log": log_state(self.logger),
-            "episodes": np.array(0),
-            "best_model": NO_BYTES,
-        }
-        if self._run.episodes.is_file():
-            state["episodes"] = np.array(self._run.episodes.stat().st_size)
-        if self._run.best_model.is_file():
-            state["best_model"] = np.fromfile(self._run.best_model, np.uint8)
-        return state
-
     def write(self) -> None:
         """Write the latest snapshot; until that is whole, the file holds the one before.
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
         assert self.snapshot is not None
-        arrays: dict[str, Any] = {
+        arrays: StrDict = {
             "timesteps": np.array(self.snapshot.timesteps),
             "model": np.frombuffer(self.snapshot.model, np.uint8),
             **self._state,
@@ -175,75 +165,95 @@ def load_snapshot(
             message += f"; to train its model further use -i {run.result}"
         raise ConfigError(message)
     state = read_arrays(path)
+    try:
+        model: BaseAlgorithm = _restore(state, algo, env, device, attributes)
+    except ConfigError as error:
+        raise _misfit(path, error) from None
+    _roll_back(run, state)
+    # What was loaded since then may have sampled.
+    set_random_state(state)
+    return model
+
+
+def _restore(state: Arrays, algo: str, env: VecEnv, device: str, attributes: StrDict) -> Any:
+    """Return the model of a snapshot, with its stores, environments and random numbers."""
     batch = _batch(env)
     # The model comes first: what else is expected depends on it.
-    _check(state, {"model": NO_BYTES}, path)
+    _check(state, {"model": NO_BYTES})
     model: Any = load_zip(
         get_algorithm(algo),
         io.BytesIO(state["model"].tobytes()),
-        where=f"{path}: model",
+        where="model",
         env=env,
         device=device,
         force_reset=batch is None,
         **attributes,
     )
-    expected = {
-        "timesteps": np.array(0),
-        "episodes": np.array(0),
-        "best_model": NO_BYTES,
-        "log": np.array(""),
-        **random_state(),
-        **_environment_state(env),
-        **_counters(model),
-    }
-    _check(state, expected, path)
-    _require(int(state["episodes"]) >= 0, "episodes is negative", path)
-    _require(model.num_timesteps == state["timesteps"], "timesteps is not that of model", path)
+    _check(state, {"timesteps": np.array(0), **_surroundings(env, model)})
+    _require(int(state["episodes"]) >= 0, "episodes is negative")
+    _require(model.num_timesteps == state["timesteps"], "timesteps is not that of model")
     try:
         set_random_state(state)
     except Exception as error:  # a damaged state may raise anything
         problem = f"random and torch are not states of random numbers ({one_line(error)})"
-        _require(False, problem, path)
+        raise ConfigError(problem) from None
     for name, store in _stores(model).items():
-        _fill(name, store, state, path)
+        _fill(name, store, state)
     environment = {
         name.removeprefix(ENVIRONMENT): array
         for name, array in state.items()
         if name.startswith(ENVIRONMENT)
     }
     if batch is not None:
-        try:
-            batch.restore(environment)
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {error}") from None
+        batch.restore(environment)
     else:
-        problem = f"{ENVIRONMENT}… is of environments of another kind"
-        _require(not environment, problem, path)
-    _roll_back(run, state)
-    # What was loaded since then may have sampled.
-    set_random_state(state)
-    return cast(BaseAlgorithm, model)
+        _require(not environment, f"{ENVIRONMENT}… is of environments of another kind")
+    return model
 
 
-def _check(state: Arrays, expected: Arrays, path: Path) -> None:
+def _surroundings(env: VecEnv, model: Any) -> Arrays:
+    """Return random numbers, environments and fill counters of the stores, and places for the log
+    and the files.
+    """
+    state = {
+        **random_state(),
+        "log": np.array(""),
+        "episodes": np.array(0),
+        "best_model": NO_BYTES,
+    }
+    batch = _batch(env)
+    if batch is not None:
+        for name, array in batch.snapshot().items():
+            state[f"{ENVIRONMENT}{name}"] = array
+    for name, store in _stores(model).items():
+        for counter in COUNTERS[name]:
+            state[f"{name}.{counter}"] = np.array(getattr(store, counter))
+    return state
+
+
+def _check(state: Arrays, expected: Arrays) -> None:
     """Check that a snapshot has arrays of the names, types and shapes of the expected ones."""
     for name, like in expected.items():
-        _require(name in state, f"{name} is missing", path)
+        _require(name in state, f"{name} is missing")
         array = state[name]
         if name in ANY_LENGTH:
             fits = array.dtype.kind == like.dtype.kind and array.ndim == like.ndim
         else:
             fits = array.dtype == like.dtype and array.shape == like.shape
-        problem = f"{name} is {array.dtype} {array.shape}, must be {like.dtype} {like.shape}"
-        _require(fits, problem, path)
+        kinds = f"{array.dtype} {array.shape}, must be {like.dtype} {like.shape}"
+        _require(fits, f"{name} is {kinds}")
 
 
-def _require(fits: bool, problem: str, path: Path) -> None:
+def _require(fits: bool, problem: str) -> None:
     if not fits:
-        raise ConfigError(
-            f"{path}: {problem}; it is damaged, or of other settings; "
-            "-i trains an agent of the run further"
-        )
+        raise ConfigError(problem)
+
+
+def _misfit(path: Path, problem: object) -> ConfigError:
+    return ConfigError(
+        f"{path}: {problem}; it is damaged, or of other settings; "
+        "-i trains an agent of the run further"
+    )
 
 
 def _batch(env: VecEnv) -> Any:
@@ -251,26 +261,10 @@ def _batch(env: VecEnv) -> Any:
     return getattr(env.unwrapped, "batch", None)
 
 
-def _environment_state(env: VecEnv) -> Arrays:
-    batch = _batch(env)
-    if batch is None:
-        return {}
-    return {f"{ENVIRONMENT}{name}": array for name, array in batch.snapshot().items()}
-
-
-def _stores(model: Any) -> dict[str, Any]:
+def _stores(model: Any) -> StrDict:
     """Return what a model keeps beyond a rollout, by name."""
     stores = {name: getattr(model, name, None) for name in COUNTERS}
     return {name: store for name, store in stores.items() if store is not None}
-
-
-def _counters(model: Any) -> Arrays:
-    """Return the fill counters of a model's stores."""
-    counters = {}
-    for name, store in _stores(model).items():
-        for counter in COUNTERS[name]:
-            counters[f"{name}.{counter}"] = np.array(getattr(store, counter))
-    return counters
 
 
 def _filled(name: str, store: Any) -> Arrays:
@@ -282,25 +276,24 @@ def _filled(name: str, store: Any) -> Arrays:
     else:
         # The memory-efficient variant keeps the last next observation one row further on.
         rows = store.size() + 1
-        buffers = {
-            key: array for key, array in vars(store).items() if isinstance(array, np.ndarray)
+        arrays = {
+            key: array[:rows] for key, array in vars(store).items() if isinstance(array, np.ndarray)
         }
-        arrays = {key: array[:rows] for key, array in buffers.items()}
     return {f"{name}.{key}": array for key, array in arrays.items()}
 
 
-def _fill(name: str, store: Any, state: Arrays, path: Path) -> None:
+def _fill(name: str, store: Any, state: Arrays) -> None:
     """Put a snapshot's rows into a store."""
     for counter in COUNTERS[name]:
         value = state[f"{name}.{counter}"].item()
         fits = 0 <= value < getattr(store, "buffer_size", np.inf)
-        _require(fits, f"{name}.{counter} is beyond its rows", path)
+        _require(fits, f"{name}.{counter} is beyond its rows")
         setattr(store, counter, value)
     for key, rows in _filled(name, store).items():
         # What was written later than the counters may hold more rows.
         if key in state and state[key].ndim:
             state[key] = state[key][: len(rows)]
-        _check(state, {key: rows}, path)
+        _check(state, {key: rows})
         rows[...] = state[key]
 
 
@@ -310,7 +303,8 @@ def _roll_back(run: RunFolder, state: Arrays) -> None:
     for path, rows in evaluations.items():
         lengths = {array.shape[:1] for array in rows.values()}
         is_table = "timesteps" in rows and len(lengths) == 1
-        _require(is_table and rows["timesteps"].dtype.kind == "i", "holds no evaluations", path)
+        if not is_table or rows["timesteps"].dtype.kind != "i":
+            raise _misfit(path, "holds no evaluations")
     # Only when all files are known to be good is any of them changed.
     for path, rows in evaluations.items():
         is_earlier = rows["timesteps"] <= state["timesteps"]
@@ -337,21 +331,6 @@ def log_state(logger: Logger) -> Any:
             count = logger.name_to_count[name]
             records[name] = (float(value), count, logger.name_to_excluded[name])
     return np.array(json.dumps(records))
-
-
-def set_log(logger: Logger, state: Any, path: Path) -> None:
-    """Record again what :func:`log_state` returned.
-
-    :raises ConfigError: something else, which the file at ``path`` holds.
-    """
-    try:
-        records = LOG.validate_python(json.loads(str(state)))
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
-    for name, (value, count, excluded) in records.items():
-        logger.name_to_value[name] = value
-        logger.name_to_count[name] = count
-        logger.name_to_excluded[name] = excluded
 
 
 def random_state() -> Arrays:

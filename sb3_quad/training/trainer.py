@@ -15,9 +15,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.logger import HParam
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -27,27 +29,25 @@ from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.types import Report, StrDict
 from sb3_quad.base.validate import validate
-from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.episodes import EpisodeLog
-from sb3_quad.callbacks.every import Checkpoint, ProgressLine
+from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
+from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import get_algorithm, takes_expert
-from sb3_quad.training.classes import instance
+from sb3_quad.training.algorithms import get_algorithm, instance, takes_expert
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
-from sb3_quad.training.tracking import HyperparameterLog, tracked
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 NEVER = 2**62  # timesteps
+# TensorBoard shows these next to the settings, under HPARAMS.
+METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")
 OWN_TASK = ""  # the name of the evaluations on the task of the training
-Report = Callable[[str], None]
-ShouldContinue = Callable[[float, float], bool]
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,15 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         damaged files; else as :func:`train`.
     """
     run = open_run(run_folder)
-    job = _read_job(run, changes)
-    config = job.config
+    settings, options = run.read_yaml()
+    if not {"algo", "env"} <= options.keys():
+        raise ConfigError(f"{run.arguments}: algo or env is missing")
+    config = build_config(str(options["algo"]), str(options["env"]), settings, str(run.config))
+    # These are in args.yml for its readers; they are not options.
+    for name in ("algo", "env", "env_kwargs", *MADE_WITH):
+        options.pop(name, None)
+    options |= {**changes, "config": config}
+    job = validate(TrainingJob, options, str(run.arguments))
     with (
         StopSignals() as signals,
         locked(run.path, "run folder"),
@@ -133,18 +140,6 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
             return training.run_to_end(_user_callbacks(config))
 
 
-def _read_job(run: RunFolder, changes: dict[str, Any]) -> TrainingJob:
-    """Return the job of a run folder, with ``changes`` to its options."""
-    settings, options = run.read_yaml()
-    if not {"algo", "env"} <= options.keys():
-        raise ConfigError(f"{run.arguments}: algo or env is missing")
-    config = build_config(str(options["algo"]), str(options["env"]), settings, str(run.config))
-    # These are in args.yml for its readers; they are not options.
-    for name in ("algo", "env", "env_kwargs", *MADE_WITH):
-        options.pop(name, None)
-    return validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
-
-
 @contextmanager
 def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]]:
     """Make the environments to train in and those to evaluate in, and close them in the end.
@@ -159,22 +154,20 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
         env = make_environments(config, config.n_envs, seed, staggered=True)
         stack.enter_context(closing(env))
         if job.eval_episodes > 0:
-            configs = {OWN_TASK: job.for_evaluation()}
-            for task in config.eval_tasks:
-                configs[task] = job.for_evaluation(task=task)
-            n_envs = job.n_eval_envs or 1
             # The batched environment flies all episodes of an evaluation at once.
-            if config.vec_env == "batch" and job.n_eval_envs is None:
-                n_envs = job.eval_episodes
+            n_envs = job.n_eval_envs
+            if n_envs is None:
+                n_envs = job.eval_episodes if config.vec_env == "batch" else 1
             n_envs = min(n_envs, job.eval_episodes)
             seed = seed_for("evaluation", job.seed)
-            for task, eval_config in configs.items():
-                eval_envs[task] = make_environments(eval_config, n_envs, seed)
-                stack.enter_context(closing(eval_envs[task]))
+            for task in (OWN_TASK, *config.eval_tasks):
+                eval_config = job.for_evaluation(**({"task": task} if task else {}))
+                eval_env = make_environments(eval_config, n_envs, seed)
+                eval_envs[task] = stack.enter_context(closing(eval_env))
         yield env, eval_envs
 
 
-def _expert(config: TrainingConfig) -> dict[str, Any]:
+def _expert(config: TrainingConfig) -> StrDict:
     """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
     if not takes_expert(get_algorithm(config.algo)):
         return {}
@@ -196,7 +189,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     """
     config = job.config
     keywords = copy.deepcopy(config.hyperparams) | _expert(config)
-    if config.noise_type is not None:
+    if config.noise_type:
         zeros = np.zeros(env.action_space.shape or ())
         keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
@@ -214,14 +207,14 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     if isinstance(rate, LinearSchedule):
         n_updates = -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
         rate.end = rate.start / n_updates
-    if job.trained_agent is not None:
+    if job.trained_agent:
         transfer_policy(job.trained_agent, model)
     # SB3 has seeded the environments with the seed of the policy.
     env.seed(seed_for("training", job.seed))
     return model
 
 
-def _construct(config: TrainingConfig, env: VecEnv, keywords: dict[str, Any]) -> BaseAlgorithm:
+def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAlgorithm:
     """Call the algorithm's constructor; errors that do not concern its arguments stay as they are.
 
     :raises ConfigError: arguments that it does not take or refuses, or too little memory.
@@ -266,36 +259,30 @@ class _Training:
     should_continue: ShouldContinue = lambda success, reward: True
 
     def __post_init__(self) -> None:
-        self.snapshots = SnapshotFile(
-            self.run,
-            self.job.snapshot_every,
-            self.report,
-            lambda: self.signals.received is not None,
-        )
+        self.snapshots = SnapshotFile(self.run, self.job.snapshot_every, self.report)
         self.best: BestModel | None = None
-        if self.eval_envs:
-            self.best = self._best_model()
-
-    def _best_model(self) -> BestModel:
-        job = self.job
-        return BestModel(
-            self.eval_envs[OWN_TASK],
-            every=job.eval_freq if job.eval_freq > 0 else NEVER,
-            n_episodes=job.eval_episodes,
-            seed=seed_for("evaluation", job.seed),
-            best_model=self.run.best_model,
-            evaluations=self.run.evaluations,
-            report=self.report,
-            others={task: self.eval_envs[task] for task in job.config.eval_tasks},
-            should_continue=self.should_continue,
-            by=job.config.best_by,
-        )
+        others = dict(self.eval_envs)
+        own = others.pop(OWN_TASK, None)
+        if own is not None:
+            job = self.job
+            self.best = BestModel(
+                own,
+                job.eval_freq if job.eval_freq > 0 else NEVER,
+                job.eval_episodes,
+                seed_for("evaluation", job.seed),
+                self.run.best_model,
+                self.run.evaluations,
+                self.report,
+                others,
+                self.should_continue,
+                job.config.best_by,
+            )
 
     def run_to_end(self, user_callbacks: list[BaseCallback]) -> TrainingResult:
         """Train until the job is done, or a signal or an error ends it, and save the model."""
         config = self.job.config
         # A zip says how its agent flies, but a flight cannot have the user's wrappers.
-        if config.task is not None and not (config.env_wrapper or config.vec_env_wrapper):
+        if config.task and not (config.env_wrapper or config.vec_env_wrapper):
             self.job.flight_settings.write_into(self.model)
         self.run.error.unlink(missing_ok=True)
         start = time.perf_counter()
@@ -306,11 +293,11 @@ class _Training:
                 # From here on, no signal interrupts what is saved.
                 self.signals.hold()
         except (Exception, KeyboardInterrupt) as error:
-            if self.signals.received is None:
+            if not self.signals.received:
                 self._save_after(error)
                 raise
         seconds = time.perf_counter() - start
-        if self.signals.received is not None:
+        if self.signals.received:
             return self._interrupted(seconds)
         save_model(self.model, self.run.model)
         self.run.resume_state.unlink(missing_ok=True)
@@ -324,21 +311,18 @@ class _Training:
             EpisodeLog(self.run.episodes, self.job.config.env_id),
             HyperparameterLog(self.job),
         ]
-        if self.best is not None:
+        if self.best:
             callbacks.append(self.best)
         if self.job.save_freq > 0:
             path = str(self.run.checkpoint("{steps}"))
             callbacks.append(Checkpoint(self.job.save_freq, path))
-        callbacks += user_callbacks
-        if self.job.progress:
-            callbacks.append(ProgressBarCallback())
-        else:
-            callbacks.append(ProgressLine(self.report))
-        # A signal ends the training where the snapshot can still be completed.
-        callbacks.append(
-            ConvertCallback(lambda *_: self.signals.received is None or not self.snapshots.is_fresh)
-        )
-        return callbacks
+        return [
+            *callbacks,
+            *user_callbacks,
+            ProgressBarCallback() if self.job.progress else ProgressLine(self.report),
+            # A signal ends the training where the snapshot can still be completed.
+            ConvertCallback(lambda *_: not (self.signals.received and self.snapshots.is_fresh)),
+        ]
 
     def _learn(self, callbacks: list[BaseCallback]) -> None:
         config = self.job.config
@@ -354,7 +338,7 @@ class _Training:
             reset_num_timesteps=self.model.num_timesteps == 0,
         )
         best = self.best
-        if best is None or best.stopped or self.signals.received is not None:
+        if best is None or best.stopped or self.signals.received:
             return
         # A user's callback may have ended the training early.
         if best.latest < self.model.num_timesteps:
@@ -364,7 +348,7 @@ class _Training:
         """Save the model and the snapshot after a signal."""
         snapshot = self.snapshots.snapshot
         when = "before the first rollout"
-        if snapshot is not None:
+        if snapshot:
             when = f"after {snapshot.timesteps:,} timesteps: model saved to {self.run.model}"
             # The model comes first, since it needs the least room.
             write_bytes(self.run.model, snapshot.model)
@@ -399,7 +383,7 @@ class _Training:
         """
         where = ""
         snapshot = self.snapshots.snapshot
-        if snapshot is not None:
+        if snapshot:
             write_bytes(self.run.model, snapshot.model)
             where = f"; the model after {snapshot.timesteps:,} timesteps is in {self.run.model}"
         # An error of this package says what is wrong; the place in the code adds nothing.
@@ -420,4 +404,58 @@ class _Training:
 
 def trained_seconds(run: RunFolder) -> float:
     """Return the wall-clock time that a complete run took, as its evaluations say, or 0."""
-    return float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
+    if not run.evaluations.is_file():
+        return 0.0
+    return float(read_curve(run.path).seconds[-1])
+
+
+class HyperparameterLog(BaseCallback):
+    """Logs a job's settings when its training begins; only TensorBoard shows them."""
+
+    def __init__(self, job: TrainingJob) -> None:
+        super().__init__()
+        config = job.config
+        shown = {"algo": config.algo, "env": config.env_id, "seed": job.seed, **config.settings}
+        # TensorBoard takes plain values alone.
+        self._shown = {
+            name: value if isinstance(value, (bool, int, float)) else str(value)
+            for name, value in shown.items()
+        }
+
+    def _on_training_start(self) -> None:
+        parameters = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
+        self.logger.record("hparams", parameters, exclude=("stdout", "log", "json", "csv"))
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@contextmanager
+def tracked(job: TrainingJob) -> Iterator[None]:
+    """Track the block in a run of Weights & Biases, if the job asks for it.
+
+    The run is made as rl_zoo3 makes it, and shows what TensorBoard is given.
+
+    :raises ConfigError: it cannot begin, for example without a login.
+    """
+    if not job.track:
+        yield
+        return
+    # wandb is an extra, which JobOptions has checked.
+    import wandb
+
+    config = job.config
+    try:
+        run = wandb.init(
+            name=f"{config.env_id}__{config.algo}__{job.seed}__{int(time.time())}",
+            project=job.wandb_project_name,
+            entity=job.wandb_entity,
+            group=job.wandb_group,
+            tags=[*(job.wandb_tags or ()), f"v{stable_baselines3.__version__}"],
+            config={**job.arguments(), **config.settings, **made_with()},
+            sync_tensorboard=True,
+        )
+    except wandb.Error as error:
+        raise ConfigError(f"--track: {one_line(error)}") from None
+    with run:
+        yield

@@ -14,44 +14,62 @@ Exit code 1: the rotors cannot produce hover thrust. For the contents of a
 vehicle file, see docs/vehicles.md.
 """
 
-import argparse
 import math
 import sys
-from typing import TYPE_CHECKING, Any
+from argparse import Namespace
+from typing import TYPE_CHECKING
 
 from sb3_quad.base.errors import CannotHover
-from sb3_quad.cli.parser import Parser, natural
+from sb3_quad.cli.parser import Flags, Parser, add_flags, natural
 
 if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import Vehicle
 
 # Below this thrust-to-weight ratio, little is left to turn and brake with.
 SLIM_THRUST = 1.2
-# Rotor speed, rad/s, some 95,000 rpm. Above it a unit must be wrong.
-FASTEST_HOVER = 10_000.0
+# Rotor speed, rpm. Above it a unit must be wrong.
+FASTEST_HOVER = 95_000.0
 # rpm per rad/s.
 RPM = 60.0 / (2.0 * math.pi)
+PARAMETERS = """\
+can hover | yes: thrust-to-weight ratio {v.thrust_limits[1]:.2f}, least {v.thrust_limits[0]:.2f}
+mass, weight | {v.mass:g} kg, {weight:.4g} N
+rotor thrust | {v.thrust_range[0]:.4g} to {v.thrust_range[1]:.4g} N, \
+hover {v.hover_thrust:.4g} N (action {action:+g})
+rotor speed | {speeds[0]:.0f} to {speeds[1]:.0f} rad/s, hover {speeds[2]:.0f} rad/s \
+({rpm[0]:.0f} to {rpm[1]:.0f} rpm, hover {rpm[2]:.0f} rpm)
+acceleration | up {up:.1f}, down while level {down:.1f}, \
+horizontal at constant height {horizontal:.1f} m/s²
+greatest moments | {v.greatest_moments[0]:.4g}, {v.greatest_moments[1]:.4g}, \
+{v.greatest_moments[2]:.4g} N m about roll, pitch and yaw
+ | which accelerate it by {turning[0]:.1f}, {turning[1]:.1f}, {turning[2]:.1f} rad/s²
+inertia | {v.inertia[0]:.4g}, {v.inertia[1]:.4g}, {v.inertia[2]:.4g} kg m²
+ | {physical}: the largest moment is {v.largest_moment:.2f} of the other two together, \
+at most 1 (triangle inequality)
+ | radii of gyration {v.gyration_ratios[0]:.2f}, {v.gyration_ratios[1]:.2f}, \
+{v.gyration_ratios[2]:.2f} of the rotors' distance from the centre
+motors | time constant {motor_up:.1f} ms up, {motor_down:.1f} ms down; \
+from command to thrust {lag:.1f} ms
+"""
+"""The lines of the table, of a vehicle ``v``."""
+
+
+FLAGS: Flags = {
+    "vehicle VEHICLE": "name or YAML file",
+    "-n --episodes N": (
+        natural,
+        480,
+        "episodes of each task and expert, with the true state (480)",
+    ),
+    "--seed N": (natural, 0, "seed of the episodes, which no search or training uses (0)"),
+}
 
 
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add("vehicle", metavar="VEHICLE", help="name or YAML file")
-    add(
-        "-n",
-        "--episodes",
-        type=natural,
-        default=480,
-        help="episodes of each task and expert, with the true state (480)",
-    )
-    add(
-        "--seed",
-        type=natural,
-        default=0,
-        help="seed of the episodes, which no search or training uses (0)",
-    )
+    add_flags(parser, FLAGS)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if the vehicle cannot hover."""
     from sb3_quad.base.seeds import seed_for
     from sb3_quad.cli.closing import print_tables
@@ -63,7 +81,13 @@ def run(options: argparse.Namespace) -> int:
 
     try:
         vehicle = load_vehicle(options.vehicle)
-        _check_rotor_speed(vehicle, options.vehicle)
+        # Limits in multiples of the hover thrust do not show that it hovers at all.
+        rpm = vehicle.hover_rotor_speed * RPM
+        if rpm > FASTEST_HOVER:
+            raise CannotHover(
+                f"{options.vehicle}: mass {vehicle.mass:g} kg: no rotor reaches the {rpm:,.0f} rpm "
+                "that hover needs; is the mass in kg, and thrust_coefficient in N s²?"
+            )
     except CannotHover as error:
         print(f"cannot hover: {error}", file=sys.stderr)
         return 1
@@ -87,95 +111,30 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
+def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     """Return the lines of the table: names and values."""
-    return [
-        *_thrust(vehicle),
-        *_acceleration(vehicle),
-        *_inertia(vehicle),
-        ("motors", _motors(vehicle)),
-    ]
+    import numpy as np
 
-
-def _thrust(vehicle: "Vehicle") -> list[tuple[str, str]]:
-    low, high = vehicle.thrust_range
-    slow, fast = vehicle.rotor_speed_range
-    hover = vehicle.hover_rotor_speed
     least, most = vehicle.thrust_limits
-    # Rounding would print -0.000.
-    action = f"{vehicle.hover_action:+.3f}" if abs(vehicle.hover_action) > 5e-4 else "0"
-    return [
-        ("can hover", f"yes: thrust-to-weight ratio {most:.2f}, least {least:.2f}"),
-        ("mass, weight", f"{vehicle.mass:g} kg, {vehicle.mass * vehicle.gravity:.4g} N"),
-        (
-            "rotor thrust",
-            f"{low:.4g} to {high:.4g} N, hover {vehicle.hover_thrust:.4g} N (action {action})",
-        ),
-        (
-            "rotor speed",
-            f"{slow:.0f} to {fast:.0f} rad/s, hover {hover:.0f} rad/s "
-            f"({slow * RPM:.0f} to {fast * RPM:.0f} rpm, hover {hover * RPM:.0f} rpm)",
-        ),
-    ]
-
-
-def _acceleration(vehicle: "Vehicle") -> list[tuple[str, str]]:
-    least, most = vehicle.thrust_limits
-    up = vehicle.gravity * (most - 1.0)
-    down = vehicle.gravity * (1.0 - least)
-    # The vertical part of full thrust holds the weight.
-    horizontal = vehicle.gravity * math.sqrt(most**2 - 1.0)
-    moments = vehicle.greatest_moments
-    return [
-        (
-            "acceleration",
-            f"up {up:.1f}, down while level {down:.1f}, "
-            f"horizontal at constant height {horizontal:.1f} m/s²",
-        ),
-        ("greatest moments", f"{_list(moments, '.4g')} N m about roll, pitch and yaw"),
-        ("", f"which accelerate it by {_list(moments / vehicle.inertia, '.1f')} rad/s²"),
-    ]
-
-
-def _inertia(vehicle: "Vehicle") -> list[tuple[str, str]]:
-    physical = "unphysical" if vehicle.inertia_fault else "physical"
-    ratios = _list(vehicle.gyration_ratios, ".2f")
-    return [
-        ("inertia", f"{_list(vehicle.inertia, '.4g')} kg m²"),
-        (
-            "",
-            f"{physical}: the largest moment is {vehicle.largest_moment:.2f} of the other two "
-            "together, at most 1 (triangle inequality)",
-        ),
-        ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
-    ]
-
-
-def _motors(vehicle: "Vehicle") -> str:
-    up = 1000.0 / vehicle.motor_gain_up
-    down = 1000.0 / vehicle.motor_gain_down
-    times = f"{up:.1f} ms"
-    if up != down:
-        times = f"{up:.1f} ms up, {down:.1f} ms down"
-    lag = 1000 * vehicle.command_lag
-    return f"time constant {times}; from command to thrust {lag:.1f} ms"
-
-
-def _list(values: Any, form: str) -> str:
-    return ", ".join(format(value, form) for value in values)
-
-
-def _check_rotor_speed(vehicle: "Vehicle", where: str) -> None:
-    """Check the rotor speed in hover, which limits in multiples of the hover thrust do not show.
-
-    :raises CannotHover: No rotor is that fast.
-    """
-    speed = vehicle.hover_rotor_speed
-    if speed > FASTEST_HOVER:
-        raise CannotHover(
-            f"{where}: mass {vehicle.mass:g} kg: no rotor reaches the {speed * RPM:,.0f} rpm that "
-            "hover needs; is the mass in kg, and thrust_coefficient in N s²?"
-        )
+    speeds = np.array([*vehicle.rotor_speed_range, vehicle.hover_rotor_speed])
+    text = PARAMETERS.format(
+        v=vehicle,
+        weight=vehicle.mass * vehicle.gravity,
+        # Adding 0.0 turns a negative zero into one without a sign.
+        action=round(vehicle.hover_action, 3) + 0.0,
+        speeds=speeds,
+        rpm=speeds * RPM,
+        up=vehicle.gravity * (most - 1.0),
+        down=vehicle.gravity * (1.0 - least),
+        # The vertical part of full thrust holds the weight.
+        horizontal=vehicle.gravity * math.sqrt(most**2 - 1.0),
+        turning=vehicle.greatest_moments / vehicle.inertia,
+        physical="unphysical" if vehicle.inertia_fault else "physical",
+        motor_up=1000.0 / vehicle.motor_gain_up,
+        motor_down=1000.0 / vehicle.motor_gain_down,
+        lag=1000.0 * vehicle.command_lag,
+    )
+    return [line.split(" | ") for line in text.splitlines()]
 
 
 def warnings(vehicle: "Vehicle") -> list[str]:

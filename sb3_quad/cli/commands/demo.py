@@ -20,26 +20,29 @@ same vehicle, first that of the first agent. The page also offers the vehicles
 of the package.
 """
 
-import argparse
+from argparse import Namespace
 
 from sb3_quad.base.files import refuse_existing, write_text
-from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, Parser, add_flags
+
+FLAGS: Flags = {
+    "agents CONTROLLER": (
+        {"nargs": "*"},
+        None,
+        "controllers to show (pid, geometric, and agents of the package)",
+    ),
+    "-o --output FILE": (str, "demo.html", "page to write (demo.html)"),
+    "--vehicle": "first vehicle, by name or YAML file (that of the first agent)",
+    **TRUST,
+    **OVERWRITE,
+}
 
 
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
-        "agents",
-        nargs="*",
-        metavar="CONTROLLER",
-        help="controllers to show (pid, geometric, and agents of the package)",
-    )
-    add("-o", "--output", default="demo.html", metavar="FILE", help="page to write (demo.html)")
-    add("--vehicle", help="first vehicle, by name or YAML file (that of the first agent)")
-    add_common(parser, "trust", "overwrite")
+    add_flags(parser, FLAGS)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Make the page and write it. Returns the exit code."""
     from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import parse_controllers

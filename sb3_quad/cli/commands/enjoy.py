@@ -24,16 +24,32 @@ agent (vehicle, task and observation) hold for all, unless you give --env,
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-import argparse
 import io
+import itertools
 import sys
+from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, positive, whole
+from sb3_quad.base.types import StrDict
+from sb3_quad.cli.parser import (
+    OVERWRITE,
+    PAIRS,
+    PROGRESS,
+    SEVERAL,
+    SWITCH,
+    TRUST,
+    Flags,
+    Parser,
+    above_zero,
+    add_flags,
+    natural,
+    positive,
+    whole,
+)
 from sb3_quad.envs.registration import ENVIRONMENTS
 
 DEFAULT_ENV = "QuadTargetTracking-v0"
@@ -42,124 +58,98 @@ SINGLE = (640, 480)
 PANEL = (480, 480)
 
 
-def add_arguments(parser: Parser) -> None:
-    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of this command."""
-    add = parser.add_argument
-    add(
-        "controllers",
-        nargs="*",
-        metavar="CONTROLLER",
-        help="controllers to fly, in addition to the agent of --algo",
-    )
-    _add_run_arguments(parser)
-    task = parser.add_mutually_exclusive_group()
-    task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
-    task.add_argument("--task", help="a task such as target_tracking, instead of --env")
-    task.add_argument(
-        "--scenario",
-        metavar="SUITE:NAME",
-        help="a scenario such as thesis:side_hit, instead of --env",
-    )
-    add(
-        "-n",
-        "--n-timesteps",
-        type=positive,
-        help="control steps, in as many episodes as needed (one episode)",
-    )
-    add(
-        "--n-envs",
-        type=positive,
-        default=1,
-        help="number of parallel episodes, with consecutive seeds (1)",
-    )
-    add(
-        "--seed", type=natural, default=0, help="seed of the first episode; later ones count up (0)"
-    )
-    actions = parser.add_mutually_exclusive_group()
-    actions.add_argument(
-        "--deterministic", action="store_true", help="fly the mean of a policy's actions (default)"
-    )
-    actions.add_argument("--stochastic", action="store_true", help="sample a policy's actions")
-    add("--env-kwargs", default={}, help="environment keywords, such as noise:0", **PAIRS)
-    add("--target", nargs=3, type=float, metavar=("X", "Y", "Z"), help="target to fly to, m")
-    add("--no-render", action="store_true", help="only fly and print the results")
-    add(
-        "-o",
-        "--output",
-        nargs="+",
-        default=[],
-        metavar="FILE",
-        help="write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
-    )
-    add("--size", type=_size, metavar="WxH", help="size of one controller's panel, pixels")
-    add(
-        "--speed",
-        type=above_zero,
-        default=1.0,
-        metavar="X",
-        help="playback speed of film and window; 0.5 is slow motion (1)",
-    )
-    add_common(parser, "trust", "overwrite", "progress")
-
-
-def _add_run_arguments(parser: Parser) -> None:
-    """Add the flags that name the agent of a run folder."""
-    add = parser.add_argument
-    add("--algo", help="algorithm of a trained agent, which is looked up in the log folder")
-    add(
-        "-f",
-        "--folder",
-        "--log-folder",
-        default="logs",
-        metavar="DIR",
-        help="folder that holds the run folders (logs)",
-    )
-    add(
-        "--exp-id",
-        type=whole,
-        default=0,
-        help="number of the run (0: the latest one that has an agent)",
-    )
-    add = parser.add_mutually_exclusive_group().add_argument
-    add(
-        "--load-best",
-        dest="which",
-        action="store_const",
-        const="best",
-        help="fly the best agent of the evaluations",
-    )
-    add(
-        "--load-checkpoint",
-        dest="which",
-        type=whole,
-        metavar="N",
-        help="fly the checkpoint after N timesteps",
-    )
-    add(
-        "--load-last-checkpoint",
-        dest="which",
-        action="store_const",
-        const="last",
-        help="fly the last checkpoint",
-    )
-
-
 def _size(text: str) -> tuple[int, int]:
     try:
         width, height = text.lower().split("x")
         return int(width), int(height)
     except ValueError:
-        raise argparse.ArgumentTypeError(
+        raise ArgumentTypeError(
             f"{text}: must be width and height in pixels, such as 640x480"
         ) from None
 
 
-def run(options: argparse.Namespace) -> int:
+RUN_FLAGS: Flags = {
+    "--algo": "algorithm of a trained agent, which is looked up in the log folder",
+    "-f --folder --log-folder DIR": (str, "logs", "folder that holds the run folders (logs)"),
+    "--exp-id N": (whole, 0, "number of the run (0: the latest one that has an agent)"),
+}
+"""The flags that name a run folder."""
+AGENT_FLAGS: Flags = {
+    "--load-best": (
+        {"dest": "which", "action": "store_const", "const": "best"},
+        None,
+        "fly the best agent of the evaluations",
+    ),
+    "--load-checkpoint N": (
+        {"dest": "which", "type": whole},
+        None,
+        "fly the checkpoint after N timesteps",
+    ),
+    "--load-last-checkpoint": (
+        {"dest": "which", "action": "store_const", "const": "last"},
+        None,
+        "fly the last checkpoint",
+    ),
+}
+"""The flags that name the agent in it, one at most; likewise the next two tables."""
+EPISODE_FLAGS: Flags = {
+    "--env": f"environment id ({DEFAULT_ENV})",
+    "--task": "a task such as target_tracking, instead of --env",
+    "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
+}
+ACTION_FLAGS: Flags = {
+    "--deterministic": (SWITCH, False, "fly the mean of a policy's actions (default)"),
+    "--stochastic": (SWITCH, False, "sample a policy's actions"),
+}
+FLAGS: Flags = {
+    "controllers CONTROLLER": (
+        {"nargs": "*"},
+        None,
+        "controllers to fly, in addition to the agent of --algo",
+    ),
+    "-n --n-timesteps N": (
+        positive,
+        None,
+        "control steps, in as many episodes as needed (one episode)",
+    ),
+    "--n-envs N": (positive, 1, "number of parallel episodes, with consecutive seeds (1)"),
+    "--seed N": (natural, 0, "seed of the first episode; later ones count up (0)"),
+    "--env-kwargs": (PAIRS, {}, "environment keywords, such as noise:0"),
+    "--target": (
+        {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")},
+        None,
+        "target to fly to, m",
+    ),
+    "--no-render": (SWITCH, False, "only fly and print the results"),
+    "-o --output FILE": (
+        SEVERAL,
+        [],
+        "write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
+    ),
+    "--size WxH": (_size, None, "size of one controller's panel, pixels"),
+    "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
+    **TRUST,
+    **OVERWRITE,
+    **PROGRESS,
+}
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of this command."""
+    add_flags(parser, RUN_FLAGS)
+    for flags in (AGENT_FLAGS, EPISODE_FLAGS, ACTION_FLAGS):
+        add_flags(parser.add_mutually_exclusive_group(), flags)
+    add_flags(parser, FLAGS)
+
+
+def run(options: Namespace) -> int:
     """Fly, print the results, show the flights. Returns the exit code."""
+    from PIL import Image
     from rich.console import Console
 
     from sb3_quad.show.episodes import fly_all
     from sb3_quad.show.film import show_in_window
+    from sb3_quad.show.sequence import sequence
 
     window = not (options.no_render or options.output)
     _check(options, window)
@@ -170,18 +160,24 @@ def run(options: argparse.Namespace) -> int:
             setting,
             options.seed,
             options.n_timesteps,
-            deterministic=not options.stochastic,
-            n_envs=options.n_envs,
+            not options.stochastic,
+            options.n_envs,
         )
         episodes = list(flights)
     for number, episode in enumerate(episodes, 1):
-        prefix = f"episode {number}, " if len(episodes) > 1 else ""
-        for recording in episode:
-            print(prefix + _result(recording))
+        for flight in episode:
+            prefix = f"episode {number}, " if len(episodes) > 1 else ""
+            end = flight.lost or f"{flight.state.distance[-1]:.3f} m from its target"
+            seconds = f"{flight.times[-1]:.2f} s"
+            print(f"{prefix}{flight.name}: {end} after {seconds}, reward {flight.reward:.2f}")
     size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
         if _is_picture(file):
-            _write_picture(file, episodes[0], size)
+            picture = io.BytesIO()
+            pixels = Image.fromarray(sequence(episodes[0], *size))
+            pixels.save(picture, format="png", optimize=True)
+            write_bytes(file, picture.getvalue())
+            print(f"saved {file}")
         else:
             _write_film(file, episodes, size, options)
     if window:
@@ -190,7 +186,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _check(options: argparse.Namespace, window: bool) -> None:
+def _check(options: Namespace, window: bool) -> None:
     """Refuse what can be refused before anything flies.
 
     :raises ConfigError: No controller, a bad size or file, or no display for a window.
@@ -224,7 +220,7 @@ def _is_picture(file: str) -> bool:
     return file.lower().endswith(".png")
 
 
-def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
+def _setting(options: Namespace) -> tuple[Any, StrDict]:
     """Return the :class:`~sb3_quad.show.episodes.Setting` of all, and the controllers by label."""
     from sb3_quad.cli.output import warn
     from sb3_quad.controllers.resolve import resolve_expert
@@ -237,8 +233,7 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         specs.insert(0, ControllerSpec(*_agent_of_run(options)))
         print(f"agent: {specs[0].spec}")
     # The settings of the first agent hold for all.
-    own_settings = [spec.own for spec in specs if spec.own is not None]
-    first = own_settings[0] if own_settings else None
+    first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
         setting = fixed_setting(_flight_settings(options, first), options.target)
     elif options.env_kwargs or options.target:
@@ -247,18 +242,17 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         setting = scenario_setting(options.scenario, first and first.vehicle)
     controllers = {}
     # What an agent observes stays as in its training, unless the command line says otherwise.
-    observed: dict[str, dict[str, Any]] = {}
+    observed = {}
     vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
         controllers[spec.label] = resolve_expert(spec.spec, vehicle, "controller")
-        observed[spec.label] = dict(spec.observed)
-        for name in options.env_kwargs:
-            observed[spec.label].pop(name, None)
+        kept = spec.observed.keys() - options.env_kwargs.keys()
+        observed[spec.label] = {name: spec.observed[name] for name in kept}
     return setting._replace(own=observed), controllers
 
 
-def _flight_settings(options: argparse.Namespace, first: Any) -> Any:
+def _flight_settings(options: Namespace, first: Any) -> Any:
     """Return the :class:`~sb3_quad.simulation.settings.FlightSettings` of all flights.
 
     :param first: Those of the first agent, or None.
@@ -267,21 +261,16 @@ def _flight_settings(options: argparse.Namespace, first: Any) -> Any:
 
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)
+    changes: StrDict = {}
     # With --algo, --env names the environment of the run rather than the task.
-    if options.task:
-        task = options.task
-    elif options.env and not options.algo:
-        task = env_task
-    else:
-        task = settings.task
-    changes = {"task": task}
-    if task != settings.task:
+    task = options.task or (options.env and not options.algo and env_task)
+    if task and task != settings.task:
         # The agent's changes to its own task do not fit another one.
-        changes["task_kwargs"] = None
+        changes = {"task": task, "task_kwargs": None}
     return settings.with_changes(**changes | options.env_kwargs)
 
 
-def _agent_of_run(options: argparse.Namespace) -> tuple[str, str]:
+def _agent_of_run(options: Namespace) -> tuple[str, str]:
     """Return label and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and
     ``--load-…`` name.
 
@@ -295,12 +284,12 @@ def _agent_of_run(options: argparse.Namespace) -> tuple[str, str]:
         # Raises if there is no such algorithm.
         get_algorithm(options.algo)
     run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
-    if isinstance(options.which, int):
-        path = run.checkpoint(options.which)
-    elif options.which == "last":
+    if options.which == "last":
         path = run.latest_checkpoint()
     elif options.which == "best":
         path = run.best_model
+    elif options.which is not None:
+        path = run.checkpoint(options.which)
     else:
         path = run.result
     if not path.is_file():
@@ -316,26 +305,8 @@ def _agent_of_run(options: argparse.Namespace) -> tuple[str, str]:
     return f"{options.algo} {path.name}", str(path)
 
 
-def _result(recording: Any) -> str:
-    """Return the result of a flight in one line."""
-    end = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
-    seconds = recording.times[-1]
-    return f"{recording.name}: {end} after {seconds:.2f} s, reward {recording.reward:.2f}"
-
-
-def _write_picture(file: str, episode: Sequence[Any], size: tuple[int, int]) -> None:
-    from PIL import Image
-
-    from sb3_quad.show.sequence import sequence
-
-    buffer = io.BytesIO()
-    Image.fromarray(sequence(episode, *size)).save(buffer, format="png", optimize=True)
-    write_bytes(file, buffer.getvalue())
-    print(f"saved {file}")
-
-
 def _write_film(
-    file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: argparse.Namespace
+    file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: Namespace
 ) -> None:
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.show.film import FPS, film_frames, frame_times, write_film
@@ -343,12 +314,10 @@ def _write_film(
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
 
     def frames() -> Iterator[Any]:
-        done = 0
-        for episode in episodes:
-            for frame in film_frames(episode, *size, options.speed):
-                yield frame
-                done += 1
-                show(done, total, "frames")
+        films = (film_frames(episode, *size, options.speed) for episode in episodes)
+        for done, frame in enumerate(itertools.chain.from_iterable(films), 1):
+            yield frame
+            show(done, total, "frames")
 
     with progress_bar(options.progress) as show:
         write_film(Path(file), frames())

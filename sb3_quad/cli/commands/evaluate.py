@@ -35,47 +35,56 @@ results of one command, so give all controllers at once. After an interruption,
 the same command continues where it stopped.
 """
 
-import argparse
 import sys
 import time
+from argparse import Namespace
 
-from sb3_quad.cli.parser import YES_OR_NO, Parser, add_common, whole
+from sb3_quad.cli.parser import (
+    EXECUTOR,
+    PROGRESS,
+    SEVERAL,
+    SWITCH,
+    TRUST,
+    YES_OR_NO,
+    Flags,
+    Parser,
+    add_flags,
+    whole,
+)
 
 DEFAULT_FOLDER = "evaluations"
 
 
+FLAGS: Flags = {
+    "controllers CONTROLLER": (SEVERAL, None, "controllers to fly, see below"),
+    "--suite": (
+        str,
+        "thesis",
+        "suite of scenarios: thesis (default), robustness, wind, quadcopters, quick or a file",
+    ),
+    "-o --output FOLDER": f"folder for the results ({DEFAULT_FOLDER}/SUITE)",
+    "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
+    "--episodes N": (whole, None, "episodes of each scenario (the suite's number)"),
+    "--seed N": (whole, None, "seed of each scenario (the suite's seed)"),
+    "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
+    "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
+    "--workers N": (whole, 1, "number of parallel processes (1)"),
+    "--overwrite": (SWITCH, False, "remove the results that the folder holds"),
+    "--reward MODULE:FUNCTION": (
+        "show the mean of a reward of your own, function(state, actions) per control step"
+    ),
+    "--report": (YES_OR_NO, True, "update report.html and its plots (yes)"),
+    **EXECUTOR,
+    **TRUST,
+    **PROGRESS,
+}
+
+
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add("controllers", nargs="+", metavar="CONTROLLER", help="controllers to fly, see below")
-    add(
-        "--suite",
-        default="thesis",
-        help="suite of scenarios: thesis (default), robustness, wind, quadcopters, quick or a file",
-    )
-    add("-o", "--output", metavar="FOLDER", help=f"folder for the results ({DEFAULT_FOLDER}/SUITE)")
-    add(
-        "--scenario",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="fly only these scenarios of the suite",
-    )
-    add("--episodes", type=whole, help="episodes of each scenario (the suite's number)")
-    add("--seed", type=whole, help="seed of each scenario (the suite's seed)")
-    add("--vehicle", help="vehicle, by name or YAML file (the suite's, else each agent's own)")
-    add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
-    add("--workers", type=whole, default=1, help="number of parallel processes (1)")
-    add("--overwrite", action="store_true", help="remove the results that the folder holds")
-    add(
-        "--reward",
-        metavar="MODULE:FUNCTION",
-        help="show the mean of a reward of your own, function(state, actions) per control step",
-    )
-    add("--report", default=True, help="update report.html and its plots (yes)", **YES_OR_NO)
-    add_common(parser, "executor", "trust", "progress")
+    add_flags(parser, FLAGS)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Fly, print the table and the failures. Returns the exit code."""
     from sb3_quad.cli.commands.report import report
     from sb3_quad.cli.output import console, progress_bar, warn
@@ -120,7 +129,7 @@ def run(options: argparse.Namespace) -> int:
     failures = [failure for failure in results.failures if failure.controller in labels]
     for failure in failures:
         where = failure.controller
-        if failure.scenario is not None:
+        if failure.scenario:
             where += f", scenario {failure.scenario}"
         print(f"failed: {where}: {failure.message}", file=sys.stderr)
-    return 1 if failures else 0
+    return int(bool(failures))

@@ -20,48 +20,50 @@ ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. The check
 of a C header needs a C compiler.
 """
 
-import argparse
+from argparse import Namespace
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, Parser, add_flags
 from sb3_quad.controllers.pretrained import agent_path
 
 # Facts about an exported policy that are printed, in this order.
 FACTS = ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check")
 
 
-def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
-        "model",
-        type=agent_path,
-        metavar="MODEL",
-        help="agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
+FLAGS: Flags = {
+    "model MODEL": (
+        agent_path,
+        None,
+        "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
-    )
-    add("--format", required=True, help="onnx, torchscript or c")
-    add(
-        "-o",
-        metavar="FILE",
-        dest="file",
-        help="file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
-    )
-    add(
-        "--output",
-        default="thrusts",
-        metavar="KIND",
-        help="result of the policy: thrusts (N, default) or speeds (rad/s)",
-    )
-    add("--vehicle", help="vehicle, by name or YAML file (the one in the zip or its run folder)")
-    add("--name", help="call the C function NAME_policy (the name of the file)")
-    add_common(parser, "trust", "overwrite")
+    ),
+    "--format": ({"required": True}, None, "onnx, torchscript or c"),
+    "-o FILE": (
+        {"dest": "file"},
+        None,
+        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
+    ),
+    "--output KIND": (
+        str,
+        "thrusts",
+        "result of the policy: thrusts (N, default) or speeds (rad/s)",
+    ),
+    "--vehicle": "vehicle, by name or YAML file (that of the zip or its run folder)",
+    "--name": "call the C function NAME_policy (the name of the file)",
+    **TRUST,
+    **OVERWRITE,
+}
 
 
-def run(options: argparse.Namespace) -> int:
+def add_arguments(parser: Parser) -> None:
+    add_flags(parser, FLAGS)
+
+
+def run(options: Namespace) -> int:
     """Export, check, write. Returns the exit code."""
-    from sb3_quad.cli.output import output_file, warn
+    from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import ControllerSpec
     from sb3_quad.export.c_header import c_name
     from sb3_quad.export.policy import FORMATS, export_policy
@@ -69,7 +71,10 @@ def run(options: argparse.Namespace) -> int:
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))
     model = Path(options.model)
-    file = output_file(options.file, model.stem + FORMATS[options.format])
+    file = Path(options.file or "")
+    # Without a suffix it is a folder; without -o, this one.
+    if file.is_dir() or not file.suffix:
+        file /= model.stem + FORMATS[options.format]
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
     refuse_existing(file, options.overwrite)

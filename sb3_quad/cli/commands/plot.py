@@ -14,61 +14,17 @@ examples:
     --thesis state_recovery --show survival reward losses
 """
 
-import argparse
 import glob
+from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.base.types import StrDict
+from sb3_quad.cli.parser import OVERWRITE, SEVERAL, Flags, Parser, add_flags
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 
 PANELS = ("success", "survival", "reward", "losses")
-
-
-def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
-        "groups",
-        nargs="+",
-        metavar="RUN",
-        help="run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
-    )
-    add(
-        "--line",
-        action="append",
-        default=[],
-        type=_line,
-        metavar="NAME:SUCCESS:REWARD",
-        help="draw horizontal lines at a success in %% and a reward",
-    )
-    add(
-        "--thesis",
-        choices=[*THESIS_SCENARIOS],
-        metavar="TASK",
-        help=f"draw the thesis's results for {' or '.join(THESIS_SCENARIOS)} as horizontal lines",
-    )
-    add(
-        "--show",
-        nargs="+",
-        choices=PANELS,
-        default=[],
-        metavar="PANEL",
-        help=f"panels to draw, of {', '.join(PANELS)} (success reward)",
-    )
-    add(
-        "--task", help="one of the runs' eval_tasks, whose evaluations to draw (the runs' own task)"
-    )
-    add("--title", default="", help="title of the picture")
-    add(
-        "-o",
-        "--output",
-        default="curves.png",
-        metavar="FILE",
-        help="picture to write: .png, .svg or .pdf (curves.png)",
-    )
-    add_common(parser, "overwrite")
 
 
 def _line(text: str) -> tuple[str, dict[str, float]]:
@@ -77,19 +33,51 @@ def _line(text: str) -> tuple[str, dict[str, float]]:
         share = float(success) / 100
         return name, {"success": share, "survival": share, "reward": float(reward)}
     except ValueError:
-        raise argparse.ArgumentTypeError(
+        raise ArgumentTypeError(
             f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.25:-16.1"
         ) from None
 
 
-def run(options: argparse.Namespace) -> int:
+FLAGS: Flags = {
+    "groups RUN": (
+        SEVERAL,
+        None,
+        "run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
+    ),
+    "--line NAME:SUCCESS:REWARD": (
+        {"action": "append", "type": _line},
+        [],
+        "draw horizontal lines at a success in %% and a reward",
+    ),
+    "--thesis TASK": (
+        {"choices": [*THESIS_SCENARIOS]},
+        None,
+        f"draw the thesis's results for {' or '.join(THESIS_SCENARIOS)} as horizontal lines",
+    ),
+    "--show PANEL": (
+        {"nargs": "+", "choices": PANELS},
+        [],
+        f"panels to draw, of {', '.join(PANELS)} (success reward)",
+    ),
+    "--task": "one of the runs' eval_tasks, whose evaluations to draw (the runs' own task)",
+    "--title": (str, "", "title of the picture"),
+    "-o --output FILE": (str, "curves.png", "picture to write: .png, .svg or .pdf (curves.png)"),
+    **OVERWRITE,
+}
+
+
+def add_arguments(parser: Parser) -> None:
+    add_flags(parser, FLAGS)
+
+
+def run(options: Namespace) -> int:
     """Read the runs, draw, write. Returns the exit code."""
     from sb3_quad.evaluation.learning_curves import read_curve
     from sb3_quad.evaluation.scenarios.load import load_suite
     from sb3_quad.report.curves import plot_curves
     from sb3_quad.report.plots import picture
 
-    groups: dict[str, Any] = {}
+    groups: StrDict = {}
     for text in options.groups:
         name, folders = _group(text)
         if name in groups:
@@ -105,10 +93,11 @@ def run(options: argparse.Namespace) -> int:
             lines[f"thesis: {name}"] = reference.model_dump(
                 include={"survival", "reward"}, exclude_none=True
             )
-    show = options.show or (["survival", "reward"] if options.thesis else [])
+    show = options.show
+    if options.thesis and not show:
+        show = ["survival", "reward"]
     curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
     refuse_existing(options.output, options.overwrite)
-    curves = plot_curves(groups, lines, options.title, show)
     write_bytes(options.output, picture(curves, kind, dpi=130))
     print(f"saved {options.output}")
     return 0

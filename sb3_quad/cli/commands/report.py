@@ -8,24 +8,23 @@ examples:
   sb3-quad report evaluations/thesis --overwrite
 """
 
-import argparse
-from pathlib import Path
+from argparse import Namespace
 
-from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.base.types import StrPath
+from sb3_quad.cli.parser import OVERWRITE, Parser, add_flags
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument("folder", metavar="FOLDER", help="results folder of evaluate")
-    add_common(parser, "overwrite")
+    add_flags(parser, {"folder FOLDER": "results folder of evaluate", **OVERWRITE})
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Write the page. Returns the exit code."""
     report(options.folder, options.overwrite)
     return 0
 
 
-def report(folder: str | Path, overwrite: bool) -> None:
+def report(folder: StrPath, overwrite: bool) -> None:
     """Write the page of a results folder, with a spinner in a terminal, and print its path.
 
     :raises ConfigError: See :func:`sb3_quad.report.results_page.write_report`.

@@ -21,56 +21,68 @@ The new folder receives the run folders, results.csv, results.json, report.md
 and report.html. For the keys of the file, see docs/sweeps.md.
 """
 
-import argparse
 import sys
 import time
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import StrDict
 from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
-from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
+from sb3_quad.cli.parser import (
+    EXECUTOR,
+    PAIRS,
+    PROGRESS,
+    SEVERAL,
+    SWITCH,
+    TRUST,
+    Flags,
+    Parser,
+    add_fields,
+    add_flags,
+    given,
+    positive,
+    refuse,
+    seed,
+)
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 
+FLAGS: Flags = {
+    "sweep SWEEP": (
+        {"nargs": "?"},
+        None,
+        "YAML file, or the name of a sweep of the package; the flags below replace its keys",
+    ),
+    "--seed N": ({"nargs": "+", "type": seed}, None, "seeds of each configuration (0)"),
+    "-conf --conf-file FILE": (
+        SEVERAL,
+        None,
+        "settings files, of single runs or pipelines (two_stage.yml)",
+    ),
+    "--algo": (SEVERAL, None, "algorithms of single runs (dagger)"),
+    "--env": "environment id of single runs (QuadTargetTracking-v0)",
+    "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
+    "--suite": "suite for the comparison (240 fresh episodes of each task)",
+    "--episodes N": (positive, None, "episodes of each scenario in the comparison"),
+    "--gym-packages MODULE": (SEVERAL, None, "modules that register further environments"),
+    "--workers N": (positive, None, "number of parallel runs (one per core)"),
+    "--dry-run": (SWITCH, False, "list the runs and train nothing"),
+    "--resume FOLDER": "continue the sweep in its folder",
+    **EXECUTOR,
+    **TRUST,
+    **PROGRESS,
+}
+
 
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add(
-        "sweep",
-        nargs="?",
-        metavar="SWEEP",
-        help="YAML file, or the name of a sweep of the package; the flags below replace its keys",
-    )
-    add("--seed", nargs="+", type=seed, help="seeds of each configuration (0)")
-    add(
-        "-conf",
-        "--conf-file",
-        nargs="+",
-        metavar="FILE",
-        help="settings files, of single runs or pipelines (two_stage.yml)",
-    )
-    add("--algo", nargs="+", help="algorithms of single runs (dagger)")
-    add("--env", help="environment id of single runs (QuadTargetTracking-v0)")
+    add_flags(parser, FLAGS)
     add_fields(parser, SettingsOptions)
-    add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
     fields = (*RunOptions.model_fields, "log_folder")
-    add_fields(parser, JobOptions, *fields, trained_agent={"type": agent_path})
-    add("--suite", help="suite for the comparison (240 fresh episodes of each task)")
-    add("--episodes", type=positive, help="episodes of each scenario in the comparison")
-    add(
-        "--gym-packages",
-        nargs="+",
-        metavar="MODULE",
-        help="modules that register further environments",
-    )
-    add("--workers", type=positive, help="number of parallel runs (one per core)")
-    add("--dry-run", action="store_true", help="list the runs and train nothing")
-    add("--resume", metavar="FOLDER", help="continue the sweep in its folder")
-    add_common(parser, "executor", "trust", "progress")
+    add_fields(parser, JobOptions, *fields, trained_agent=agent_path)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
     from sb3_quad.base.imports import import_packages
     from sb3_quad.sweep.folder import Sweep, SweepFolder
@@ -78,40 +90,38 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
-        for name in given(options, "sweep", *SweepSpec.model_fields, "suite", "episodes"):
-            flag = "SWEEP" if name == "sweep" else f"--{name.replace('_', '-')}"
-            raise ConfigError(f"--resume keeps the sweep's own settings; remove {flag}")
+        names = ("sweep", *SweepSpec.model_fields, "suite", "episodes")
+        refuse(options, names, "--resume keeps the sweep's own settings; remove {}")
         folder = SweepFolder(options.resume)
         return _execute(options, folder.read(), folder)
     spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
     sweep = Sweep(spec=spec, runs=tuple(make_runs(spec)), suite=suite_of(spec))
     if options.dry_run:
-        _print_runs(sweep)
+        for planned in sweep.runs:
+            stages = [
+                f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
+                for stage in planned.stages
+            ]
+            print(f"{planned.name}: {', then '.join(stages)}")
+        configurations = {planned.configuration for planned in sweep.runs}
+        runs = _count(len(sweep.runs), "run")
+        print(f"{runs} of {_count(len(configurations), 'configuration')}")
         return 0
     return _execute(options, sweep, None)
 
 
-def _print_runs(sweep: Any) -> None:
-    for run in sweep.runs:
-        stages = [
-            f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
-            for stage in run.stages
-        ]
-        print(f"{run.name}: {', then '.join(stages)}")
-    configurations = {run.configuration for run in sweep.runs}
-    print(f"{_count(len(sweep.runs), 'run')} of {_count(len(configurations), 'configuration')}")
-
-
-def _spec(options: argparse.Namespace) -> Any:
+def _spec(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line.
 
     Flags replace the keys of the file.
     """
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
+    from sb3_quad.training.algorithms import as_list
+    from sb3_quad.training.pipeline import is_pipeline
 
-    data: dict[str, Any] = {"name": "sweep"}
+    data: StrDict = {"name": "sweep"}
     if options.sweep is not None:
         data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
     flags = given(options, *SweepSpec.model_fields)
@@ -130,30 +140,16 @@ def _spec(options: argparse.Namespace) -> Any:
             grid[name] = flags.pop(name)
     evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
     data |= {**flags, "grid": grid, "evaluation": evaluation}
-    _add_defaults(data)
+    keys = {**data, **grid}
+    # A sweep without settings trains what train does by default.
+    if not (data.get("configurations") or keys.keys() & {"conf_file", "algo", "env"}):
+        data["conf_file"] = DEFAULT_PIPELINE
+    elif not (data.get("configurations") or any(map(is_pipeline, as_list(keys.get("conf_file"))))):
+        data = {"algo": DEFAULT_ALGO, "env": DEFAULT_ENV, **data}
     return validate(SweepSpec, data, options.sweep or "command line")
 
 
-def _add_defaults(data: dict[str, Any]) -> None:
-    """Let a sweep without settings train what ``train`` does by default: its pipeline, or its
-    algorithm and environment.
-    """
-    from sb3_quad.training.pipeline import is_pipeline
-
-    keys = {**data, **data["grid"]}
-    files = keys.get("conf_file", [])
-    if isinstance(files, str):
-        files = [files]
-    if data.get("configurations") or any(is_pipeline(file) for file in files):
-        return
-    if not keys.keys() & {"conf_file", "algo", "env"}:
-        data["conf_file"] = DEFAULT_PIPELINE
-        return
-    data.setdefault("algo", DEFAULT_ALGO)
-    data.setdefault("env", DEFAULT_ENV)
-
-
-def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
+def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
     """Do what is left of a sweep. Returns the exit code.
 
     :param sweep: The sweep.
@@ -161,9 +157,12 @@ def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
     """
     from sb3_quad.base.files import locked
     from sb3_quad.base.process import StopSignals, available_cpus
-    from sb3_quad.cli.output import progress_bar
+    from sb3_quad.cli.output import console, progress_bar
     from sb3_quad.executors import start_executor
+    from sb3_quad.sweep.folder import SweepFolder
+    from sb3_quad.sweep.results import tables, write_report, write_results
     from sb3_quad.sweep.run import execute
+    from sb3_quad.training.runs import claim_folder
 
     start = time.perf_counter()
     workers = min(options.workers or available_cpus(), len(sweep.runs))
@@ -174,7 +173,9 @@ def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
     ) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
-            folder = _new_folder(options, sweep)
+            parent = Path(options.log_folder or "logs") / "sweep"
+            folder = SweepFolder(claim_folder(parent, sweep.spec.name or "sweep"))
+            folder.write(sweep)
         parallel = f"{executor.workers} in parallel, executor {options.executor}"
         print(f"sweep {folder.path}: {runs}, {parallel}")
         with (
@@ -185,7 +186,12 @@ def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
             records = execute(folder, sweep, executor, signals, show, print)
             # Nothing interrupts the results.
             signals.hold()
-            results = _write_results(folder, sweep, records)
+            results = write_results(folder, sweep, records)
+            if results.finished:
+                shown = tables(results)
+                for table in shown:
+                    console().print(table)
+                write_report(folder, results, shown)
     failures = [record for record in records.values() if record.state == "failed"]
     seconds = time.perf_counter() - start
     print(f"{results.finished} of {runs} finished, {len(failures)} failed; {seconds:.1f} s")
@@ -193,34 +199,10 @@ def _execute(options: argparse.Namespace, sweep: Any, folder: Any) -> int:
     print(f"saved in {folder.path}: results.csv, results.json, runs/{report}")
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
-    if signals.received is not None:
+    if signals.received:
         print(f"to continue: --resume {folder.path}")
         return signals.exit_code
-    return 1 if failures else 0
-
-
-def _new_folder(options: argparse.Namespace, sweep: Any) -> Any:
-    from sb3_quad.sweep.folder import SweepFolder
-    from sb3_quad.training.runs import claim_folder
-
-    parent = Path(options.log_folder or "logs") / "sweep"
-    folder = SweepFolder(claim_folder(parent, sweep.spec.name or "sweep"))
-    folder.write(sweep)
-    return folder
-
-
-def _write_results(folder: Any, sweep: Any, records: Any) -> Any:
-    """Write and print the comparison of the finished runs, and return it."""
-    from sb3_quad.cli.output import console
-    from sb3_quad.sweep.results import tables, write_report, write_results
-
-    results = write_results(folder, sweep, records)
-    if results.finished:
-        shown = tables(results)
-        for table in shown:
-            console().print(table)
-        write_report(folder, results, shown)
-    return results
+    return int(bool(failures))
 
 
 def _count(number: int, noun: str) -> str:

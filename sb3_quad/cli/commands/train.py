@@ -30,13 +30,28 @@ examples:
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
 
-import argparse
 import time
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
+from sb3_quad.base.types import StrDict
+from sb3_quad.cli.parser import (
+    PAIRS,
+    PROGRESS,
+    SEVERAL,
+    SWITCH,
+    TRUST,
+    Flags,
+    Parser,
+    add_fields,
+    add_flags,
+    given,
+    positive,
+    refuse,
+    seed,
+)
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, SettingsOptions
 
@@ -60,135 +75,101 @@ KEPT_BY_RESUME = (
 KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
 
 
+SETTINGS_FLAGS: Flags = {
+    "--algo": f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})",
+    "--env": (
+        f"environment id ({DEFAULT_ENV}); "
+        "any id that Gymnasium knows, with --vec-env dummy or subproc"
+    ),
+    "-conf --conf-file FILE": (
+        "settings: a YAML file, or one of the package, such as thesis/dagger.yml "
+        "(ALGO.yml: undisturbed, PID expert)"
+    ),
+    "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
+    "--num-threads N": (positive, None, "threads (the cores; one where PyTorch computes)"),
+    "--gym-packages MODULE": (SEVERAL, [], "modules that register further environments"),
+    **TRUST,
+    **PROGRESS,
+}
+FLAGS: Flags = {
+    "--thesis": (SWITCH, False, f"the thesis's method: --conf-file {THESIS}"),
+    "--seed N": (seed, None, "seed (0); negative: a random one, recorded in args.yml"),
+    "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
+}
+# Options of a run that tune has, and all others; seed and progress have flags of their own.
+SHARED_FIELDS = ("eval_env_kwargs", "trained_agent", "n_eval_envs", "device")
+TRAIN_FIELDS = [
+    name for name in JobOptions.model_fields if name not in (*SHARED_FIELDS, "seed", "progress")
+]
+
+
 def add_settings(parser: Parser) -> None:
     """Add the flags for what is trained, which ``tune`` has as well."""
-    add = parser.add_argument
-    add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
-    add(
-        "--env",
-        help=f"environment id ({DEFAULT_ENV}); "
-        "any id that Gymnasium knows, with --vec-env dummy or subproc",
-    )
-    add(
-        "-conf",
-        "--conf-file",
-        metavar="FILE",
-        help="settings: a YAML file, or one of the package, such as thesis/dagger.yml "
-        "(ALGO.yml: undisturbed, PID expert)",
-    )
+    add_flags(parser, SETTINGS_FLAGS)
     add_fields(parser, SettingsOptions)
-    add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
-    shared = ("eval_env_kwargs", "trained_agent", "n_eval_envs", "device")
-    add_fields(parser, JobOptions, *shared, trained_agent={"type": agent_path})
-    add(
-        "--num-threads",
-        type=positive,
-        metavar="N",
-        help="threads (the cores; one where PyTorch computes)",
-    )
-    add(
-        "--gym-packages",
-        nargs="+",
-        default=[],
-        metavar="MODULE",
-        help="modules that register further environments",
-    )
-    add_common(parser, "trust", "progress")
+    add_fields(parser, JobOptions, *SHARED_FIELDS, trained_agent=agent_path)
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
-    add = parser.add_argument
-    add("--thesis", action="store_true", help=f"the thesis's method: --conf-file {THESIS}")
-    add(
-        "--seed",
-        type=seed,
-        metavar="N",
-        help="seed (0); negative: a random one, recorded in args.yml",
-    )
-    run_fields = ("log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
-    log_fields = ("log_interval", "tensorboard_log", "verbose", "track", "wandb_project_name")
-    add_fields(parser, JobOptions, *run_fields, *log_fields)
-    tags = {"nargs": "+", "type": str}
-    add_fields(parser, JobOptions, "wandb_entity", "wandb_group", "wandb_tags", wandb_tags=tags)
-    add(
-        "--resume",
-        metavar="RUN_FOLDER",
-        help="continue an interrupted or killed run with all its settings",
-    )
+    add_flags(parser, FLAGS)
+    add_fields(parser, JobOptions, *TRAIN_FIELDS, wandb_tags=SEVERAL)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Train, compare, print where everything is. Returns the exit code."""
+    from sb3_quad.base.validate import validate
+    from sb3_quad.cli.closing import close_pipeline, close_run
     from sb3_quad.cli.output import shows_progress
-    from sb3_quad.training.pipeline import is_pipeline
+    from sb3_quad.training import pipeline
+    from sb3_quad.training.config import TrainingJob, describe
+    from sb3_quad.training.trainer import resume, train
 
+    start = time.perf_counter()
+    _check_flags(options)
+    prepare(options)
+    job = given(options, *JobOptions.model_fields)
+    job["progress"] = shows_progress(options.progress)
+    if options.resume is not None:
+        folder = Path(options.resume)
+        if not pipeline.is_pipeline_run(folder):
+            return close_run(resume(options.resume, **job))
+        result = pipeline.resume_pipeline(folder, **job)
+    elif options.conf_file is not None and pipeline.is_pipeline(options.conf_file):
+        refuse(
+            options,
+            KEPT_BY_STAGES,
+            "{} goes with a single run (--algo, --env); "
+            f"a pipeline's stages have their own in {options.conf_file}",
+        )
+        stages = pipeline.load_pipeline(options.conf_file)
+        stages = pipeline.with_settings(stages, changed_settings(options))
+        result = pipeline.run_pipeline(stages, job, Path(options.conf_file).stem)
+    else:
+        content = {"config": make_config(options), **job}
+        checked = validate(TrainingJob, content, "command line")
+        print(describe(checked))
+        return close_run(train(checked))
+    return close_pipeline(result, time.perf_counter() - start)
+
+
+def _check_flags(options: Namespace) -> None:
+    """Check that flags go together, and fill in the settings file that they stand for."""
     if options.thesis:
         if options.conf_file or options.resume:
             raise ConfigError(
                 f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume"
             )
         options.conf_file = THESIS
-    prepare(options)
-    job = given(options, *JobOptions.model_fields)
-    job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
-        return _resume(options, job)
+        refuse(options, KEPT_BY_RESUME, "--resume keeps the run's own settings; remove {}")
     # Without any of these, the default is a pipeline rather than a single run.
-    if options.conf_file is None and options.algo is None and options.env is None:
+    elif not given(options, "conf_file", "algo", "env"):
         options.conf_file = DEFAULT_PIPELINE
-    if options.conf_file is not None and is_pipeline(options.conf_file):
-        return _train_pipeline(options, job)
-    return _train_single(options, job)
 
 
-def _resume(options: argparse.Namespace, changes: dict[str, Any]) -> int:
-    from sb3_quad.cli.closing import close_pipeline, close_run
-    from sb3_quad.training.pipeline import is_pipeline_run, resume_pipeline
-    from sb3_quad.training.trainer import resume
-
-    for name in given(options, *KEPT_BY_RESUME):
-        raise ConfigError(f"--resume keeps the run's own settings; remove {_flag(name)}")
-    folder = Path(options.resume)
-    start = time.perf_counter()
-    if is_pipeline_run(folder):
-        return close_pipeline(resume_pipeline(folder, **changes), time.perf_counter() - start)
-    return close_run(resume(options.resume, **changes))
-
-
-def _train_pipeline(options: argparse.Namespace, job: dict[str, Any]) -> int:
-    from sb3_quad.cli.closing import close_pipeline
-    from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
-
-    for name in given(options, *KEPT_BY_STAGES):
-        raise ConfigError(
-            f"{_flag(name)} goes with a single run (--algo, --env); "
-            f"a pipeline's stages have their own in {options.conf_file}"
-        )
-    start = time.perf_counter()
-    pipeline = with_settings(load_pipeline(options.conf_file), changed_settings(options))
-    result = run_pipeline(pipeline, job, Path(options.conf_file).stem)
-    return close_pipeline(result, time.perf_counter() - start)
-
-
-def _train_single(options: argparse.Namespace, job: dict[str, Any]) -> int:
-    from sb3_quad.base.validate import validate
-    from sb3_quad.cli.closing import close_run
-    from sb3_quad.training.config import TrainingJob, describe
-    from sb3_quad.training.trainer import train
-
-    content = {"config": make_config(options), **job}
-    checked = validate(TrainingJob, content, "command line")
-    print(describe(checked))
-    return close_run(train(checked))
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-def prepare(options: argparse.Namespace) -> None:
+def prepare(options: Namespace) -> None:
     """Import further environments, set the number of threads.
 
     :raises ConfigError: a module that cannot be imported.
@@ -206,10 +187,9 @@ def prepare(options: argparse.Namespace) -> None:
         torch.set_num_threads(options.num_threads)
 
 
-def make_config(options: argparse.Namespace) -> Any:
+def make_config(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.training.config.TrainingConfig` of a command line."""
-    from sb3_quad.training.config import load_config
-    from sb3_quad.training.successor import as_agent
+    from sb3_quad.training.config import as_agent, load_config
 
     algo = options.algo or DEFAULT_ALGO
     env = options.env or DEFAULT_ENV
@@ -222,6 +202,6 @@ def make_config(options: argparse.Namespace) -> Any:
     return config
 
 
-def changed_settings(options: argparse.Namespace) -> dict[str, Any]:
+def changed_settings(options: Namespace) -> StrDict:
     """Return the settings that a command line puts over a settings file."""
     return {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)}

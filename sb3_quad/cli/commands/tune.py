@@ -27,7 +27,7 @@ Ctrl-C keeps the finished trials. Needs Optuna: pip install '.[tune]' from a
 clone.
 """
 
-import argparse
+from argparse import Namespace
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -35,75 +35,48 @@ from typing import Any
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
-from sb3_quad.cli.parser import Parser, given, natural, positive, seed, whole
+from sb3_quad.cli.parser import Flags, Parser, add_flags, given, natural, positive, seed, whole
 
 JOURNAL = "study.log"
 # Episodes per evaluation by --vec-env.
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 
 
+FLAGS: Flags = {
+    "--n-trials N": (natural, 500, "trials of this process; 0 only writes the results (500)"),
+    "--max-total-trials N": (
+        positive,
+        None,
+        "trials of the whole study, without failed ones (no limit)",
+    ),
+    "--sampler NAME": (
+        str,
+        "tpe",
+        "method that proposes trials: tpe (default), random or cmaes",
+    ),
+    "--pruner NAME": (
+        str,
+        "median",
+        "method that stops poor trials early: median (default), halving or none",
+    ),
+    "--n-startup-trials N": (whole, 10, "random trials before sampler and pruner start (10)"),
+    "--n-evaluations N": (whole, 10, "evaluations per trial, for the pruner (10)"),
+    "--storage WHERE": "journal file, or URL of a database (study.log in the new folder)",
+    "--study-name NAME": "name of the study in the storage (ALGO_ENV)",
+    "--search-space FILE": "YAML file of settings to vary (the package's file for the algorithm)",
+    "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
+    "--seed N": (seed, None, "seed of trainings and sampler, negative for a random one (0)"),
+    "--eval-episodes N": (whole, None, "episodes per evaluation (batch: 240, else 48)"),
+}
+
+
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings."""
     add_settings(parser)
-    add = parser.add_argument
-    add(
-        "--n-trials",
-        type=natural,
-        default=500,
-        help="trials of this process; 0 only writes the results (500)",
-    )
-    add(
-        "--max-total-trials",
-        type=positive,
-        help="trials of the whole study, without failed ones (no limit)",
-    )
-    add(
-        "--sampler",
-        default="tpe",
-        metavar="NAME",
-        help="method that proposes trials: tpe (default), random or cmaes",
-    )
-    add(
-        "--pruner",
-        default="median",
-        metavar="NAME",
-        help="method that stops poor trials early: median (default), halving or none",
-    )
-    add(
-        "--n-startup-trials",
-        type=whole,
-        default=10,
-        help="random trials before sampler and pruner start (10)",
-    )
-    add(
-        "--n-evaluations",
-        type=whole,
-        default=10,
-        help="evaluations per trial, for the pruner (10)",
-    )
-    add(
-        "--storage",
-        metavar="WHERE",
-        help="journal file, or URL of a database (study.log in the new folder)",
-    )
-    add("--study-name", metavar="NAME", help="name of the study in the storage (ALGO_ENV)")
-    add(
-        "--search-space",
-        metavar="FILE",
-        help="YAML file of the settings to vary (the package's file for the algorithm)",
-    )
-    add(
-        "-f",
-        "--log-folder",
-        default="logs",
-        metavar="DIR",
-        help="results go to DIR/tune/ALGO/ENV_N (logs)",
-    )
-    add("--seed", type=seed, help="seed of trainings and sampler, negative for a random one (0)")
-    add("--eval-episodes", type=whole, help="episodes per evaluation (batch: 240, else 48)")
+    add_flags(parser, FLAGS)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Search, report, write. Returns the exit code."""
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.tuning.results import count_trials, trial_line, write_results
@@ -117,10 +90,10 @@ def run(options: argparse.Namespace) -> int:
             try:
                 for number in range(options.n_trials):
                     show(number, options.n_trials, "trials")
-                    if signals.received is not None:
+                    if signals.received:
                         break
                     trial = search.try_one(options.max_total_trials)
-                    if trial is None:
+                    if not trial:
                         break
                     write_results(search)
                     print(trial_line(search, trial))
@@ -130,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
     return signals.exit_code
 
 
-def _make_search(options: argparse.Namespace) -> Any:
+def _make_search(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.tuning.search.Search` of a command line, with a new folder for
     its results.
     """
@@ -187,7 +160,7 @@ def _print_results(search: Any) -> None:
         print(f"the best: {trial_line(search, best)}")
         path = Path(best.user_attrs[RUN])
         # A process on another machine may have trained it.
-        if config.task is not None and path.is_dir():
+        if config.task and path.is_dir():
             model = open_run(path).model
             flown = build_config(config.algo, config.env_id, settings_of(best))
             job = search.job.model_copy(update={"config": flown})
