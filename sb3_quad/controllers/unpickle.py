@@ -13,7 +13,6 @@ import re
 import sys
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -115,10 +114,9 @@ def _check_dtype(dtype: Any, state: Any) -> None:
 
 
 def _set_bit_generator(bit_generator: Any, state: Any) -> None:
+    # NumPy 2 adds the seeds. Only further generators would need them, and a space spawns none.
     if type(state) is tuple:
-        state, seeds = state
-        _check(type(seeds) is SeedSequence, "a random generator")
-        bit_generator.__init__(seeds)
+        state, _ = state
     bit_generator.state = state
 
 
@@ -132,18 +130,6 @@ def _generator(bit_generator: Any, *_: Any) -> Generator:
 
 def _set_generator(generator: Any, state: Any) -> None:
     generator.bit_generator.state = state
-
-
-def _set_seed_sequence(seeds: Any, state: Any) -> None:
-    # The third entry, the pool, follows from the others.
-    entropy, spawned, _, pool_size, spawn_key = state
-    seeds.__init__(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=spawned)
-
-
-def _member(kind: Any, value: Any) -> Any:
-    """Return the member of an enumeration."""
-    members = {member.value: member for member in kind}
-    return members[value]
 
 
 # Tables: what a pickle may name.
@@ -196,8 +182,9 @@ for _core in ("numpy.core", "numpy._core"):  # in NumPy 1 and 2
             ()
         ],
     }
+# Members of enumerations, by their values.
 for _key, _kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items():
-    _FUNCTIONS[_key] = partial(_member, _kind)
+    _FUNCTIONS[_key] = {member.value: member for member in _kind}.__getitem__
 # Arguments of these functions, which know by themselves what they make.
 _ARGUMENTS: Names = {key: key[1] for key in _by_name(np.ndarray, PCG64, SeedSequence)}
 # How an object that has been made gets its state.
@@ -205,7 +192,7 @@ _CHANGES: dict[type, Callable[[Any, Any], None]] = {
     np.ndarray: _fill_array,
     PCG64: _set_bit_generator,
     Generator: _set_generator,
-    SeedSequence: _set_seed_sequence,
+    SeedSequence: lambda *_: None,
 }
 for _code in "?bhilqBHILQefdgFDG":
     _CHANGES[type(np.dtype(_code))] = _check_dtype
@@ -273,49 +260,38 @@ def _update(items: Any, *new: Any) -> Any:
     return items
 
 
-def _add(items: Any, *new: Any) -> Any:
-    _check(type(items) is set, "a container")
-    items.update(new)
-    return items
-
-
 def _tuple(*items: Any) -> Any:
     return items
 
 
 # Opcodes that push their argument.
 _LITERALS = (
-    *("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"),
-    *("SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
-    *("SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"),
-)
+    "BININT BININT1 BININT2 LONG1 BINFLOAT SHORT_BINUNICODE BINUNICODE SHORT_BINBYTES BINBYTES "
+    "BYTEARRAY8"
+).split()
 # Opcodes that replace so many items of the stack by the result of a function.
 _OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "NONE": (0, lambda: None),
     "NEWTRUE": (0, lambda: True),
     "NEWFALSE": (0, lambda: False),
-    "EMPTY_TUPLE": (0, tuple),
+    "EMPTY_TUPLE": (0, _tuple),
     "EMPTY_LIST": (0, list),
     "EMPTY_DICT": (0, dict),
-    "EMPTY_SET": (0, set),
     "TUPLE1": (1, _tuple),
     "TUPLE2": (2, _tuple),
     "TUPLE3": (3, _tuple),
+    "TUPLE": (0, _tuple),
     "APPEND": (2, _extend),
+    "APPENDS": (1, _extend),
     "SETITEM": (3, _update),
+    "SETITEMS": (1, _update),
     "STACK_GLOBAL": (2, _find),
     "REDUCE": (2, _call),
     "NEWOBJ": (2, _new),
     "BUILD": (2, _change),
 }
-# The same for all items above the last mark, and so many below it.
-_MARK_OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
-    "TUPLE": (0, _tuple),
-    "FROZENSET": (0, lambda *items: frozenset(items)),
-    "APPENDS": (1, _extend),
-    "SETITEMS": (1, _update),
-    "ADDITEMS": (1, _add),
-}
+# These replace all items above the last mark as well.
+_TO_MARK = ("TUPLE", "APPENDS", "SETITEMS")
 
 
 def _interpret(content: bytes) -> Any:
@@ -323,7 +299,7 @@ def _interpret(content: bytes) -> Any:
 
     Known are the opcodes of protocols 4 and 5 that are used for what SB3 saves.
     """
-    memo: dict[int, Any] = {}
+    memo: list[Any] = []
     stack: list[Any] = []
     below: list[list[Any]] = []  # the stacks below each mark
     argument: Any
@@ -331,14 +307,13 @@ def _interpret(content: bytes) -> Any:
         name = opcode.name
         if name in _LITERALS:
             stack.append(argument)
-        elif name in _OPERATIONS or name in _MARK_OPERATIONS:
+        elif name in _OPERATIONS:
             # Take the items off the stack, and push the result.
             above: list[Any] = []
-            if name in _OPERATIONS:
-                count, operation = _OPERATIONS[name]
-            else:
-                count, operation = _MARK_OPERATIONS[name]
-                above, stack = stack, below.pop()
+            if name in _TO_MARK:
+                above = stack
+                stack = below.pop()
+            count, operation = _OPERATIONS[name]
             items = [stack.pop() for _ in range(count)]
             stack.append(operation(*reversed(items), *above))
         elif name == "GLOBAL":
@@ -347,19 +322,13 @@ def _interpret(content: bytes) -> Any:
         elif name == "MARK":
             below.append(stack)
             stack = []
-        elif name == "POP_MARK":
-            stack = below.pop()
         elif name == "POP":
             stack.pop()
         # The memo is how a pickle names an object twice.
         elif name == "MEMOIZE":
-            memo[len(memo)] = stack[-1]
-        elif name in ("BINPUT", "LONG_BINPUT"):
-            memo[argument] = stack[-1]
+            memo.append(stack[-1])
         elif name in ("BINGET", "LONG_BINGET"):
             stack.append(memo[argument])
-        elif name == "STOP":
-            return stack.pop()
         else:
-            _check(name in ("PROTO", "FRAME"), f"opcode {name}")
-    raise _Refusal("no end")
+            _check(name in ("PROTO", "FRAME", "STOP"), f"opcode {name}")
+    return stack.pop()
