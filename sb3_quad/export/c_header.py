@@ -2,14 +2,14 @@
 
 import re
 import textwrap
-from collections.abc import Mapping
 from typing import Any
 
 import jinja2
 import numpy as np
 
 from sb3_quad.base.arrays import Float32Array
-from sb3_quad.export.network import Network, StatefulNetwork
+from sb3_quad.base.types import StrDict
+from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 WIDTH = 110  # columns
@@ -21,7 +21,7 @@ def c_name(text: str) -> str:
     return name if name and not name[0].isdigit() else f"quad_{name}".rstrip("_")
 
 
-def write_header(network: Network, metadata: Mapping[str, str], name: str) -> bytes:
+def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     """Return the header, with ``static inline void NAME_policy(const float observation[18], float
     thrust[4])``.
 
@@ -32,20 +32,26 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
-    # The constants of the file, by name.
+    # The constants of the file, by name. Weights and biases alternate in a network.
     tables = {"mean": network.mean, "inverse_std": network.inverse_std}
-    for number, (layer, _) in enumerate(network.steps):
-        tables[f"weight_{number}"] = layer.weight
-        tables[f"bias_{number}"] = layer.bias
-    # A policy of the present features alone has no state, and gets a shorter function.
-    state: dict[str, Any] = {}
-    if isinstance(network, StatefulNetwork):
-        names = ("gain", "distance2", "speed2", "limit")
-        state = {
-            "observation": network.observation,
-            "integral": dict(zip(names, map(_number, network.integral or ()), strict=False)),
-            "keeps_actions": bool(network.actions),
-        }
+    for number, values in enumerate(network.parameters()):
+        kind = ("weight", "bias")[number % 2]
+        tables[f"{kind}_{number // 2}"] = values
+    text = render(
+        "policy.h.j2",
+        name=name,
+        comment=_comment(metadata),
+        tables=[_table(f"{name}_policy_{key}", value.numpy()) for key, value in tables.items()],
+        network=network,
+        features=OBSERVATION_SIZE,
+        position=F.position,
+        velocity=F.velocity,
+    )
+    return text.encode("ascii")
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill in a template of this folder."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sb3_quad.export", ""),
         undefined=jinja2.StrictUndefined,
@@ -53,24 +59,11 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    text = environment.get_template("policy.h.j2").render(
-        name=name,
-        guard=f"{name.upper()}_POLICY_H",
-        comment=_comment(metadata),
-        tables=[_table(f"{name}_policy_{key}", value.numpy()) for key, value in tables.items()],
-        layers=network.shapes,
-        features=OBSERVATION_SIZE,
-        position=F.position,
-        velocity=F.velocity,
-        result=network.result,
-        middle=_number(network.middle),
-        half_range=_number(network.half_range),
-        **{"keeps_actions": False, **state},
-    )
-    return text.encode("ascii")
+    environment.filters["c_number"] = _number
+    return environment.get_template(template).render(values)
 
 
-def _comment(metadata: Mapping[str, str]) -> list[str]:
+def _comment(metadata: StrDict) -> list[str]:
     lines: list[str] = []
     for key, value in metadata.items():
         # A file may have any name, but the name must neither end the comment nor leave ASCII.

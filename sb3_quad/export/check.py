@@ -2,14 +2,15 @@
 difference.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
-from sb3_quad.base.errors import ConfigError, ExportError
+from sb3_quad.base.errors import ExportError
+from sb3_quad.base.types import StrDict
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
@@ -18,9 +19,9 @@ from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.observation import (
     DEFAULT_MEAN,
     DEFAULT_STD,
-    FEATURES,
     GROUPS,
     OBSERVATION_SIZE,
+    turn_features,
 )
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
@@ -37,7 +38,6 @@ WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "bo
 # Here the position integral is at work from the first step on.
 NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
 ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
-PER_ROTOR = ("0", "1", "2", "3")  # the parts of a feature that has one number for each rotor
 
 
 class Reference(NamedTuple):
@@ -59,39 +59,9 @@ class Reference(NamedTuple):
     turn: Turn = Turn()
 
     @property
-    def turned_features(self) -> FloatArray:
-        """(OBSERVATION_SIZE, OBSERVATION_SIZE), from features in the vehicle's own body frame to
-        those that the policy knows.
-
-        :raises ConfigError: the layouts differ, and nobody knows how a feature turns with them.
-        """
-        matrix = np.eye(OBSERVATION_SIZE)
-        if self.turn == Turn():
-            return matrix
-        axes = self.turn.axes
-        blocks = {
-            "position": np.eye(3),  # in the world frame
-            "rotation": np.kron(axes, np.eye(3)),
-            "velocity": axes,
-            "body_rates": axes,
-        }
-        # Every feature needs a rule: a missing one must not turn into a wrong file.
-        for feature in FEATURES:
-            block = blocks.get(feature.name)
-            if block is None and feature.parts == PER_ROTOR:
-                block = np.eye(4)[[*self.turn.order]]
-            if block is None:
-                raise ConfigError(
-                    f"the feature {feature.name} has no rule for other rotor layouts; "
-                    "export for a vehicle in the layout of the training"
-                )
-            matrix[GROUPS[feature.name], GROUPS[feature.name]] = block
-        return matrix
-
-    @property
     def own_mean(self) -> FloatArray:
         """μ in the vehicle's own body frame, (OBSERVATION_SIZE,)."""
-        return self.mean @ self.turned_features
+        return self.mean @ turn_features(self.turn)
 
     def results(self, actions: npt.ArrayLike) -> FloatArray:
         """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape,
@@ -137,12 +107,7 @@ class Comparison(Hook):
     def __init__(self, reference: Reference, call: Call) -> None:
         self._reference = reference
         self._call = call
-        self._turned = reference.turned_features.astype(np.float32)
-        self._order = [*reference.turn.order]
-        integral = reference.observation.position_integral
-        self._limits = {}
-        if integral is not None:
-            self._limits = {"position": integral.distance, "velocity": integral.speed}
+        self._turned = turn_features(reference.turn).astype(np.float32)
         self._state = None
         self._sure = np.True_
         self.count = 0
@@ -158,16 +123,17 @@ class Comparison(Hook):
         # The present frame comes first in an observation. Unscaled, it is the file's input.
         scaled = observation[:, :OBSERVATION_SIZE]
         features = (scaled * self._reference.std + self._reference.mean).astype(np.float32)
-        if self._limits:
+        integral = self._reference.observation.position_integral
+        if integral is not None:
             # The position integral is a part of the observed position, and the file has its own.
             features[:, GROUPS["position"]] = state.position - state.target
-        # So close to a limit, rounding may begin to integrate one step earlier or later.
-        for group, limit in self._limits.items():
-            norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
-            self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
+            # So close to a limit, rounding may begin to integrate one step earlier or later.
+            for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
+                norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
+                self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
         # The file flies the vehicle in its own axes and order of rotors.
         results, self._state = self._call(features @ self._turned, self._state)
-        self._results = results[:, self._order]
+        self._results = results[:, self._reference.turn.order]
         self._compared = flying & self._sure
 
     def after_step(
@@ -193,7 +159,7 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
         finite.
     """
     # Far and fast starts, or long flights for a policy with a state.
-    changes: dict[str, Any] = {"task": "recovery_and_tracking", "task_kwargs": WIDE, "noise": 0.05}
+    changes: StrDict = {"task": "recovery_and_tracking", "task_kwargs": WIDE, "noise": 0.05}
     steps = SHORT
     if reference.observation.is_extended:
         changes = {"task": {"recovery_and_tracking": 1.0, NEAR: 1.0}, "noise": 0.0}
