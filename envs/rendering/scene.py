@@ -14,7 +14,7 @@ from sb3_quad.envs.rendering import models
 from sb3_quad.envs.rendering.camera import Camera
 from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, Colour, add_body, move_body
 from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Trail, backdrop, draw_trails
-from sb3_quad.simulation.state import POSITION, QUATERNION, QuadcopterState
+from sb3_quad.simulation.state import POSITION, QUATERNION
 from sb3_quad.vehicles.vehicle import Vehicle
 
 MARKER: Colour = (0.10, 0.72, 0.28, 1.0)
@@ -116,10 +116,10 @@ class Scene:
         drawn = Pillow.fromarray(bodies)
         draw_trails(drawn, trails, camera, depth)
         # The bodies lie over the backdrop where they are opaque.
-        small = np.asarray(drawn.reduce(SUPERSAMPLING), dtype=np.float32)
-        opacity = small[..., 3:] / 255.0
-        behind = 255.0 * backdrop(camera, self._shadows)
-        return np.asarray(behind + opacity * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
+        drawn = drawn.reduce(SUPERSAMPLING)
+        picture = Pillow.fromarray(backdrop(camera, self._shadows))
+        picture.paste(drawn, mask=drawn)
+        return np.array(picture)
 
     def close(self) -> None:
         """Give a client of its own back; calling it twice is fine."""
@@ -135,10 +135,9 @@ class _VehicleBodies:
         radius = size * models.rotor_radius(vehicle)
         places = size * np.array(vehicle.rotor_positions)
         self.centres = np.column_stack([places, np.full(len(places), 0.17 * arm)])
-        self.frame = [
-            add_body(parts, colour, client)
-            for colour, parts in models.frame(arm, self.centres).items()
-        ]
+        self.frame = []
+        for colour, parts in models.frame(arm, self.centres).items():
+            self.frame.append(add_body(parts, colour, client))
         self.rotors = []
         for (x, _), sense in zip(places, vehicle.rotor_directions, strict=True):
             # A rotor's drag on the body is opposed to its sense of turning.
@@ -160,10 +159,9 @@ class _VehicleBodies:
             moved = p.multiplyTransforms(position, attitude, centre, turned)
             move_body(self.client, body, *moved)
         # The wrench has a part in the world frame and one in the body frame.
-        rotation = QuadcopterState(pose.state[:, None]).rotation[0]
-        wrench = pose.wrench.reshape(2, 2, 3)
+        wrench = pose.wrench.reshape(2, 2, 3).tolist()
         for body, (in_world, in_body) in zip((self.force, self.torque), wrench, strict=True):
-            x, y, z = (in_world + rotation @ in_body).tolist()
+            x, y, z = np.add(in_world, p.rotateVector(attitude, in_body)).tolist()
             tilt = math.atan2(math.hypot(x, y), z)
             along = p.getQuaternionFromEuler((0.0, tilt, math.atan2(y, x)))
             move_body(self.client, body, position if any((x, y, z)) else NOWHERE, along)
