@@ -23,6 +23,7 @@ from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
 
+
 class Export(NamedTuple):
     """An exported policy, not yet on disk."""
 
