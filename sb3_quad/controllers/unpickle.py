@@ -12,7 +12,7 @@ import pickletools
 import re
 import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -71,9 +71,9 @@ def _check(fits: bool, what: str) -> None:
         raise _Refusal(what)
 
 
-def _is_one_of(value: Any, candidates: Iterable[Any]) -> bool:
+def _is_one_of(value: Any, names: Names) -> bool:
     """Compare by identity: equality could be an object's own method."""
-    return any(value is candidate for candidate in candidates)
+    return any(value is candidate for candidate in names.values())
 
 
 # Functions that stand for those that SB3's pickles call, and for the methods that set a state.
@@ -171,17 +171,12 @@ _FUNCTIONS: Names = {
     ("numpy.random._pickle", "__bit_generator_ctor"): lambda *_: PCG64(0),
     ("numpy.random._pickle", "__generator_ctor"): _generator,
     ("numpy.random.bit_generator", "__pyx_unpickle_SeedSequence"): lambda *_: SeedSequence(0),
+    ("numpy.core.numeric", "_frombuffer"): _array,
+    ("numpy.core.multiarray", "_reconstruct"): lambda *_: np.empty(0, np.int8),
+    ("numpy.core.multiarray", "scalar"): lambda dtype, content: _array(content, dtype, (), "C")[()],
     ("collections", "OrderedDict"): lambda: OrderedDict(),
     ("collections", "deque"): lambda _, length=None: deque(maxlen=length),
 }
-for _core in ("numpy.core", "numpy._core"):  # in NumPy 1 and 2
-    _FUNCTIONS |= {
-        (f"{_core}.numeric", "_frombuffer"): _array,
-        (f"{_core}.multiarray", "_reconstruct"): lambda *_: np.empty(0, np.int8),
-        (f"{_core}.multiarray", "scalar"): lambda dtype, content: _array(content, dtype, (), "C")[
-            ()
-        ],
-    }
 # Members of enumerations, by their values.
 for _key, _kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items():
     _FUNCTIONS[_key] = {member.value: member for member in _kind}.__getitem__
@@ -212,6 +207,8 @@ def _recurrent_names() -> Names:
 
 def _find(module: Any, name: Any) -> Any:
     _check(type(module) is str and type(name) is str, "a name")
+    # NumPy 2 moved its core.
+    module = module.replace("numpy._core.", "numpy.core.")
     names = _CLASSES | _FUNCTIONS | _ARGUMENTS
     if module.startswith("sb3_contrib.common.recurrent."):
         names |= _recurrent_names()
@@ -221,8 +218,7 @@ def _find(module: Any, name: Any) -> Any:
 
 
 def _call(function: Any, arguments: Any) -> Any:
-    _check(_is_one_of(function, _FUNCTIONS.values()), "a call")
-    _check(type(arguments) is tuple, "a call")
+    _check(_is_one_of(function, _FUNCTIONS) and type(arguments) is tuple, "a call")
     return function(*arguments)
 
 
@@ -230,7 +226,7 @@ def _new(kind: Any, arguments: Any) -> Any:
     _check(type(arguments) is tuple, "an instance")
     if kind is TrainFreq:
         return TrainFreq(*arguments)
-    _check(_is_one_of(kind, _WITH_ATTRIBUTES.values()) and not arguments, "an instance")
+    _check(_is_one_of(kind, _WITH_ATTRIBUTES) and not arguments, "an instance")
     return kind.__new__(kind)
 
 
@@ -239,7 +235,7 @@ def _change(instance: Any, state: Any) -> Any:
     if kind in _CHANGES:
         _CHANGES[kind](instance, state)
         return instance
-    _check(_is_one_of(kind, _WITH_ATTRIBUTES.values()) and type(state) is dict, "a state")
+    _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")
     _check(all(type(name) is str and not name.startswith("__") for name in state), "attributes")
     if hasattr(kind, "__setstate__"):
         kind.__setstate__(instance, state)
@@ -265,10 +261,18 @@ def _tuple(*items: Any) -> Any:
 
 
 # Opcodes that push their argument.
-_LITERALS = (
-    "BININT BININT1 BININT2 LONG1 BINFLOAT SHORT_BINUNICODE BINUNICODE SHORT_BINBYTES BINBYTES "
-    "BYTEARRAY8"
-).split()
+_LITERALS = [
+    "BININT",
+    "BININT1",
+    "BININT2",
+    "LONG1",
+    "BINFLOAT",
+    "SHORT_BINUNICODE",
+    "BINUNICODE",
+    "SHORT_BINBYTES",
+    "BINBYTES",
+    "BYTEARRAY8",
+]
 # Opcodes that replace so many items of the stack by the result of a function.
 _OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "NONE": (0, lambda: None),

@@ -4,12 +4,11 @@ import re
 import textwrap
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.types import StrDict
 from sb3_quad.export.network import Network
+from sb3_quad.export.templates import c_number, render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 WIDTH = 110  # columns
@@ -32,35 +31,16 @@ def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
-    # The constants of the file, by name. Weights and biases alternate in a network.
-    tables = {"mean": network.mean, "inverse_std": network.inverse_std}
-    for number, values in enumerate(network.parameters()):
-        kind = ("weight", "bias")[number % 2]
-        tables[f"{kind}_{number // 2}"] = values
     text = render(
         "policy.h.j2",
         name=name,
         comment=_comment(metadata),
-        tables=[_table(f"{name}_policy_{key}", value.numpy()) for key, value in tables.items()],
+        table=_table,
         network=network,
         features=OBSERVATION_SIZE,
-        position=F.position,
-        velocity=F.velocity,
+        F=F,
     )
     return text.encode("ascii")
-
-
-def render(template: str, **values: Any) -> str:
-    """Fill in a template of this folder."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sb3_quad.export", ""),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["c_number"] = _number
-    return environment.get_template(template).render(values)
 
 
 def _comment(metadata: StrDict) -> list[str]:
@@ -73,14 +53,12 @@ def _comment(metadata: StrDict) -> list[str]:
     return lines
 
 
-def _number(value: Any) -> str:
-    """Return the fewest digits that tell a float32 from any other."""
-    return f"{np.float32(value)!s}f"
-
-
-def _table(name: str, values: Float32Array) -> str:
+def _table(name: str, tensor: Any) -> str:
+    values = tensor.numpy()
     size = "".join(f"[{length}]" for length in values.shape)
     # NumPy's brackets become C's braces.
-    with np.printoptions(threshold=values.size, linewidth=WIDTH, formatter={"float_kind": _number}):
+    with np.printoptions(
+        threshold=values.size, linewidth=WIDTH, formatter={"float_kind": c_number}
+    ):
         rows = np.array2string(values, separator=", ").translate(str.maketrans("[]", "{}"))
     return f"{name}{size} =\n{rows}"

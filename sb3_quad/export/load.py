@@ -17,6 +17,7 @@ from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
+from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 N_ROTORS = 4
@@ -39,7 +40,7 @@ def load_torchscript(content: bytes) -> tuple[Call, str]:
     def run(*inputs: Float32Array) -> Sequence[Float32Array]:
         outputs = module(*map(th.from_numpy, inputs))
         if not size:
-            return [outputs.numpy()]
+            outputs = [outputs]
         return [output.numpy() for output in outputs]
 
     return _call(run, size), f"torch {th.__version__}"
@@ -68,14 +69,13 @@ def load_onnx(content: bytes) -> tuple[Call, str]:
 def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
     """:param size: numbers in a state of ``run``; 0: it takes and gives none."""
 
-    def call(rows: Float32Array, state: Float32Array | None = None) -> tuple[Float32Array, Any]:
+    def call(rows: Float32Array, state: Any = None) -> Any:
         if not size:
             return run(rows)[0], None
         # Zeros begin a flight.
         if state is None:
             state = np.zeros((len(rows), size), dtype=np.float32)
-        results, following = run(rows, state)
-        return results, following
+        return tuple(run(rows, state))
 
     return call
 
@@ -93,26 +93,16 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
             "--format c needs a C compiler, to check what it writes: "
             "install gcc or clang (apt install gcc)"
         )
-    # The program below also flies a policy without a state, by a state that it does not use.
-    declarations = f"typedef char {name}_state;\n#define {name}_reset(state) (*(state) = 0)\n"
-    argument = ""
-    if f"}} {name}_state;".encode() in content:
-        declarations = ""
-        argument = "&states[k], "
-    program = f"""\
-#include "policy.h"
-{declarations}int size(void) {{ return (int)sizeof({name}_state); }}
-void run(const float *in, float *out, {name}_state *states, int begin, long n)
-{{
-    for (long k = 0; k < n; ++k) {{
-        if (begin) {name}_reset(&states[k]);
-        {name}_policy({argument}in + {OBSERVATION_SIZE} * k, out + {N_ROTORS} * k);
-    }}
-}}
-"""
+    program = render(
+        "run.c.j2",
+        name=name,
+        stateful=f"}} {name}_state;".encode() in content,
+        features=OBSERVATION_SIZE,
+        rotors=N_ROTORS,
+    )
     library = _compile(compiler, content, program)
 
-    def call(rows: Float32Array, state: Any = None) -> tuple[Float32Array, Any]:
+    def call(rows: Float32Array, state: Any = None) -> Any:
         begins = state is None
         if begins:
             # A new struct holds anything before its reset.

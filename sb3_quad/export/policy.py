@@ -11,13 +11,14 @@ from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import load
-from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.export.c_header import c_name, render, write_header
+from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare, make_reference
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
+from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
@@ -120,7 +121,8 @@ def _describe(
         vehicle=vehicle,
         # The limits of the results are those of the extreme actions.
         limits=reference.results([-1.0, 1.0]),
-        features=[(feature, GROUPS[feature.name]) for feature in FEATURES],
+        features=FEATURES,
+        places=GROUPS,
         n_parameters=parameters_to_vector(network.parameters()).numel(),
         needs=network.observation.model_dump(mode="json"),
     )

@@ -1,6 +1,6 @@
 """Recorded flights to be shown: the same episodes for all controllers, on PyBullet."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -77,6 +77,14 @@ class Recording:
         """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
         wrench = self.wrench_around(step, seconds)
         return Pose(self.state.array[:, step], wrench, self.rotor_angles[step])
+
+
+def landmarks(recordings: Iterable[Recording]) -> FloatArray:
+    """Return the points and targets of flights, from which a camera is chosen, (n, 3), m."""
+    points = []
+    for recording in recordings:
+        points += [recording.state.position, recording.targets]
+    return np.concatenate(points)
 
 
 class Setting(NamedTuple):

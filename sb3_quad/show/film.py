@@ -22,7 +22,7 @@ from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_came
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
-from sb3_quad.show.episodes import Recording
+from sb3_quad.show.episodes import Recording, landmarks
 from sb3_quad.show.labels import side_by_side, with_header
 
 FPS = 25
@@ -93,20 +93,13 @@ def film_frames(
     :param speed: of time in the film; 0.5 is slow motion.
     """
     times = frame_times(recordings, speed)
-    forward = _direction(recordings)
+    # One direction for all panels, so that their flights can be compared.
+    forward = broadside(landmarks(recordings))
     lens = Lens(width, height)
     panels = [_panel(recording, times, forward, lens) for recording in recordings]
     # Frame by frame, because a film does not fit into memory.
     for pictures in zip(*panels, strict=True):
         yield side_by_side(pictures, PANELS_ABREAST)
-
-
-def _direction(recordings: Sequence[Recording]) -> FloatArray:
-    """Return the direction in which all cameras look, so that flights can be compared, (3,)."""
-    points = []
-    for recording in recordings:
-        points += [recording.state.position[::5], recording.targets]
-    return broadside(np.concatenate(points))
 
 
 def following_cameras(
@@ -197,7 +190,7 @@ def show_in_window(
 
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
-    forward = _direction(recordings)
+    forward = broadside(landmarks(recordings))
     cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
     # The number of the frame follows the clock, so that flights are shown in real time.
     begun = time.perf_counter()

@@ -39,8 +39,19 @@ DEFAULT_AGENTS = (
 )
 LIMIT = 500_000  # bytes of a page, above which the largest networks are rounded to half precision
 # The modules of the page in the order of their imports: those that need no browser, and the others.
-MODEL = "tables vehicle dynamics observation network experts flight weights".split()
-VIEW = "fleet camera airframe scene plots hand player board controls app".split()
+MODEL = ["tables", "vehicle", "dynamics", "observation", "network", "experts", "flight", "weights"]
+VIEW = [
+    "fleet",
+    "camera",
+    "airframe",
+    "scene",
+    "plots",
+    "hand",
+    "player",
+    "board",
+    "controls",
+    "app",
+]
 EXPERTS = ("pid", "geometric")
 FEATURES = {"position", "rotation", "velocity", "body_rates"}  # that observation.js computes
 TABLES = {
