@@ -144,7 +144,7 @@ def test_trails_are_hidden_by_what_is_before_them(distance, seen):
     points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0], [distance, 0.0, 0.5]])
     picture = Image.new("RGBA", (80, 40))
     draw_trails(
-        picture, [Trail(points, "red", 0.1)], looking_along_x(), np.full((40, 80), 5.0, np.float32)
+        picture, [Trail(points, "red")], looking_along_x(), np.full((40, 80), 5.0, np.float32)
     )
     drawn = np.asarray(picture)
     assert (drawn[..., 3] == 255).any() == (drawn[..., 3] > 0).any() == seen

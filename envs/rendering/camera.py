@@ -59,12 +59,12 @@ def direction(course: float, elevation: float) -> FloatArray:
 
 
 def broadside(points: FloatArray) -> FloatArray:
-    """Return the direction, (3,), in which a camera sees the spread of ``points``, (n, 3), best; a
-    little downwards.
+    """Return the direction, (3,), in which a camera sees the spread of points best; a little
+    downwards.
+
+    :param points: (n, 3), n > 1.
     """
-    spread = np.eye(2)
-    if len(points) > 2:
-        spread = np.cov(points[:, :2].T)
+    spread = np.cov(points[:, :2].T)
     # The direction of the least spread. Of its two signs always the same one is taken, so that
     # similar flights are seen from the same side.
     x, y = np.linalg.eigh(spread)[1][:, 0]

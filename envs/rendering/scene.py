@@ -70,7 +70,6 @@ class Scene:
         self._targets = [
             [add_body(parts, MARKER, client) for parts in shapes] for _ in range(n_targets)
         ]
-        self._shadows = np.zeros((0, 3))
 
     def place(self, poses: Sequence[Pose], targets: FloatArray) -> None:
         """Move everything: a pose for each vehicle, and ``targets``, (n_targets, 3)."""
@@ -78,15 +77,13 @@ class Scene:
             vehicle.place(pose)
         positions = np.array([pose.state[POSITION] for pose in poses])
         # Only the last vehicle has a shadow: those of all poses would blacken the ground.
-        shadows = [[*positions[-1, :2], self.span]]
+        self._shadow = np.float32([*positions[-1, :2], self.span])
         for target, bodies in zip(targets, self._targets, strict=True):
             for body in bodies:
                 move_body(self.client, body, target.tolist())
             # The ball would hide a vehicle in it.
             if np.linalg.norm(positions - target, axis=1).min() < 0.7 * self.scale:
                 move_body(self.client, bodies[0], NOWHERE)
-            shadows.append([*target[:2], RING * self.scale])
-        self._shadows = np.array(shadows)
 
     def picture(self, camera: Camera, trails: Sequence[Trail] = ()) -> Image:
         """Draw the scene: uint8 (height, width, 3)."""
@@ -117,7 +114,7 @@ class Scene:
         draw_trails(drawn, trails, camera, depth)
         # The bodies lie over the backdrop where they are opaque.
         drawn = drawn.reduce(SUPERSAMPLING)
-        picture = Pillow.fromarray(backdrop(camera, self._shadows))
+        picture = Pillow.fromarray(backdrop(camera, self._shadow))
         picture.paste(drawn, mask=drawn)
         return np.array(picture)
 

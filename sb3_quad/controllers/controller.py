@@ -90,8 +90,8 @@ class Controller:
 
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
-        self._low: Float32Array = action_space.low.reshape(-1).astype(np.float32)
-        self._high: Float32Array = action_space.high.reshape(-1).astype(np.float32)
+        self._low = action_space.low.ravel().astype(np.float32)
+        self._high = action_space.high.ravel().astype(np.float32)
 
     @staticmethod
     def for_env(

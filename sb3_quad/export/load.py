@@ -100,7 +100,18 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
         features=OBSERVATION_SIZE,
         rotors=N_ROTORS,
     )
-    library = _compile(compiler, content, program)
+    with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
+        Path(folder, "policy.h").write_bytes(content)
+        Path(folder, "run.c").write_text(program, encoding="ascii")
+        command = (compiler, *FLAGS, "-shared", "-fPIC", "-o", "run.so", "run.c", "-lm")
+        try:
+            subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+            library = ctypes.CDLL(f"{folder}/run.so")
+        except (subprocess.CalledProcessError, OSError) as error:
+            reason = one_line(error)
+            if isinstance(error, subprocess.CalledProcessError):
+                reason = f"{compiler} failed ({' '.join(error.stderr.split())[:200]})"
+            raise ExportError(f"the C header cannot be checked: {reason}") from None
 
     def call(rows: Float32Array, state: Any = None) -> Any:
         begins = state is None
@@ -113,19 +124,3 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
         return results, state
 
     return call, f"{compiler} {' '.join(FLAGS)}"
-
-
-def _compile(compiler: str, header: bytes, program: str) -> ctypes.CDLL:
-    """Compile and load a program that includes the header as ``policy.h``."""
-    with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
-        Path(folder, "policy.h").write_bytes(header)
-        Path(folder, "run.c").write_text(program, encoding="ascii")
-        command = (compiler, *FLAGS, "-shared", "-fPIC", "-o", "run.so", "run.c", "-lm")
-        try:
-            subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-            return ctypes.CDLL(str(Path(folder, "run.so")))
-        except subprocess.CalledProcessError as error:
-            reason = f"{compiler} failed ({' '.join(error.stderr.split())[:200]})"
-        except OSError as error:
-            reason = one_line(error)
-    raise ExportError(f"the C header cannot be checked: {reason}")

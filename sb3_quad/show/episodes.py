@@ -61,7 +61,7 @@ class Recording:
 
     def at(self, seconds: float) -> int:
         """The index of the last state not later than ``seconds``."""
-        return max(0, int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1)
+        return int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1
 
     def vehicle_and_target(self, step: int) -> FloatArray:
         """The positions of both, (2, 3), world frame, m."""

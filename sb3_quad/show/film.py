@@ -146,7 +146,7 @@ def _panel(
             # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
             flown = recording.state.position[: step + 1 : 2]
-            pixels = scene.picture(camera, [Trail(flown, recording.colour, 0.03 * scene.scale)])
+            pixels = scene.picture(camera, [Trail(flown, recording.colour)])
             lines = [_caption(recording, step)]
             yield with_header(pixels, recording.name, lines, recording.colour, font_size)
 

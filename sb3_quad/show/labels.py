@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -20,10 +19,9 @@ GAP = 4  # between pictures side by side, pixels
 
 
 @cache
-def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+def font(size: int, name: str = "DejaVuSans") -> ImageFont.FreeTypeFont:
     """DejaVu Sans, ``size`` in pixels."""
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", name)), size)
+    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/{name}.ttf", size)
 
 
 def tag_size(text: str, size: int) -> tuple[float, float]:
@@ -58,7 +56,7 @@ def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, 
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, 0, bar, band - 1), fill=colour)
     column = bar + 0.7 * size
-    draw.text((column, 0.35 * size), heading, font=font(size, bold=True), fill=INK)
+    draw.text((column, 0.35 * size), heading, font=font(size, "DejaVuSans-Bold"), fill=INK)
     for number, line in enumerate(lines, 1):
         row = (0.35 + number * STEP) * size
         draw.text((column, row), line, font=font(round(SMALLER * size)), fill=INK)

@@ -98,7 +98,7 @@ def pose_steps(recording: Recording, view: View) -> list[int]:
 
 def _panel(recording: Recording, view: View) -> Image:
     steps = pose_steps(recording, view)
-    trail = Trail(recording.state.position, recording.colour, 0.05 * view.breadth)
+    trail = Trail(recording.state.position, recording.colour)
     targets = recording.targets
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
