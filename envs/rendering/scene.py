@@ -1,7 +1,6 @@
 """Scenes and their pictures: vehicles in poses, targets and arrows, in a PyBullet client."""
 
 import math
-import weakref
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from sb3_quad.envs.rendering import models
 from sb3_quad.envs.rendering.camera import Camera
 from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, Colour, add_body, move_body
 from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Trail, backdrop, draw_trails
+from sb3_quad.envs.rendering.window import disconnect
 from sb3_quad.simulation.state import POSITION, QUATERNION
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -53,9 +53,6 @@ class Scene:
     ) -> None:
         if client is None:
             client = int(p.connect(p.DIRECT))
-            # PyBullet's clients are limited. So this one is also given back when the object is
-            # forgotten without close().
-            self._close = weakref.finalize(self, p.disconnect, client)
         self.client = client
         # Distances in pictures are multiples of the scale.
         self.scale = size * vehicle.arm_length / REFERENCE_ARM
@@ -120,7 +117,7 @@ class Scene:
 
     def close(self) -> None:
         """Give a client of its own back; calling it twice is fine."""
-        self._close()
+        disconnect(self.client)
 
 
 class _VehicleBodies:

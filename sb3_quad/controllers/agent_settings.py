@@ -48,7 +48,20 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
 
 
 def _settings_of_zip(record: StrDict, where: str) -> FlightSettings:
-    _refuse_paths(record, where)
+    # A path in a zip from a stranger could name a device file, which is read forever. Both a vehicle
+    # and a distribution may be given by a name, which could be a path.
+    distribution = record.get("vehicles")
+    if isinstance(distribution, dict):
+        distribution = distribution.get("distribution")
+    for key, folder, source in (
+        ("rotor_layout", VEHICLES, record.get("rotor_layout")),
+        ("vehicles", DISTRIBUTIONS, distribution),
+    ):
+        if isinstance(source, str) and folder.is_path(source):
+            raise ConfigError(
+                f"{where}: {key}: {source!r} is a path; "
+                "a zip holds such files or names those of the package"
+            )
     # A task is saved by its fields; a mixture holds weights by name instead.
     task = record.get("task")
     if isinstance(task, dict) and "name" in task:
@@ -78,26 +91,6 @@ def _settings_of_run(config: Path) -> FlightSettings:
     for part in parts:
         given |= parse_mapping(part, where)
     return validate(FlightSettings, given, where)
-
-
-def _refuse_paths(record: StrDict, where: str) -> None:
-    """Reject file paths in untrusted zips: reading a device file could block forever.
-
-    :raises ConfigError: the record holds a path where a name may stand.
-    """
-    # Both a vehicle and a distribution may be given by a name, which could be a path.
-    distribution = record.get("vehicles")
-    if isinstance(distribution, dict):
-        distribution = distribution.get("distribution")
-    for key, folder, source in (
-        ("rotor_layout", VEHICLES, record.get("rotor_layout")),
-        ("vehicles", DISTRIBUTIONS, distribution),
-    ):
-        if isinstance(source, str) and folder.is_path(source):
-            raise ConfigError(
-                f"{where}: {key}: {source!r} is a path; "
-                "a zip holds such files or names those of the package"
-            )
 
 
 def env_kwargs(agent: StrPath) -> StrDict:

@@ -22,7 +22,8 @@ from stable_baselines3.common import buffers, noise, policies, torch_layers, uti
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.dqn import policies as dqn
-from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
+from stable_baselines3.her import GoalSelectionStrategy
+from stable_baselines3.her import her_replay_buffer as her
 from stable_baselines3.sac import policies as sac
 from stable_baselines3.td3 import policies as td3
 from torch import nn, optim
@@ -30,10 +31,9 @@ from torch import nn, optim
 from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import TRUST_VARIABLE
+from sb3_quad.base.types import StrDict
 
 WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {TRUST_VARIABLE}=1)"
-Names = dict[tuple[str, str], Any]
-"""Objects by module and name."""
 
 
 def unpickle(text: str, where: str) -> Any:
@@ -71,7 +71,7 @@ def _check(fits: bool, what: str) -> None:
         raise _Refusal(what)
 
 
-def _is_one_of(value: Any, names: Names) -> bool:
+def _is_one_of(value: Any, names: StrDict) -> bool:
     """Compare by identity: equality could be an object's own method."""
     return any(value is candidate for candidate in names.values())
 
@@ -135,53 +135,64 @@ def _set_generator(generator: Any, state: Any) -> None:
 # Tables: what a pickle may name.
 
 
-def _by_name(*classes: type) -> Names:
-    return {(kind.__module__, kind.__qualname__): kind for kind in classes}
+def _by_name(*classes: type) -> StrDict:
+    return {f"{kind.__module__}.{kind.__qualname__}": kind for kind in classes}
 
 
-def _members(module: Any, names: str) -> Names:
-    return _by_name(*[getattr(module, name) for name in names.split()])
+def _members(names: dict[Any, str]) -> StrDict:
+    """Return classes by their full names.
+
+    :param names: the names of the classes in each module.
+    """
+    classes = []
+    for module, text in names.items():
+        classes += [getattr(module, name) for name in text.split()]
+    return _by_name(*classes)
 
 
 # Instances of these classes are made, and get attributes.
-_WITH_ATTRIBUTES = (
-    _members(spaces, "Box Dict Discrete MultiBinary MultiDiscrete")
-    | _members(noise, "NormalActionNoise OrnsteinUhlenbeckActionNoise VectorizedActionNoise")
-    | _members(utils, "ConstantSchedule FloatSchedule LinearSchedule")
+_WITH_ATTRIBUTES = _members(
+    {
+        spaces: "Box Dict Discrete MultiBinary MultiDiscrete",
+        noise: "NormalActionNoise OrnsteinUhlenbeckActionNoise VectorizedActionNoise",
+        utils: "ConstantSchedule FloatSchedule LinearSchedule",
+    }
 )
+_NAMED = {
+    policies: "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy",
+    sac: "SACPolicy CnnPolicy MultiInputPolicy",
+    td3: "TD3Policy CnnPolicy MultiInputPolicy",
+    dqn: "DQNPolicy CnnPolicy MultiInputPolicy",
+    torch_layers: "FlattenExtractor NatureCNN CombinedExtractor",
+    buffers: ("RolloutBuffer DictRolloutBuffer ReplayBuffer DictReplayBuffer NStepReplayBuffer"),
+    her: "HerReplayBuffer",
+    nn: (
+        "CELU ELU GELU Hardswish Hardtanh LeakyReLU Mish ReLU ReLU6 SELU Sigmoid SiLU Softplus "
+        "Softsign Tanh"
+    ),
+    optim: "Adagrad Adam Adamax AdamW NAdam RAdam RMSprop SGD",
+    np: "float32 float64",
+}
 # The others of these are only named, but for TrainFreq, a named tuple.
-_CLASSES = (
-    _WITH_ATTRIBUTES
-    | _members(policies, "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy")
-    | _members(sac, "SACPolicy CnnPolicy MultiInputPolicy")
-    | _members(td3, "TD3Policy CnnPolicy MultiInputPolicy")
-    | _members(dqn, "DQNPolicy CnnPolicy MultiInputPolicy")
-    | _members(torch_layers, "FlattenExtractor NatureCNN CombinedExtractor")
-    | _members(buffers, "RolloutBuffer DictRolloutBuffer ReplayBuffer DictReplayBuffer")
-    | _members(buffers, "NStepReplayBuffer")
-    | _members(nn, "CELU ELU GELU Hardswish Hardtanh LeakyReLU Mish ReLU ReLU6 SELU Sigmoid SiLU")
-    | _members(nn, "Softplus Softsign Tanh")
-    | _members(optim, "Adagrad Adam Adamax AdamW NAdam RAdam RMSprop SGD")
-    | _by_name(RMSpropTFLike, HerReplayBuffer, TrainFreq, np.float32, np.float64)
-)
+_CLASSES = _WITH_ATTRIBUTES | _members(_NAMED) | _by_name(RMSpropTFLike, TrainFreq)
 # The function that is called for a name. Items and state of its result follow in the pickle.
-_FUNCTIONS: Names = {
-    ("numpy", "dtype"): _dtype,
+_FUNCTIONS: StrDict = {
+    "numpy.dtype": _dtype,
     # Gymnasium's spaces have no other bit generator.
-    ("numpy.random._pickle", "__bit_generator_ctor"): lambda *_: PCG64(0),
-    ("numpy.random._pickle", "__generator_ctor"): _generator,
-    ("numpy.random.bit_generator", "__pyx_unpickle_SeedSequence"): lambda *_: SeedSequence(0),
-    ("numpy.core.numeric", "_frombuffer"): _array,
-    ("numpy.core.multiarray", "_reconstruct"): lambda *_: np.empty(0, np.int8),
-    ("numpy.core.multiarray", "scalar"): lambda dtype, content: _array(content, dtype, (), "C")[()],
-    ("collections", "OrderedDict"): lambda: OrderedDict(),
-    ("collections", "deque"): lambda _, length=None: deque(maxlen=length),
+    "numpy.random._pickle.__bit_generator_ctor": lambda *_: PCG64(0),
+    "numpy.random._pickle.__generator_ctor": _generator,
+    "numpy.random.bit_generator.__pyx_unpickle_SeedSequence": lambda *_: SeedSequence(0),
+    "numpy.core.numeric._frombuffer": _array,
+    "numpy.core.multiarray._reconstruct": lambda *_: np.empty(0, np.int8),
+    "numpy.core.multiarray.scalar": lambda dtype, content: _array(content, dtype, (), "C")[()],
+    "collections.OrderedDict": lambda: OrderedDict(),
+    "collections.deque": lambda _, length=None: deque(maxlen=length),
 }
 # Members of enumerations, by their values.
 for _key, _kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items():
     _FUNCTIONS[_key] = {member.value: member for member in _kind}.__getitem__
 # Arguments of these functions, which know by themselves what they make.
-_ARGUMENTS: Names = {key: key[1] for key in _by_name(np.ndarray, PCG64, SeedSequence)}
+_ARGUMENTS = {key: key for key in _by_name(np.ndarray, PCG64, SeedSequence)}
 # How an object that has been made gets its state.
 _CHANGES: dict[type, Callable[[Any, Any], None]] = {
     np.ndarray: _fill_array,
@@ -193,13 +204,17 @@ for _code in "?bhilqBHILQefdgFDG":
     _CHANGES[type(np.dtype(_code))] = _check_dtype
 
 
-def _recurrent_names() -> Names:
+def _recurrent_names() -> StrDict:
     recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
     return _members(
-        recurrent.policies,
-        "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
-        "RecurrentMultiInputActorCriticPolicy",
-    ) | _members(recurrent.buffers, "RecurrentRolloutBuffer RecurrentDictRolloutBuffer")
+        {
+            recurrent.policies: (
+                "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
+                "RecurrentMultiInputActorCriticPolicy"
+            ),
+            recurrent.buffers: "RecurrentRolloutBuffer RecurrentDictRolloutBuffer",
+        }
+    )
 
 
 # What the opcodes do. Each function takes the items of the stack and returns what replaces them.
@@ -208,13 +223,13 @@ def _recurrent_names() -> Names:
 def _find(module: Any, name: Any) -> Any:
     _check(type(module) is str and type(name) is str, "a name")
     # NumPy 2 moved its core.
-    module = module.replace("numpy._core.", "numpy.core.")
+    full_name = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
     names = _CLASSES | _FUNCTIONS | _ARGUMENTS
-    if module.startswith("sb3_contrib.common.recurrent."):
+    if full_name.startswith("sb3_contrib.common.recurrent."):
         names |= _recurrent_names()
-    if (module, name) not in names:
-        raise _UnknownName(f"{module}.{name}".encode("unicode_escape").decode()[:200])
-    return names[module, name]
+    if full_name not in names:
+        raise _UnknownName(full_name.encode("unicode_escape").decode()[:200])
+    return names[full_name]
 
 
 def _call(function: Any, arguments: Any) -> Any:
