@@ -16,16 +16,16 @@ from sb3_quad.vehicles.vehicle import Vehicle
 Vector: TypeAlias = tuple[float, float, float]
 Colour: TypeAlias = tuple[float, float, float, float]
 
-DARK: Colour = (0.13, 0.14, 0.17, 1.0)
-GREY: Colour = (0.55, 0.58, 0.62, 1.0)
-FRONT: Colour = (0.93, 0.32, 0.10, 1.0)
-WHITE: Colour = (0.92, 0.93, 0.95, 1.0)
+DARK = (0.13, 0.14, 0.17, 1.0)
+GREY = (0.55, 0.58, 0.62, 1.0)
+FRONT = (0.93, 0.32, 0.10, 1.0)
+WHITE = (0.92, 0.93, 0.95, 1.0)
 # The drawn rotors turn so much slower than real ones, which would seem to stand or turn backwards
 # in a film.
 SLOWED = 12.0
 # The three steps of an arrow's head: height, in its length, and radius, in its radius.
 HEAD = ((0.75, 2.4), (0.85, 1.6), (0.95, 0.8))
-NOWHERE: Vector = (0.0, 0.0, -1000.0)
+NOWHERE = (0.0, 0.0, -1000.0)
 
 
 class Part(NamedTuple):
@@ -82,7 +82,7 @@ def span(vehicle: Vehicle) -> float:
 
 def rotor_turning(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
     """Return the rates of the drawn rotors about body z, of rotor speeds (..., 4), rad/s."""
-    return np.asarray(-np.sign(vehicle.rotor_directions) * speeds / SLOWED)
+    return -np.sign(vehicle.rotor_directions) * speeds / SLOWED
 
 
 def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:

@@ -17,10 +17,10 @@ from sb3_quad.envs.rendering.camera import Camera, Lens
 NEAR = 0.05  # distances between which bodies are drawn, m
 FAR = 120.0
 SUPERSAMPLING = 2  # PyBullet's software renderer draws hard edges
-SKY_HORIZON = np.float32([0.87, 0.92, 0.96])
-SKY_ZENITH = np.float32([0.36, 0.58, 0.86])
-GROUND_LIGHT = np.float32([0.61, 0.69, 0.55])
-GROUND_DARK = np.float32([0.50, 0.60, 0.46])
+SKY_HORIZON = np.array([0.87, 0.92, 0.96], np.float32)
+SKY_ZENITH = np.array([0.36, 0.58, 0.86], np.float32)
+GROUND_LIGHT = np.array([0.61, 0.69, 0.55], np.float32)
+GROUND_DARK = np.array([0.50, 0.60, 0.46], np.float32)
 SQUARE = 2.0  # side of the ground's squares, m
 SHADOW = 0.45  # share of the light that a shadow takes
 VISIBILITY = 90.0  # distance at which 1/e of the ground is still seen through the haze, m
@@ -62,7 +62,7 @@ def backdrop(camera: Camera, shadow: Float32Array) -> Image:
     ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
     # The share of the ground that is seen through the haze.
     haze = np.exp(distance / -VISIBILITY)[..., None]
-    return np.asarray(255.0 * (sky + haze * (ground - sky)) + 0.5, dtype=np.uint8)
+    return np.asarray(255.0 * (sky + haze * (ground - sky)) + 0.5, np.uint8)
 
 
 def draw_trails(

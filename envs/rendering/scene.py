@@ -11,15 +11,15 @@ from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.envs.rendering import models
 from sb3_quad.envs.rendering.camera import Camera
-from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, Colour, add_body, move_body
+from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, add_body, move_body
 from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Trail, backdrop, draw_trails
 from sb3_quad.envs.rendering.window import disconnect
 from sb3_quad.simulation.state import POSITION, QUATERNION
 from sb3_quad.vehicles.vehicle import Vehicle
 
-MARKER: Colour = (0.10, 0.72, 0.28, 1.0)
-FORCE: Colour = (0.86, 0.10, 0.14, 1.0)
-TORQUE: Colour = (0.55, 0.15, 0.75, 1.0)
+MARKER = (0.10, 0.72, 0.28, 1.0)
+FORCE = (0.86, 0.10, 0.14, 1.0)
+TORQUE = (0.55, 0.15, 0.75, 1.0)
 REFERENCE_ARM = 0.24  # of the default vehicle, m
 RING = 0.42  # radius of the rings around a target, m, for a vehicle of the default one's size
 
@@ -74,7 +74,7 @@ class Scene:
             vehicle.place(pose)
         positions = np.array([pose.state[POSITION] for pose in poses])
         # Only the last vehicle has a shadow: those of all poses would blacken the ground.
-        self._shadow = np.float32([*positions[-1, :2], self.span])
+        self._shadow = np.array([*positions[-1, :2], self.span], np.float32)
         for target, bodies in zip(targets, self._targets, strict=True):
             for body in bodies:
                 move_body(self.client, body, target.tolist())

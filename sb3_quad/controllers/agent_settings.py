@@ -48,8 +48,8 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
 
 
 def _settings_of_zip(record: StrDict, where: str) -> FlightSettings:
-    # A path in a zip from a stranger could name a device file, which is read forever. Both a vehicle
-    # and a distribution may be given by a name, which could be a path.
+    # A path in a stranger's zip could name a device file, which is read forever. Both a vehicle and
+    # a distribution may be given by a name, which could be a path.
     distribution = record.get("vehicles")
     if isinstance(distribution, dict):
         distribution = distribution.get("distribution")

@@ -67,8 +67,9 @@ class Controller:
             raise error(f"{who}: is a class; give an instance, such as {self.name}()")
         if not isinstance(action_space, spaces.Box):
             raise error(f"action space {action_space}: a {kind} gives Box actions only")
-        has_predict = hasattr(source, "predict")
-        if not (hasattr(source, "actions") or has_predict or callable(source)):
+        sees_state = hasattr(source, "actions")
+        sees_observation = hasattr(source, "predict") or callable(source)
+        if not (sees_state or sees_observation):
             raise error(
                 f"{kind} {source!r}: needs actions(state) or predict(observation), "
                 "or must be a function of observations"
@@ -84,8 +85,8 @@ class Controller:
                     f"{who}: its {name.replace('_', ' ')} has shape {theirs.shape}, "
                     f"the environment's {ours.shape}"
                 )
-        self.needs_state = hasattr(source, "actions") and true_state is not None
-        if not (self.needs_state or has_predict or callable(source)):
+        self.needs_state = sees_state and true_state is not None
+        if not (self.needs_state or sees_observation):
             raise error(f"{who}: needs the true state, and this environment has no true_state()")
 
         # Actions are checked and clipped as flat rows.

@@ -204,19 +204,6 @@ for _code in "?bhilqBHILQefdgFDG":
     _CHANGES[type(np.dtype(_code))] = _check_dtype
 
 
-def _recurrent_names() -> StrDict:
-    recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
-    return _members(
-        {
-            recurrent.policies: (
-                "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
-                "RecurrentMultiInputActorCriticPolicy"
-            ),
-            recurrent.buffers: "RecurrentRolloutBuffer RecurrentDictRolloutBuffer",
-        }
-    )
-
-
 # What the opcodes do. Each function takes the items of the stack and returns what replaces them.
 
 
@@ -226,7 +213,16 @@ def _find(module: Any, name: Any) -> Any:
     full_name = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
     names = _CLASSES | _FUNCTIONS | _ARGUMENTS
     if full_name.startswith("sb3_contrib.common.recurrent."):
-        names |= _recurrent_names()
+        recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
+        names |= _members(
+            {
+                recurrent.policies: (
+                    "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
+                    "RecurrentMultiInputActorCriticPolicy"
+                ),
+                recurrent.buffers: "RecurrentRolloutBuffer RecurrentDictRolloutBuffer",
+            }
+        )
     if full_name not in names:
         raise _UnknownName(full_name.encode("unicode_escape").decode()[:200])
     return names[full_name]

@@ -14,7 +14,6 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
-from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.imports import require
@@ -116,7 +115,7 @@ class Network(th.nn.Module):
         # The policy sees the frames of some ages; all but the oldest stay in the state.
         size = self.observation.frame_size
         ages = self.observation.ages
-        seen = frames.unflatten(1, (-1, size))[:, ages].flatten(1)
+        seen = frames.view(-1, ages[-1] + 1, size)[:, ages].flatten(1)
         action = self.layers(seen).clamp(-1.0, 1.0)
         following = [action[:, : self.actions], *following, frames[:, : ages[-1] * size]]
         return self.command(action), th.cat(following, dim=1)
@@ -167,15 +166,13 @@ def build_network(reference: Reference, where: str = "model") -> Network:
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
         )
-    # C knows these layers only, and a file with NaN would fail in flight.
+    # C knows these layers only.
     for layer in layers:
         if type(layer) is not th.nn.Linear and type(layer) not in ACTIVATIONS:
             raise ConfigError(
                 f"{where}: its network has a layer {layer}; "
                 "only linear layers, Tanh and ReLU export"
             )
-    if not parameters_to_vector(layers.parameters()).isfinite().all():
-        raise ConfigError(f"{where}: holds parameters that are not finite")
     return Network(layers, reference)
 
 

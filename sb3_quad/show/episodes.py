@@ -210,7 +210,7 @@ class _Log(Hook):
             name=name,
             colour=colour,
             vehicle=self.vehicle,
-            times=np.arange(len(self.states)) * self.vehicle.control_step,
+            times=np.arange(len(self.states), dtype=np.float64) * self.vehicle.control_step,
             state=QuadcopterState.concatenate(self.states),
             wrench=np.stack(self.wrenches),
             reward=float(flights.reward[0]),

@@ -1,6 +1,5 @@
 """Words in pictures, in the font that comes with matplotlib."""
 
-import math
 from collections.abc import Sequence
 from functools import cache
 
@@ -69,11 +68,10 @@ def side_by_side(pictures: Sequence[Image], columns: int) -> Image:
     """
     # Each picture stands in the top left corner of its field; the gap is on its other sides.
     columns = min(columns, len(pictures))
-    rows = math.ceil(len(pictures) / columns)
-    height, width, _ = np.add(pictures[0].shape, (GAP, GAP, 0))
-    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
-    for number, picture in enumerate(pictures):
-        top = number // columns * height
-        left = number % columns * width
-        sheet[top : top + height - GAP, left : left + width - GAP] = picture
-    return sheet[: sheet.shape[0] // 2 * 2, : sheet.shape[1] // 2 * 2]
+    padding = ((0, -len(pictures) % columns), (0, GAP), (0, GAP), (0, 0))
+    fields = np.pad(np.stack(pictures), padding, constant_values=255)
+    # Fields (rows, columns, height, width, colour) become one sheet, row by row.
+    _, height, width, _ = fields.shape
+    sheet = fields.reshape(-1, columns, height, width, 3).swapaxes(1, 2)
+    sheet = sheet.reshape(-1, columns * width, 3)
+    return sheet[: len(sheet) // 2 * 2, : columns * width // 2 * 2]
