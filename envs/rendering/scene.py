@@ -60,27 +60,25 @@ class Scene:
         self._vehicles = [
             _VehicleBodies(vehicle, client, size, self.scale) for _ in range(n_vehicles)
         ]
-        # A target is a ball within two hoops that cross.
-        shapes = [[models.Part(p.GEOM_SPHERE, radius=0.14)]]
-        for yaw in (0.0, math.pi / 2):
-            shapes.append(models.hoop(RING * self.scale, 0.014 * self.scale, yaw))
-        self._targets = [
-            [add_body(parts, MARKER, client) for parts in shapes] for _ in range(n_targets)
-        ]
+        # A target is two hoops that cross, through which a vehicle in it is seen.
+        self._targets = []
+        for _ in range(n_targets):
+            hoops = []
+            for yaw in (0.0, math.pi / 2):
+                parts = models.hoop(RING * self.scale, 0.018 * self.scale, yaw)
+                hoops.append(add_body(parts, MARKER, client))
+            self._targets.append(hoops)
 
     def place(self, poses: Sequence[Pose], targets: FloatArray) -> None:
         """Move everything: a pose for each vehicle, and ``targets``, (n_targets, 3)."""
         for pose, vehicle in zip(poses, self._vehicles, strict=True):
             vehicle.place(pose)
-        positions = np.array([pose.state[POSITION] for pose in poses])
         # Only the last vehicle has a shadow: those of all poses would blacken the ground.
-        self._shadow = np.array([*positions[-1, :2], self.span], np.float32)
-        for target, bodies in zip(targets, self._targets, strict=True):
-            for body in bodies:
-                move_body(self.client, body, target.tolist())
-            # The ball would hide a vehicle in it.
-            if np.linalg.norm(positions - target, axis=1).min() < 0.7 * self.scale:
-                move_body(self.client, bodies[0], NOWHERE)
+        x, y, _ = poses[-1].state[POSITION]
+        self._shadow = np.array([x, y, self.span], np.float32)
+        for target, hoops in zip(targets.tolist(), self._targets, strict=True):
+            for hoop in hoops:
+                move_body(self.client, hoop, target)
 
     def picture(self, camera: Camera, trails: Sequence[Trail] = ()) -> Image:
         """Draw the scene: uint8 (height, width, 3)."""

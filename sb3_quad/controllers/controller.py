@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -126,7 +125,7 @@ class Controller:
 
     def actions(
         self,
-        observation: npt.NDArray[Any],
+        observation: Any,
         rows: BoolArray | None = None,
         episode_start: BoolArray | None = None,
     ) -> Float32Array:
@@ -153,7 +152,7 @@ class Controller:
         if raw.dtype.kind not in "fiub":
             raise error(f"{who}: gives actions of type {raw.dtype}, must be real numbers")
         # Dictionary observations have a batch axis in each entry.
-        batch: Any = observation
+        batch = observation
         if isinstance(observation, dict):
             batch = next(iter(observation.values()))
         shape = (len(batch), *self._action_shape)
@@ -173,14 +172,12 @@ class Controller:
             )
         return actions
 
-    def labels(
-        self, observation: npt.NDArray[Any], episode_start: BoolArray | None = None
-    ) -> Float32Array:
+    def labels(self, observation: Any, episode_start: BoolArray | None = None) -> Float32Array:
         """Return :meth:`actions` clipped to the action space: the labels that an agent imitates."""
         actions = self.actions(observation, episode_start=episode_start)
         return actions.clip(self._low, self._high)
 
-    def _ask(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
+    def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
         """Return the controller's own answer, unchecked."""
         if self.needs_state and self._true_state is not None:
             return self.source.actions(self._true_state())

@@ -10,9 +10,7 @@ import base64
 import math
 import pickletools
 import re
-import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -107,10 +105,7 @@ def _dtype(code: Any, *_: Any) -> Any:
 
 def _check_dtype(dtype: Any, state: Any) -> None:
     """Accept the state of a plain dtype in this machine's byte order, which it has already."""
-    native = {"little": "<", "big": ">"}[sys.byteorder]
-    if dtype.itemsize == 1:
-        native = "|"
-    _check(state[1] in ("|", native) and state[2:5] == (None, None, None), "a dtype")
+    _check(state[1:5] == (dtype.str[0], None, None, None), "a dtype")
 
 
 def _set_bit_generator(bit_generator: Any, state: Any) -> None:
@@ -194,7 +189,7 @@ for _key, _kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items():
 # Arguments of these functions, which know by themselves what they make.
 _ARGUMENTS = {key: key for key in _by_name(np.ndarray, PCG64, SeedSequence)}
 # How an object that has been made gets its state.
-_CHANGES: dict[type, Callable[[Any, Any], None]] = {
+_CHANGES: dict[type, Any] = {
     np.ndarray: _fill_array,
     PCG64: _set_bit_generator,
     Generator: _set_generator,
@@ -285,7 +280,7 @@ _LITERALS = [
     "BYTEARRAY8",
 ]
 # Opcodes that replace so many items of the stack by the result of a function.
-_OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+_OPERATIONS: StrDict = {
     "NONE": (0, lambda: None),
     "NEWTRUE": (0, lambda: True),
     "NEWFALSE": (0, lambda: False),

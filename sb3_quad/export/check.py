@@ -2,10 +2,9 @@
 difference.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
@@ -63,7 +62,7 @@ class Reference(NamedTuple):
         """μ in the vehicle's own body frame, (OBSERVATION_SIZE,)."""
         return self.mean @ turn_features(self.turn)
 
-    def results(self, actions: npt.ArrayLike) -> FloatArray:
+    def results(self, actions: Any) -> FloatArray:
         """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape,
         in float64.
         """

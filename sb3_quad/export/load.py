@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def load_torchscript(content: bytes) -> tuple[Call, str]:
     size = int(json.loads(extra["metadata.json"]).get("state_size", 0))
 
     @th.no_grad()
-    def run(*inputs: Float32Array) -> Sequence[Float32Array]:
+    def run(*inputs: Float32Array) -> list[Any]:
         outputs = module(*map(th.from_numpy, inputs))
         if not size:
             outputs = [outputs]
@@ -66,7 +66,7 @@ def load_onnx(content: bytes) -> tuple[Call, str]:
     return _call(run, size), f"onnxruntime {runtime.__version__}"
 
 
-def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
+def _call(run: Callable[..., Any], size: int) -> Call:
     """:param size: numbers in a state of ``run``; 0: it takes and gives none."""
 
     def call(rows: Float32Array, state: Any = None) -> Any:

@@ -120,12 +120,11 @@ def following_cameras(
     eye = None
     for seconds in times:
         points = []
-        # The vehicles, and their targets, or at most AHEAD of the way there.
+        # The vehicles, and their targets, or at most AHEAD of the way there along each axis.
         for recording in recordings:
             vehicle, target = recording.vehicle_and_target(recording.at(seconds))
-            way = target - vehicle
-            seen = min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9))
-            points += [vehicle, vehicle + seen * way]
+            way = np.clip(target - vehicle, -AHEAD * scale, AHEAD * scale)
+            points += [vehicle, vehicle + way]
         camera = framing_camera(np.stack(points), MARGIN * scale, forward, lens)
         if eye is not None:
             # The camera follows with a lag, so that a jump of the target is no jump of the picture.
