@@ -5,7 +5,7 @@ import re
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch.nn.utils import parameters_to_vector
 
@@ -70,7 +70,7 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     # Each format has a writer, and a reader for the check.
-    formats: dict[str, tuple[Any, Any]] = {
+    formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
         "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),

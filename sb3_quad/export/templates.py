@@ -1,4 +1,4 @@
-"""The templates of this folder: exported files and what they say about themselves."""
+"""Templates of files: exported policies, what they say about themselves, and the demo's page."""
 
 from typing import Any
 
@@ -6,10 +6,10 @@ import jinja2
 import numpy as np
 
 
-def render(template: str, **values: Any) -> str:
-    """Fill in a template; its filter ``c_number`` is :func:`c_number`."""
+def render(template: str, package: str = "sb3_quad.export", **values: Any) -> str:
+    """Fill in a template of a package; its filter ``c_number`` is :func:`c_number`."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sb3_quad.export", ""),
+        loader=jinja2.PackageLoader(package, ""),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

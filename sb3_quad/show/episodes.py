@@ -1,6 +1,6 @@
 """Recorded flights to be shown: the same episodes for all controllers, on PyBullet."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -94,7 +94,7 @@ class Setting(NamedTuple):
     settings: FlightSettings  # of all episodes
     plan: Callable[[int], Plan]  # the events of an episode, by its seed
     # Changes to the settings that go with a controller, by its label.
-    own: Mapping[str, StrMapping] = {}
+    own: StrMapping = {}
 
 
 def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = None) -> Setting:

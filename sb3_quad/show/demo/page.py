@@ -12,7 +12,6 @@ import zlib
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 
-import jinja2
 import numpy as np
 from torch.nn.utils import parameters_to_vector
 
@@ -26,6 +25,7 @@ from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.export.check import make_reference
 from sb3_quad.export.network import Network, build_network
+from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
 from sb3_quad.simulation.state import STATE, STATE_SIZE, X
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
@@ -92,7 +92,7 @@ def make_page(
     colours = colours_of([spec.label for spec in specs])
     vehicles = {name: load_vehicle(name) for name in VEHICLES.names()}
     first = vehicle and _add(vehicles, vehicle)
-    agents: dict[str, StrDict] = {}
+    agents: StrDict = {}
     networks: dict[str, Network] = {}
     for spec in specs:
         described, network = describe(spec)
@@ -201,9 +201,11 @@ def join_modules(text: str) -> str:
 def _render(data: StrDict, rounded: Sequence[str]) -> str:
     # Without "<", no text in the data can end the script element.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(__package__, ""), undefined=jinja2.StrictUndefined
-    )
-    return environment.get_template("page.html.j2").render(
-        data=text, script=script(), rounded=rounded, version=__version__
+    return render(
+        "page.html.j2",
+        "sb3_quad.show.demo",
+        data=text,
+        script=script(),
+        rounded=rounded,
+        version=__version__,
     )
