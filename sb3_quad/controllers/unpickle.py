@@ -91,8 +91,8 @@ def _fill_array(array: Any, state: Any) -> None:
     _, shape, dtype, by_columns, content = state
     _check(isinstance(dtype, np.dtype), "an array")
     _check(type(content) is bytes and type(by_columns) is bool, "an array")
-    _check(type(shape) is tuple, "the shape of an array")
-    _check(all(type(n) is int and n >= 0 for n in shape), "the shape of an array")
+    is_shape = type(shape) is tuple and all(type(n) is int and n >= 0 for n in shape)
+    _check(is_shape, "the shape of an array")
     _check(len(content) == math.prod(shape) * dtype.itemsize, "the size of an array")
     array.__setstate__((1, shape, dtype, by_columns, content))
 
