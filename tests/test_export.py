@@ -27,7 +27,7 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, network, policy
 from sb3_quad.export.check import Reference
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
-from sb3_quad.export.network import StatefulNetwork, build_network
+from sb3_quad.export.network import Network, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -201,14 +201,14 @@ def test_it_sees_the_frames_of_the_environment_in_whole_flights(
     ids=["no action", "no integral", "begun at once", "another age", "gain", "distance", "speed"],
 )
 def test_a_file_with_another_state_is_refused(extended, monkeypatch, wrong):
-    class Wrong(StatefulNetwork):
+    class Wrong(Network):
         def __init__(self, layers, reference):
             super().__init__(layers, wrong(reference, torch.zeros(1, 200))[0])
 
         def forward(self, observation, state):
             return super().forward(observation, wrong(Reference(None, ITM), state)[1])
 
-    monkeypatch.setattr(network, "StatefulNetwork", Wrong)
+    monkeypatch.setattr(network, "Network", Wrong)
     with pytest.raises(ExportError, match="differs from the trained one"):
         export_policy(extended / "all.zip", "torchscript")
 

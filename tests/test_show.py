@@ -144,7 +144,7 @@ def test_trails_are_hidden_by_what_is_before_them(distance, seen):
     points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0], [distance, 0.0, 0.5]])
     picture = Image.new("RGBA", (80, 40))
     draw_trails(
-        picture, [Trail(points, "red", 0.1)], looking_along_x(), np.full((40, 80), 5.0, np.float32)
+        picture, [Trail(points, "red")], looking_along_x(), np.full((40, 80), 5.0, np.float32)
     )
     drawn = np.asarray(picture)
     assert (drawn[..., 3] == 255).any() == (drawn[..., 3] > 0).any() == seen
@@ -206,11 +206,11 @@ def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
 
 
 def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
-    ends = [len(fall.times) - 1, 60]
-    view = sequence.view_of([fall, hit], ends, Lens(300, 400))
-    flights = zip((fall, hit), ends, strict=True)
-    chosen = [sequence.pose_steps(flight, end, view) for flight, end in flights]
-    assert chosen[0][0] == 0 and chosen[0][-1] == ends[0] and hit.disturbances[0] in chosen[1]
+    assert len(hit.times) == 61
+    view = sequence.view_of([fall, hit], Lens(300, 400))
+    chosen = [sequence.pose_steps(flight, view) for flight in (fall, hit)]
+    assert chosen[0][0] == 0 and chosen[0][-1] == len(fall.times) - 1
+    assert hit.disturbances[0] in chosen[1]
     for steps, flight in zip(chosen, (fall, hit), strict=True):
         places, breadth = view.project(flight.state.position[steps])
         gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[
@@ -223,8 +223,8 @@ def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
 
 @pytest.mark.parametrize("size", [(300, 400), (600, 200)])
 def test_texts_of_a_sequence_are_inside_the_picture_beside_their_poses(fall, size):
-    view = sequence.view_of([fall], [len(fall.times) - 1], Lens(*size))
-    steps = sequence.pose_steps(fall, len(fall.times) - 1, view)
+    view = sequence.view_of([fall], Lens(*size))
+    steps = sequence.pose_steps(fall, view)
     places, breadth = view.project(fall.state.position[steps])
     tags = sequence.time_tags(fall, steps, view, 12)
     assert [text for text, _ in tags] == [f"{fall.times[step]:.2f} s" for step in steps]

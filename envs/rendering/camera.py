@@ -59,12 +59,12 @@ def direction(course: float, elevation: float) -> FloatArray:
 
 
 def broadside(points: FloatArray) -> FloatArray:
-    """Return the direction, (3,), in which a camera sees the spread of ``points``, (n, 3), best; a
-    little downwards.
+    """Return the direction, (3,), in which a camera sees the spread of points best; a little
+    downwards.
+
+    :param points: (n, 3), n > 1.
     """
-    spread = np.eye(2)
-    if len(points) > 2:
-        spread = np.cov(points[:, :2].T)
+    spread = np.cov(points[:, :2].T)
     # The direction of the least spread. Of its two signs always the same one is taken, so that
     # similar flights are seen from the same side.
     x, y = np.linalg.eigh(spread)[1][:, 0]
@@ -78,7 +78,10 @@ def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens:
     :param points: (n, 3), world frame, m.
     :param forward: its direction, a unit vector, (3,), not vertical.
     """
-    axes = _axes(forward)
+    # Level: the camera does not roll.
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    axes = np.stack([forward, right, np.cross(right, forward)])
     local = points @ axes.T
     across = local[:, 1:]
     room = margin - lens.slopes * local[:, :1]
@@ -120,11 +123,3 @@ class ChaseCamera:
         both = np.stack([state[POSITION], state[TARGET]])
         forward = direction(self.course, self.elevation)
         return framing_camera(both, CHASE_MARGIN * self.scale, forward, self.lens)
-
-
-def _axes(forward: FloatArray) -> FloatArray:
-    """Forward, right and up of a camera without roll, (3, 3)."""
-    # Level: the camera does not roll.
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    return np.stack([forward, right, np.cross(right, forward)])

@@ -16,38 +16,36 @@ from sb3_quad.vehicles.vehicle import Vehicle
 Vector: TypeAlias = tuple[float, float, float]
 Colour: TypeAlias = tuple[float, float, float, float]
 
-DARK: Colour = (0.13, 0.14, 0.17, 1.0)
-GREY: Colour = (0.55, 0.58, 0.62, 1.0)
-FRONT: Colour = (0.93, 0.32, 0.10, 1.0)
-WHITE: Colour = (0.92, 0.93, 0.95, 1.0)
+DARK = (0.13, 0.14, 0.17, 1.0)
+GREY = (0.55, 0.58, 0.62, 1.0)
+FRONT = (0.93, 0.32, 0.10, 1.0)
+WHITE = (0.92, 0.93, 0.95, 1.0)
 # The drawn rotors turn so much slower than real ones, which would seem to stand or turn backwards
 # in a film.
 SLOWED = 12.0
 # The three steps of an arrow's head: height, in its length, and radius, in its radius.
 HEAD = ((0.75, 2.4), (0.85, 1.6), (0.95, 0.8))
-NOWHERE: Vector = (0.0, 0.0, -1000.0)
-NO_BOX: Vector = (0.0, 0.0, 0.0)
+NOWHERE = (0.0, 0.0, -1000.0)
 
 
 class Part(NamedTuple):
-    """A part of a body: a box (its sides), a cylinder along z, or a ball; angles in rad, roll
-    before yaw.
+    """A part of a body: a box (its sides), a cylinder along z, or a ball.
+
+    The angles are roll, pitch and yaw, rad.
     """
 
     shape: int
     at: Vector = (0.0, 0.0, 0.0)
-    box: Vector = NO_BOX
+    box: Vector = (0.0, 0.0, 0.0)
     radius: float = 0.0
     length: float = 0.0
-    roll: float = 0.0
-    yaw: float = 0.0
+    angles: Vector = (0.0, 0.0, 0.0)
 
 
 def add_body(parts: Sequence[Part], colour: Colour, client: int) -> int:
     """Add a body of at most 16 parts, out of sight; return its number."""
     # PyBullet takes lists only; tuples crash it.
-    shapes, places, boxes, radii, lengths, rolls, yaws = map(list, zip(*parts, strict=True))
-    angles = zip(rolls, [0.0] * len(parts), yaws, strict=True)
+    shapes, places, boxes, radii, lengths, angles = map(list, zip(*parts, strict=True))
     shape = p.createVisualShapeArray(
         shapeTypes=shapes,
         halfExtents=np.divide(boxes, 2.0).tolist(),
@@ -84,7 +82,7 @@ def span(vehicle: Vehicle) -> float:
 
 def rotor_turning(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
     """Return the rates of the drawn rotors about body z, of rotor speeds (..., 4), rad/s."""
-    return np.asarray(-np.sign(vehicle.rotor_directions) * speeds / SLOWED)
+    return -np.sign(vehicle.rotor_directions) * speeds / SLOWED
 
 
 def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:
@@ -105,7 +103,7 @@ def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:
         middle = (x / 2, y / 2, 0.02 * arm)
         beam = (math.hypot(x, y), 0.09 * arm, 0.06 * arm)
         colour = FRONT if x > 0 else DARK
-        parts[colour].append(Part(p.GEOM_BOX, middle, beam, yaw=math.atan2(y, x)))
+        parts[colour].append(Part(p.GEOM_BOX, middle, beam, angles=(0.0, 0.0, math.atan2(y, x))))
         motor = (x, y, 0.45 * z)
         parts[GREY].append(Part(p.GEOM_CYLINDER, motor, radius=0.09 * arm, length=0.9 * z))
     return parts
@@ -118,7 +116,7 @@ def rotor(radius: float, pitch: float) -> list[Part]:
     blade = (length, 0.15 * radius, 0.02 * radius)
     for side in (1.0, -1.0):
         middle = (side * length / 2, 0.0, 0.0)
-        parts.append(Part(p.GEOM_BOX, middle, blade, roll=side * pitch))
+        parts.append(Part(p.GEOM_BOX, middle, blade, angles=(side * pitch, 0.0, 0.0)))
     return parts
 
 
@@ -139,5 +137,6 @@ def hoop(radius: float, thickness: float, yaw: float) -> list[Part]:
     for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
         level = radius * math.cos(angle)
         place = (-level * math.sin(yaw), level * math.cos(yaw), radius * math.sin(angle))
-        parts.append(Part(p.GEOM_CYLINDER, place, NO_BOX, thickness, length, angle, yaw))
+        part = Part(p.GEOM_CYLINDER, place, radius=thickness, length=length)
+        parts.append(part._replace(angles=(angle, 0.0, yaw)))
     return parts

@@ -8,41 +8,39 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.colors import to_rgb
 from PIL import Image as Pillow
 from PIL import ImageDraw
 
-from sb3_quad.base.arrays import Float32Array, FloatArray
+from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.envs.rendering.camera import Camera, Lens
 
 NEAR = 0.05  # distances between which bodies are drawn, m
 FAR = 120.0
 SUPERSAMPLING = 2  # PyBullet's software renderer draws hard edges
-SKY_HORIZON = np.array([0.87, 0.92, 0.96], dtype=np.float32)
-SKY_ZENITH = np.array([0.36, 0.58, 0.86], dtype=np.float32)
-GROUND_LIGHT = np.array([0.61, 0.69, 0.55], dtype=np.float32)
-GROUND_DARK = np.array([0.50, 0.60, 0.46], dtype=np.float32)
+SKY_HORIZON = np.array([0.87, 0.92, 0.96], np.float32)
+SKY_ZENITH = np.array([0.36, 0.58, 0.86], np.float32)
+GROUND_LIGHT = np.array([0.61, 0.69, 0.55], np.float32)
+GROUND_DARK = np.array([0.50, 0.60, 0.46], np.float32)
 SQUARE = 2.0  # side of the ground's squares, m
 SHADOW = 0.45  # share of the light that a shadow takes
 VISIBILITY = 90.0  # distance at which 1/e of the ground is still seen through the haze, m
-THINNEST = 1.4  # width of a line at least, pixels
+LINE = 0.006  # width of a trail, in heights of the picture
 
 
 class Trail(NamedTuple):
     """The line that a vehicle has flown along."""
 
     points: FloatArray  # (n, 3)
-    colour: str  # as matplotlib takes it
-    width: float  # m
+    colour: str  # as Pillow takes it, such as #rrggbb
 
 
-def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
-    """Draw sky, and chequered ground with shadows and haze, (height, width, 3).
+def backdrop(camera: Camera, shadow: Float32Array) -> Image:
+    """Draw sky, and chequered ground with a shadow and haze, uint8 (height, width, 3).
 
-    :param shadows: centre x, y and radius of each shadow on the ground, (k, 3).
+    :param shadow: centre x, y and radius of the shadow on the ground, (3,).
     """
     width, height, slope = camera.lens
-    across = np.linspace(-1.0, 1.0, width, dtype=np.float32) * np.float32(slope * width / height)
+    across = np.linspace(-1.0, 1.0, width, dtype=np.float32) * (slope * width / height)
     upwards = np.linspace(slope, -slope, height, dtype=np.float32)
     forward, right, up = camera.axes.astype(np.float32)
     # One ray for each pixel, from the eye.
@@ -55,17 +53,16 @@ def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
     points = eye[:2] + distance[..., None] * rays[..., :2]
     # The size of a pixel on the ground, in squares. Finer squares blur into their mean instead of
     # flickering.
-    footprint = distance * distance * np.float32(2.0 * slope / height / max(eye[2], 0.1) / SQUARE)
+    footprint = distance * distance * (2.0 * slope / height / max(eye[2], 0.1) / SQUARE)
     wave = np.sin(np.pi / SQUARE * points).prod(axis=2) / np.maximum(2.0 * footprint, 0.02)
     dark = 0.5 + 0.5 * np.clip(wave, -1.0, 1.0) * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
     ground = GROUND_LIGHT + dark[..., None] * (GROUND_DARK - GROUND_LIGHT)
-    # Shadows have soft edges.
-    for *centre, radius in shadows.tolist():
-        away = np.linalg.norm(points - np.float32(centre), axis=2) / radius
-        ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
+    # The shadow has a soft edge.
+    away = np.linalg.norm(points - shadow[:2], axis=2) / shadow[2]
+    ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
     # The share of the ground that is seen through the haze.
     haze = np.exp(distance / -VISIBILITY)[..., None]
-    return np.asarray(sky + haze * (ground - sky), dtype=np.float32)
+    return np.asarray(255.0 * (sky + haze * (ground - sky)) + 0.5, np.uint8)
 
 
 def draw_trails(
@@ -75,17 +72,14 @@ def draw_trails(
     them.
     """
     high, wide = depth.shape
-    slope = camera.lens.slope
-    larger = camera._replace(lens=Lens(wide, high, slope))
+    larger = camera._replace(lens=Lens(wide, high, camera.lens.slope))
+    width = max(2, round(LINE * high))
     draw = ImageDraw.Draw(picture)
     for trail in trails:
         column, row, away = larger.project(trail.points).T
-        widths = trail.width * high / (2.0 * slope * np.maximum(away, NEAR))
-        widths = np.maximum(widths, THINNEST * SUPERSAMPLING).round().astype(int).tolist()
         before = depth[row.clip(0, high - 1).astype(int), column.clip(0, wide - 1).astype(int)]
         is_seen = (away > NEAR) & (away < before)
-        colour = tuple(round(255 * part) for part in to_rgb(trail.colour))
         # A piece of the line is drawn where both its ends are seen.
         for k in np.flatnonzero(is_seen[:-1] & is_seen[1:]).tolist():
             piece = (column[k], row[k], column[k + 1], row[k + 1])
-            draw.line(piece, fill=colour, width=widths[k])
+            draw.line(piece, fill=trail.colour, width=width)

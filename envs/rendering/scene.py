@@ -1,7 +1,6 @@
 """Scenes and their pictures: vehicles in poses, targets and arrows, in a PyBullet client."""
 
 import math
-import weakref
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,14 +11,15 @@ from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.envs.rendering import models
 from sb3_quad.envs.rendering.camera import Camera
-from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, Colour, add_body, move_body
+from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, add_body, move_body
 from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Trail, backdrop, draw_trails
-from sb3_quad.simulation.state import POSITION, QUATERNION, QuadcopterState
+from sb3_quad.envs.rendering.window import disconnect
+from sb3_quad.simulation.state import POSITION, QUATERNION
 from sb3_quad.vehicles.vehicle import Vehicle
 
-MARKER: Colour = (0.10, 0.72, 0.28, 1.0)
-FORCE: Colour = (0.86, 0.10, 0.14, 1.0)
-TORQUE: Colour = (0.55, 0.15, 0.75, 1.0)
+MARKER = (0.10, 0.72, 0.28, 1.0)
+FORCE = (0.86, 0.10, 0.14, 1.0)
+TORQUE = (0.55, 0.15, 0.75, 1.0)
 REFERENCE_ARM = 0.24  # of the default vehicle, m
 RING = 0.42  # radius of the rings around a target, m, for a vehicle of the default one's size
 
@@ -53,9 +53,6 @@ class Scene:
     ) -> None:
         if client is None:
             client = int(p.connect(p.DIRECT))
-            # PyBullet's clients are limited. So this one is also given back when the object is
-            # forgotten without close().
-            self._close = weakref.finalize(self, p.disconnect, client)
         self.client = client
         # Distances in pictures are multiples of the scale.
         self.scale = size * vehicle.arm_length / REFERENCE_ARM
@@ -63,30 +60,25 @@ class Scene:
         self._vehicles = [
             _VehicleBodies(vehicle, client, size, self.scale) for _ in range(n_vehicles)
         ]
-        # A target is a ball within two hoops that cross.
-        shapes = [[models.Part(p.GEOM_SPHERE, radius=0.14)]]
-        for yaw in (0.0, math.pi / 2):
-            shapes.append(models.hoop(RING * self.scale, 0.014 * self.scale, yaw))
-        self._targets = [
-            [add_body(parts, MARKER, client) for parts in shapes] for _ in range(n_targets)
-        ]
-        self._shadows = np.zeros((0, 3))
+        # A target is two hoops that cross, through which a vehicle in it is seen.
+        self._targets = []
+        for _ in range(n_targets):
+            hoops = []
+            for yaw in (0.0, math.pi / 2):
+                parts = models.hoop(RING * self.scale, 0.018 * self.scale, yaw)
+                hoops.append(add_body(parts, MARKER, client))
+            self._targets.append(hoops)
 
     def place(self, poses: Sequence[Pose], targets: FloatArray) -> None:
         """Move everything: a pose for each vehicle, and ``targets``, (n_targets, 3)."""
         for pose, vehicle in zip(poses, self._vehicles, strict=True):
             vehicle.place(pose)
-        positions = np.array([pose.state[POSITION] for pose in poses])
         # Only the last vehicle has a shadow: those of all poses would blacken the ground.
-        shadows = [[*positions[-1, :2], self.span]]
-        for target, bodies in zip(targets, self._targets, strict=True):
-            for body in bodies:
-                move_body(self.client, body, target.tolist())
-            # The ball would hide a vehicle in it.
-            if np.linalg.norm(positions - target, axis=1).min() < 0.7 * self.scale:
-                move_body(self.client, bodies[0], NOWHERE)
-            shadows.append([*target[:2], RING * self.scale])
-        self._shadows = np.array(shadows)
+        x, y, _ = poses[-1].state[POSITION]
+        self._shadow = np.array([x, y, self.span], np.float32)
+        for target, hoops in zip(targets.tolist(), self._targets, strict=True):
+            for hoop in hoops:
+                move_body(self.client, hoop, target)
 
     def picture(self, camera: Camera, trails: Sequence[Trail] = ()) -> Image:
         """Draw the scene: uint8 (height, width, 3)."""
@@ -116,14 +108,14 @@ class Scene:
         drawn = Pillow.fromarray(bodies)
         draw_trails(drawn, trails, camera, depth)
         # The bodies lie over the backdrop where they are opaque.
-        small = np.asarray(drawn.reduce(SUPERSAMPLING), dtype=np.float32)
-        opacity = small[..., 3:] / 255.0
-        behind = 255.0 * backdrop(camera, self._shadows)
-        return np.asarray(behind + opacity * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
+        drawn = drawn.reduce(SUPERSAMPLING)
+        picture = Pillow.fromarray(backdrop(camera, self._shadow))
+        picture.paste(drawn, mask=drawn)
+        return np.array(picture)
 
     def close(self) -> None:
         """Give a client of its own back; calling it twice is fine."""
-        self._close()
+        disconnect(self.client)
 
 
 class _VehicleBodies:
@@ -135,10 +127,9 @@ class _VehicleBodies:
         radius = size * models.rotor_radius(vehicle)
         places = size * np.array(vehicle.rotor_positions)
         self.centres = np.column_stack([places, np.full(len(places), 0.17 * arm)])
-        self.frame = [
-            add_body(parts, colour, client)
-            for colour, parts in models.frame(arm, self.centres).items()
-        ]
+        self.frame = []
+        for colour, parts in models.frame(arm, self.centres).items():
+            self.frame.append(add_body(parts, colour, client))
         self.rotors = []
         for (x, _), sense in zip(places, vehicle.rotor_directions, strict=True):
             # A rotor's drag on the body is opposed to its sense of turning.
@@ -160,10 +151,9 @@ class _VehicleBodies:
             moved = p.multiplyTransforms(position, attitude, centre, turned)
             move_body(self.client, body, *moved)
         # The wrench has a part in the world frame and one in the body frame.
-        rotation = QuadcopterState(pose.state[:, None]).rotation[0]
-        wrench = pose.wrench.reshape(2, 2, 3)
+        wrench = pose.wrench.reshape(2, 2, 3).tolist()
         for body, (in_world, in_body) in zip((self.force, self.torque), wrench, strict=True):
-            x, y, z = (in_world + rotation @ in_body).tolist()
+            x, y, z = np.add(in_world, p.rotateVector(attitude, in_body)).tolist()
             tilt = math.atan2(math.hypot(x, y), z)
             along = p.getQuaternionFromEuler((0.0, tilt, math.atan2(y, x)))
             move_body(self.client, body, position if any((x, y, z)) else NOWHERE, along)

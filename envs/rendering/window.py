@@ -49,7 +49,6 @@ def open_window(width: int, height: int) -> int:
     plane = f"{pybullet_data.getDataPath()}/plane.urdf"
     ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=client)
     p.setCollisionFilterGroupMask(ground, -1, 0, 0, physicsClientId=client)
-    p.changeVisualShape(ground, -1, specularColor=(0.1, 0.1, 0.1), physicsClientId=client)
     return client
 
 

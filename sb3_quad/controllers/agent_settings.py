@@ -1,10 +1,10 @@
 """The flight settings of the agent in a zip, as training wrote them into or next to it."""
 
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import agent_path
@@ -16,7 +16,7 @@ from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle
 
 
-def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
+def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
     """Return how the agent in a zip flies, and the file that says so.
 
     The file is the zip itself, else a ``config.yml`` in a folder next to it, where runs of this
@@ -62,8 +62,21 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
     return warning
 
 
-def _settings_of_zip(record: dict[str, Any], where: str) -> FlightSettings:
-    _refuse_paths(record, where)
+def _settings_of_zip(record: StrDict, where: str) -> FlightSettings:
+    # A path in a stranger's zip could name a device file, which is read forever. Both a vehicle and
+    # a distribution may be given by a name, which could be a path.
+    distribution = record.get("vehicles")
+    if isinstance(distribution, dict):
+        distribution = distribution.get("distribution")
+    for key, folder, source in (
+        ("rotor_layout", VEHICLES, record.get("rotor_layout")),
+        ("vehicles", DISTRIBUTIONS, distribution),
+    ):
+        if isinstance(source, str) and folder.is_path(source):
+            raise ConfigError(
+                f"{where}: {key}: {source!r} is a path; "
+                "a zip holds such files or names those of the package"
+            )
     # A task is saved by its fields; a mixture holds weights by name instead.
     task = record.get("task")
     if isinstance(task, dict) and "name" in task:
@@ -87,7 +100,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
 
     # The folder has the name of the environment, which says the task.
     where = f"{config}: env_kwargs"
-    given: dict[str, Any] = {}
+    given: StrDict = {}
     if config.parent.name in ENVIRONMENTS:
         given["task"] = ENVIRONMENTS[config.parent.name]
     for part in parts:
@@ -95,27 +108,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
     return validate(FlightSettings, given, where)
 
 
-def _refuse_paths(record: dict[str, Any], where: str) -> None:
-    """Reject file paths in untrusted zips: reading a device file could block forever.
-
-    :raises ConfigError: the record holds a path where a name may stand.
-    """
-    # Both a vehicle and a distribution may be given by a name, which could be a path.
-    distribution = record.get("vehicles")
-    if isinstance(distribution, dict):
-        distribution = distribution.get("distribution")
-    for key, folder, source in (
-        ("rotor_layout", VEHICLES, record.get("rotor_layout")),
-        ("vehicles", DISTRIBUTIONS, distribution),
-    ):
-        if isinstance(source, str) and folder.is_path(source):
-            raise ConfigError(
-                f"{where}: {key}: {source!r} is a path; "
-                "a zip holds such files or names those of the package"
-            )
-
-
-def env_kwargs(agent: str | Path) -> dict[str, Any]:
+def env_kwargs(agent: StrPath) -> StrDict:
     """Return the keywords of environments that fly as an agent was trained to.
 
     They are its vehicle, noise and observation.

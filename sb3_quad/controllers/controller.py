@@ -1,37 +1,18 @@
 """One way to ask a controller for actions, whatever it is: an expert, an SB3 model, a function."""
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Protocol, TypeAlias, cast
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
+from sb3_quad.base.types import StrDict
+from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.simulation.state import QuadcopterState
-
-
-class StateController(Protocol):
-    """A controller that acts on the true state, such as ``PIDExpert``."""
-
-    def actions(self, state: QuadcopterState) -> npt.NDArray[Any]:
-        """Return actions of shape (n, action_dim) for the true state of n vehicles."""
-
-
-ExpertLike: TypeAlias = (
-    StateController | PolicyPredictor | Callable[[Any], npt.NDArray[Any]] | str | Path
-)
-"""Everything that ``expert=`` takes.
-
-An object with ``actions(state)``; an SB3 model or policy (anything with ``predict(observation)``);
-a function from observations to actions; or a name or path for
-:func:`~sb3_quad.controllers.resolve.resolve_expert`.
-"""
 
 
 class Controller:
@@ -52,11 +33,10 @@ class Controller:
 
     :param source: the controller, as above.
     :param action_space: the environment's action space, a Box.
-    :param observation_space: the environment's observation space; None: not checked.
+    :param observation_space: the environment's observation space.
     :param true_state: returns the current true state; None: not available.
     :param kind: what messages call the controller. With ``"expert"``, errors are ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
-    :param made_for: the ``expert=`` argument and the environment that :meth:`for_env` compares.
     :raises ConfigError: the source is of no kind above, or its spaces do not fit (of an expert:
         ``ExpertError``).
     """
@@ -65,16 +45,16 @@ class Controller:
         self,
         source: Any,
         action_space: spaces.Space[Any],
-        observation_space: spaces.Space[Any] | None = None,
+        observation_space: spaces.Space[Any],
         true_state: Callable[[], QuadcopterState] | None = None,
         kind: str = "controller",
         deterministic: bool = True,
-        made_for: tuple[object, VecEnv] | None = None,
     ) -> None:
         self.source = source
         self.kind = kind
         self.name = getattr(source, "__name__", type(source).__name__)
-        self.made_for = made_for
+        # The ``expert=`` argument and the environment that :meth:`for_env` compares.
+        self.made_for: tuple[Any, Any] = (None, None)
         self._deterministic = deterministic
         self._true_state = true_state
         self._predict_state: Any = None
@@ -86,8 +66,9 @@ class Controller:
             raise error(f"{who}: is a class; give an instance, such as {self.name}()")
         if not isinstance(action_space, spaces.Box):
             raise error(f"action space {action_space}: a {kind} gives Box actions only")
-        has_predict = hasattr(source, "predict")
-        if not (hasattr(source, "actions") or has_predict or callable(source)):
+        sees_state = hasattr(source, "actions")
+        sees_observation = hasattr(source, "predict") or callable(source)
+        if not (sees_state or sees_observation):
             raise error(
                 f"{kind} {source!r}: needs actions(state) or predict(observation), "
                 "or must be a function of observations"
@@ -98,19 +79,19 @@ class Controller:
             ("action_space", action_space),
         ):
             theirs = getattr(source, name, None)
-            if isinstance(theirs, spaces.Space) and ours is not None and theirs.shape != ours.shape:
+            if isinstance(theirs, spaces.Space) and theirs.shape != ours.shape:
                 raise error(
                     f"{who}: its {name.replace('_', ' ')} has shape {theirs.shape}, "
                     f"the environment's {ours.shape}"
                 )
-        self.needs_state = hasattr(source, "actions") and true_state is not None
-        if not (self.needs_state or has_predict or callable(source)):
+        self.needs_state = sees_state and true_state is not None
+        if not (self.needs_state or sees_observation):
             raise error(f"{who}: needs the true state, and this environment has no true_state()")
 
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
-        self._low: Float32Array = action_space.low.reshape(-1).astype(np.float32)
-        self._high: Float32Array = action_space.high.reshape(-1).astype(np.float32)
+        self._low = action_space.low.ravel().astype(np.float32)
+        self._high = action_space.high.ravel().astype(np.float32)
 
     @staticmethod
     def for_env(
@@ -133,23 +114,18 @@ class Controller:
                 "or call set_expert(expert)"
             )
         # A recurrent expert keeps its state as long as it labels the same environment.
-        if present is not None and present.made_for is not None:
-            present_expert, present_env = present.made_for
-            if present_expert is expert and present_env is env:
-                return present
+        if present and present.made_for[0] is expert and present.made_for[1] is env:
+            return present
         vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
-        return Controller(
-            resolve_expert(expert, vehicle),
-            env.action_space,
-            env.observation_space,
-            true_state_of(env),
-            kind="expert",
-            made_for=(expert, env),
-        )
+        source = resolve_expert(expert, vehicle)
+        env_spaces = (env.action_space, env.observation_space)
+        controller = Controller(source, *env_spaces, true_state_of(env), kind="expert")
+        controller.made_for = (expert, env)
+        return controller
 
     def actions(
         self,
-        observation: npt.NDArray[Any],
+        observation: Any,
         rows: BoolArray | None = None,
         episode_start: BoolArray | None = None,
     ) -> Float32Array:
@@ -176,7 +152,7 @@ class Controller:
         if raw.dtype.kind not in "fiub":
             raise error(f"{who}: gives actions of type {raw.dtype}, must be real numbers")
         # Dictionary observations have a batch axis in each entry.
-        batch: Any = observation
+        batch = observation
         if isinstance(observation, dict):
             batch = next(iter(observation.values()))
         shape = (len(batch), *self._action_shape)
@@ -196,22 +172,19 @@ class Controller:
             )
         return actions
 
-    def labels(
-        self, observation: npt.NDArray[Any], episode_start: BoolArray | None = None
-    ) -> Float32Array:
+    def labels(self, observation: Any, episode_start: BoolArray | None = None) -> Float32Array:
         """Return :meth:`actions` clipped to the action space: the labels that an agent imitates."""
         actions = self.actions(observation, episode_start=episode_start)
-        np.clip(actions, self._low, self._high, out=actions)
-        return actions
+        return actions.clip(self._low, self._high)
 
-    def _ask(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
+    def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
         """Return the controller's own answer, unchecked."""
         if self.needs_state and self._true_state is not None:
             return self.source.actions(self._true_state())
         if not hasattr(self.source, "predict"):
             return self.source(observation)
         # Without a state yet, the policy begins by itself. Many policies take no such keywords.
-        keywords: dict[str, Any] = {}
+        keywords: StrDict = {}
         if self._predict_state is not None:
             keywords["state"] = self._predict_state
             if episode_start is not None:

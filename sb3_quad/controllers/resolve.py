@@ -6,6 +6,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError, unknown
 from sb3_quad.base.imports import import_name
+from sb3_quad.base.types import StrPath
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
@@ -24,9 +25,9 @@ DEFAULT_EXPERT = "pid"
 
 def resolve_expert(
     spec: Any,
-    vehicle: str | Path | Vehicle | Sequence[Any] = "itm",
+    vehicle: StrPath | Vehicle | Sequence[Any] = "itm",
     kind: str = "expert",
-    layout: str | Path | Vehicle | None = None,
+    layout: StrPath | Vehicle | None = None,
 ) -> Any:
     """Return the expert that ``spec`` names.
 

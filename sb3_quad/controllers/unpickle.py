@@ -10,10 +10,7 @@ import base64
 import math
 import pickletools
 import re
-import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +20,8 @@ from stable_baselines3.common import buffers, noise, policies, torch_layers, uti
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.dqn import policies as dqn
-from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
+from stable_baselines3.her import GoalSelectionStrategy
+from stable_baselines3.her import her_replay_buffer as her
 from stable_baselines3.sac import policies as sac
 from stable_baselines3.td3 import policies as td3
 from torch import nn, optim
@@ -31,10 +29,9 @@ from torch import nn, optim
 from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import TRUST_VARIABLE
+from sb3_quad.base.types import StrDict
 
 WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {TRUST_VARIABLE}=1)"
-Names = dict[tuple[str, str], Any]
-"""Objects by module and name."""
 
 
 def unpickle(text: str, where: str) -> Any:
@@ -72,9 +69,9 @@ def _check(fits: bool, what: str) -> None:
         raise _Refusal(what)
 
 
-def _is_one_of(value: Any, candidates: Iterable[Any]) -> bool:
+def _is_one_of(value: Any, names: StrDict) -> bool:
     """Compare by identity: equality could be an object's own method."""
-    return any(value is candidate for candidate in candidates)
+    return any(value is candidate for candidate in names.values())
 
 
 # Functions that stand for those that SB3's pickles call, and for the methods that set a state.
@@ -94,8 +91,8 @@ def _fill_array(array: Any, state: Any) -> None:
     _, shape, dtype, by_columns, content = state
     _check(isinstance(dtype, np.dtype), "an array")
     _check(type(content) is bytes and type(by_columns) is bool, "an array")
-    _check(type(shape) is tuple, "the shape of an array")
-    _check(all(type(n) is int and n >= 0 for n in shape), "the shape of an array")
+    is_shape = type(shape) is tuple and all(type(n) is int and n >= 0 for n in shape)
+    _check(is_shape, "the shape of an array")
     _check(len(content) == math.prod(shape) * dtype.itemsize, "the size of an array")
     array.__setstate__((1, shape, dtype, by_columns, content))
 
@@ -108,17 +105,13 @@ def _dtype(code: Any, *_: Any) -> Any:
 
 def _check_dtype(dtype: Any, state: Any) -> None:
     """Accept the state of a plain dtype in this machine's byte order, which it has already."""
-    native = {"little": "<", "big": ">"}[sys.byteorder]
-    if dtype.itemsize == 1:
-        native = "|"
-    _check(state[1] in ("|", native) and state[2:5] == (None, None, None), "a dtype")
+    _check(state[1:5] == (dtype.str[0], None, None, None), "a dtype")
 
 
 def _set_bit_generator(bit_generator: Any, state: Any) -> None:
+    # NumPy 2 adds the seeds. Only further generators would need them, and a space spawns none.
     if type(state) is tuple:
-        state, seeds = state
-        _check(type(seeds) is SeedSequence, "a random generator")
-        bit_generator.__init__(seeds)
+        state, _ = state
     bit_generator.state = state
 
 
@@ -134,90 +127,76 @@ def _set_generator(generator: Any, state: Any) -> None:
     generator.bit_generator.state = state
 
 
-def _set_seed_sequence(seeds: Any, state: Any) -> None:
-    # The third entry, the pool, follows from the others.
-    entropy, spawned, _, pool_size, spawn_key = state
-    seeds.__init__(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=spawned)
-
-
-def _member(kind: Any, value: Any) -> Any:
-    """Return the member of an enumeration."""
-    members = {member.value: member for member in kind}
-    return members[value]
-
-
 # Tables: what a pickle may name.
 
 
-def _by_name(*classes: type) -> Names:
-    return {(kind.__module__, kind.__qualname__): kind for kind in classes}
+def _by_name(*classes: type) -> StrDict:
+    return {f"{kind.__module__}.{kind.__qualname__}": kind for kind in classes}
 
 
-def _members(module: Any, names: str) -> Names:
-    return _by_name(*[getattr(module, name) for name in names.split()])
+def _members(names: dict[Any, str]) -> StrDict:
+    """Return classes by their full names.
+
+    :param names: the names of the classes in each module.
+    """
+    classes = []
+    for module, text in names.items():
+        classes += [getattr(module, name) for name in text.split()]
+    return _by_name(*classes)
 
 
 # Instances of these classes are made, and get attributes.
-_WITH_ATTRIBUTES = (
-    _members(spaces, "Box Dict Discrete MultiBinary MultiDiscrete")
-    | _members(noise, "NormalActionNoise OrnsteinUhlenbeckActionNoise VectorizedActionNoise")
-    | _members(utils, "ConstantSchedule FloatSchedule LinearSchedule")
-)
-# The others of these are only named, but for TrainFreq, a named tuple.
-_CLASSES = (
-    _WITH_ATTRIBUTES
-    | _members(policies, "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy")
-    | _members(sac, "SACPolicy CnnPolicy MultiInputPolicy")
-    | _members(td3, "TD3Policy CnnPolicy MultiInputPolicy")
-    | _members(dqn, "DQNPolicy CnnPolicy MultiInputPolicy")
-    | _members(torch_layers, "FlattenExtractor NatureCNN CombinedExtractor")
-    | _members(buffers, "RolloutBuffer DictRolloutBuffer ReplayBuffer DictReplayBuffer")
-    | _members(buffers, "NStepReplayBuffer")
-    | _members(nn, "CELU ELU GELU Hardswish Hardtanh LeakyReLU Mish ReLU ReLU6 SELU Sigmoid SiLU")
-    | _members(nn, "Softplus Softsign Tanh")
-    | _members(optim, "Adagrad Adam Adamax AdamW NAdam RAdam RMSprop SGD")
-    | _by_name(RMSpropTFLike, HerReplayBuffer, TrainFreq, np.float32, np.float64)
-)
-# The function that is called for a name. Items and state of its result follow in the pickle.
-_FUNCTIONS: Names = {
-    ("numpy", "dtype"): _dtype,
-    # Gymnasium's spaces have no other bit generator.
-    ("numpy.random._pickle", "__bit_generator_ctor"): lambda *_: PCG64(0),
-    ("numpy.random._pickle", "__generator_ctor"): _generator,
-    ("numpy.random.bit_generator", "__pyx_unpickle_SeedSequence"): lambda *_: SeedSequence(0),
-    ("collections", "OrderedDict"): lambda: OrderedDict(),
-    ("collections", "deque"): lambda _, length=None: deque(maxlen=length),
-}
-for _core in ("numpy.core", "numpy._core"):  # in NumPy 1 and 2
-    _FUNCTIONS |= {
-        (f"{_core}.numeric", "_frombuffer"): _array,
-        (f"{_core}.multiarray", "_reconstruct"): lambda *_: np.empty(0, np.int8),
-        (f"{_core}.multiarray", "scalar"): lambda dtype, content: _array(content, dtype, (), "C")[
-            ()
-        ],
+_WITH_ATTRIBUTES = _members(
+    {
+        spaces: "Box Dict Discrete MultiBinary MultiDiscrete",
+        noise: "NormalActionNoise OrnsteinUhlenbeckActionNoise VectorizedActionNoise",
+        utils: "ConstantSchedule FloatSchedule LinearSchedule",
     }
+)
+_NAMED = {
+    policies: "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy",
+    sac: "SACPolicy CnnPolicy MultiInputPolicy",
+    td3: "TD3Policy CnnPolicy MultiInputPolicy",
+    dqn: "DQNPolicy CnnPolicy MultiInputPolicy",
+    torch_layers: "FlattenExtractor NatureCNN CombinedExtractor",
+    buffers: ("RolloutBuffer DictRolloutBuffer ReplayBuffer DictReplayBuffer NStepReplayBuffer"),
+    her: "HerReplayBuffer",
+    nn: (
+        "CELU ELU GELU Hardswish Hardtanh LeakyReLU Mish ReLU ReLU6 SELU Sigmoid SiLU Softplus "
+        "Softsign Tanh"
+    ),
+    optim: "Adagrad Adam Adamax AdamW NAdam RAdam RMSprop SGD",
+    np: "float32 float64",
+}
+# The others of these are only named, but for TrainFreq, a named tuple.
+_CLASSES = _WITH_ATTRIBUTES | _members(_NAMED) | _by_name(RMSpropTFLike, TrainFreq)
+# The function that is called for a name. Items and state of its result follow in the pickle.
+_FUNCTIONS: StrDict = {
+    "numpy.dtype": _dtype,
+    # Gymnasium's spaces have no other bit generator.
+    "numpy.random._pickle.__bit_generator_ctor": lambda *_: PCG64(0),
+    "numpy.random._pickle.__generator_ctor": _generator,
+    "numpy.random.bit_generator.__pyx_unpickle_SeedSequence": lambda *_: SeedSequence(0),
+    "numpy.core.numeric._frombuffer": _array,
+    "numpy.core.multiarray._reconstruct": lambda *_: np.empty(0, np.int8),
+    "numpy.core.multiarray.scalar": lambda dtype, content: _array(content, dtype, (), "C")[()],
+    "collections.OrderedDict": lambda: OrderedDict(),
+    "collections.deque": lambda _, length=None: deque(maxlen=length),
+}
+# Members of enumerations, by their values.
 for _key, _kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items():
-    _FUNCTIONS[_key] = partial(_member, _kind)
+    _FUNCTIONS[_key] = {member.value: member for member in _kind}.__getitem__
 # Arguments of these functions, which know by themselves what they make.
-_ARGUMENTS: Names = {key: key[1] for key in _by_name(np.ndarray, PCG64, SeedSequence)}
+_ARGUMENTS = {key: key for key in _by_name(np.ndarray, PCG64, SeedSequence)}
 # How an object that has been made gets its state.
-_CHANGES: dict[type, Callable[[Any, Any], None]] = {
+_CHANGES: dict[type, Any] = {
     np.ndarray: _fill_array,
     PCG64: _set_bit_generator,
     Generator: _set_generator,
-    SeedSequence: _set_seed_sequence,
+    SeedSequence: lambda *_: None,
 }
 for _code in "?bhilqBHILQefdgFDG":
     _CHANGES[type(np.dtype(_code))] = _check_dtype
-
-
-def _recurrent_names() -> Names:
-    recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
-    return _members(
-        recurrent.policies,
-        "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
-        "RecurrentMultiInputActorCriticPolicy",
-    ) | _members(recurrent.buffers, "RecurrentRolloutBuffer RecurrentDictRolloutBuffer")
 
 
 # What the opcodes do. Each function takes the items of the stack and returns what replaces them.
@@ -225,17 +204,27 @@ def _recurrent_names() -> Names:
 
 def _find(module: Any, name: Any) -> Any:
     _check(type(module) is str and type(name) is str, "a name")
+    # NumPy 2 moved its core.
+    full_name = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
     names = _CLASSES | _FUNCTIONS | _ARGUMENTS
-    if module.startswith("sb3_contrib.common.recurrent."):
-        names |= _recurrent_names()
-    if (module, name) not in names:
-        raise _UnknownName(f"{module}.{name}".encode("unicode_escape").decode()[:200])
-    return names[module, name]
+    if full_name.startswith("sb3_contrib.common.recurrent."):
+        recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
+        names |= _members(
+            {
+                recurrent.policies: (
+                    "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
+                    "RecurrentMultiInputActorCriticPolicy"
+                ),
+                recurrent.buffers: "RecurrentRolloutBuffer RecurrentDictRolloutBuffer",
+            }
+        )
+    if full_name not in names:
+        raise _UnknownName(full_name.encode("unicode_escape").decode()[:200])
+    return names[full_name]
 
 
 def _call(function: Any, arguments: Any) -> Any:
-    _check(_is_one_of(function, _FUNCTIONS.values()), "a call")
-    _check(type(arguments) is tuple, "a call")
+    _check(_is_one_of(function, _FUNCTIONS) and type(arguments) is tuple, "a call")
     return function(*arguments)
 
 
@@ -243,7 +232,7 @@ def _new(kind: Any, arguments: Any) -> Any:
     _check(type(arguments) is tuple, "an instance")
     if kind is TrainFreq:
         return TrainFreq(*arguments)
-    _check(_is_one_of(kind, _WITH_ATTRIBUTES.values()) and not arguments, "an instance")
+    _check(_is_one_of(kind, _WITH_ATTRIBUTES) and not arguments, "an instance")
     return kind.__new__(kind)
 
 
@@ -252,7 +241,7 @@ def _change(instance: Any, state: Any) -> Any:
     if kind in _CHANGES:
         _CHANGES[kind](instance, state)
         return instance
-    _check(_is_one_of(kind, _WITH_ATTRIBUTES.values()) and type(state) is dict, "a state")
+    _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")
     _check(all(type(name) is str and not name.startswith("__") for name in state), "attributes")
     if hasattr(kind, "__setstate__"):
         kind.__setstate__(instance, state)
@@ -273,49 +262,46 @@ def _update(items: Any, *new: Any) -> Any:
     return items
 
 
-def _add(items: Any, *new: Any) -> Any:
-    _check(type(items) is set, "a container")
-    items.update(new)
-    return items
-
-
 def _tuple(*items: Any) -> Any:
     return items
 
 
 # Opcodes that push their argument.
-_LITERALS = (
-    *("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"),
-    *("SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
-    *("SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"),
-)
+_LITERALS = [
+    "BININT",
+    "BININT1",
+    "BININT2",
+    "LONG1",
+    "BINFLOAT",
+    "SHORT_BINUNICODE",
+    "BINUNICODE",
+    "SHORT_BINBYTES",
+    "BINBYTES",
+    "BYTEARRAY8",
+]
 # Opcodes that replace so many items of the stack by the result of a function.
-_OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+_OPERATIONS: StrDict = {
     "NONE": (0, lambda: None),
     "NEWTRUE": (0, lambda: True),
     "NEWFALSE": (0, lambda: False),
-    "EMPTY_TUPLE": (0, tuple),
+    "EMPTY_TUPLE": (0, _tuple),
     "EMPTY_LIST": (0, list),
     "EMPTY_DICT": (0, dict),
-    "EMPTY_SET": (0, set),
     "TUPLE1": (1, _tuple),
     "TUPLE2": (2, _tuple),
     "TUPLE3": (3, _tuple),
+    "TUPLE": (0, _tuple),
     "APPEND": (2, _extend),
+    "APPENDS": (1, _extend),
     "SETITEM": (3, _update),
+    "SETITEMS": (1, _update),
     "STACK_GLOBAL": (2, _find),
     "REDUCE": (2, _call),
     "NEWOBJ": (2, _new),
     "BUILD": (2, _change),
 }
-# The same for all items above the last mark, and so many below it.
-_MARK_OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
-    "TUPLE": (0, _tuple),
-    "FROZENSET": (0, lambda *items: frozenset(items)),
-    "APPENDS": (1, _extend),
-    "SETITEMS": (1, _update),
-    "ADDITEMS": (1, _add),
-}
+# These replace all items above the last mark as well.
+_TO_MARK = ("TUPLE", "APPENDS", "SETITEMS")
 
 
 def _interpret(content: bytes) -> Any:
@@ -323,7 +309,7 @@ def _interpret(content: bytes) -> Any:
 
     Known are the opcodes of protocols 4 and 5 that are used for what SB3 saves.
     """
-    memo: dict[int, Any] = {}
+    memo: list[Any] = []
     stack: list[Any] = []
     below: list[list[Any]] = []  # the stacks below each mark
     argument: Any
@@ -331,14 +317,13 @@ def _interpret(content: bytes) -> Any:
         name = opcode.name
         if name in _LITERALS:
             stack.append(argument)
-        elif name in _OPERATIONS or name in _MARK_OPERATIONS:
+        elif name in _OPERATIONS:
             # Take the items off the stack, and push the result.
             above: list[Any] = []
-            if name in _OPERATIONS:
-                count, operation = _OPERATIONS[name]
-            else:
-                count, operation = _MARK_OPERATIONS[name]
-                above, stack = stack, below.pop()
+            if name in _TO_MARK:
+                above = stack
+                stack = below.pop()
+            count, operation = _OPERATIONS[name]
             items = [stack.pop() for _ in range(count)]
             stack.append(operation(*reversed(items), *above))
         elif name == "GLOBAL":
@@ -347,19 +332,13 @@ def _interpret(content: bytes) -> Any:
         elif name == "MARK":
             below.append(stack)
             stack = []
-        elif name == "POP_MARK":
-            stack = below.pop()
         elif name == "POP":
             stack.pop()
         # The memo is how a pickle names an object twice.
         elif name == "MEMOIZE":
-            memo[len(memo)] = stack[-1]
-        elif name in ("BINPUT", "LONG_BINPUT"):
-            memo[argument] = stack[-1]
+            memo.append(stack[-1])
         elif name in ("BINGET", "LONG_BINGET"):
             stack.append(memo[argument])
-        elif name == "STOP":
-            return stack.pop()
         else:
-            _check(name in ("PROTO", "FRAME"), f"opcode {name}")
-    raise _Refusal("no end")
+            _check(name in ("PROTO", "FRAME", "STOP"), f"opcode {name}")
+    return stack.pop()

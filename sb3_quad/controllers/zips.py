@@ -16,6 +16,7 @@ from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import trusted
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.unpickle import unpickle
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
@@ -28,13 +29,13 @@ _FAMILIES = {
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",
 }
-# Of this package's algorithms: the family, a setting that only they save, and their name. Apart
-# from that their zips are those of the stock algorithm.
-_OURS = (
-    ("PPO", "bc_coef", "PPOBC"),
-    ("PPO", "beta", "DAgger"),
-    ("SAC", "bc_coef", "SACBC"),
-)
+# This package's algorithms with their family, and a setting that only they save. Apart from that
+# their zips are those of the stock algorithm.
+_OURS = {
+    "PPOBC": ("PPO", "bc_coef"),
+    "DAgger": ("PPO", "beta"),
+    "SACBC": ("SAC", "bc_coef"),
+}
 # Of the pickles of an agent, ``predict`` needs only these.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")
 # The others become None, or these values where SB3 cannot load None.
@@ -45,7 +46,7 @@ _NEVER_READ = ("env", "expert", "_labeller")
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 
 
-def saved_data(path: str | Path | io.BytesIO, where: str = "") -> dict[str, Any]:
+def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
     """Return the attributes of the model in an SB3 ``.zip``, as its JSON has them.
 
     Attributes that are pickled there stay pickled.
@@ -70,7 +71,7 @@ def _incomplete(where: str, error: Exception) -> ConfigError:
     return ConfigError(f"{where}: not a complete SB3 zip ({type(error).__name__}: {error})")
 
 
-def saved_algorithm(path: str | Path) -> str:
+def saved_algorithm(path: StrPath) -> str:
     """Return the name of the algorithm that made an SB3 ``.zip``.
 
     It is PPO, A2C, SAC, TD3, DDPG, DQN or RecurrentPPO; or PPOBC, SACBC or DAgger of this package.
@@ -89,7 +90,7 @@ def saved_algorithm(path: str | Path) -> str:
             f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}"
         )
     family = _FAMILIES[module]
-    for stock, setting, name in _OURS:
+    for name, (stock, setting) in _OURS.items():
         if family == stock and setting in data:
             return name
     # A2C and DDPG have the policy classes of PPO and TD3.
@@ -102,7 +103,7 @@ def saved_algorithm(path: str | Path) -> str:
 
 def load_zip(
     algorithm: type[Algorithm],
-    path: str | Path | io.BytesIO,
+    path: StrPath | io.BytesIO,
     to_fly: bool = False,
     where: str = "",
     **kwargs: Any,
@@ -119,7 +120,7 @@ def load_zip(
     """
     where = where or f"model {path}"
     # What stands in ``custom_objects`` is not unpickled by SB3.
-    objects: dict[str, Any] = {}
+    objects: StrDict = {}
     data = {} if trusted() else saved_data(path, where)
     for key, entry in data.items():
         if key in _NEVER_READ:
@@ -150,7 +151,7 @@ def load_zip(
         ) from error
 
 
-def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
+def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     """Return the model in an SB3 ``.zip``, ready for ``predict``.
 
     It may be of any algorithm of Stable-Baselines3 or of this package.
@@ -160,10 +161,9 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     :raises MissingExtra: a recurrent model, and sb3-contrib is not installed.
     """
     name = saved_algorithm(path)
-    for stock, _, ours in _OURS:
-        if name == ours:
-            name = stock
     # ``predict`` of this package's algorithms is that of the stock ones.
+    if name in _OURS:
+        name, _ = _OURS[name]
     library = stable_baselines3
     if name == "RecurrentPPO":
         library = require("sb3_contrib", "", f"model {path}")

@@ -2,14 +2,13 @@
 
 import re
 import textwrap
-from collections.abc import Mapping
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from sb3_quad.base.arrays import Float32Array
-from sb3_quad.export.network import Network, StatefulNetwork
+from sb3_quad.base.types import StrDict
+from sb3_quad.export.network import Network
+from sb3_quad.export.templates import c_number, render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 WIDTH = 110  # columns
@@ -21,7 +20,7 @@ def c_name(text: str) -> str:
     return name if name and not name[0].isdigit() else f"quad_{name}".rstrip("_")
 
 
-def write_header(network: Network, metadata: Mapping[str, str], name: str) -> bytes:
+def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     """Return the header, with ``static inline void NAME_policy(const float observation[18], float
     thrust[4])``.
 
@@ -32,45 +31,19 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
-    # The constants of the file, by name.
-    tables = {"mean": network.mean, "inverse_std": network.inverse_std}
-    for number, (layer, _) in enumerate(network.steps):
-        tables[f"weight_{number}"] = layer.weight
-        tables[f"bias_{number}"] = layer.bias
-    # A policy of the present features alone has no state, and gets a shorter function.
-    state: dict[str, Any] = {}
-    if isinstance(network, StatefulNetwork):
-        names = ("gain", "distance2", "speed2", "limit")
-        state = {
-            "observation": network.observation,
-            "integral": dict(zip(names, map(_number, network.integral or ()), strict=False)),
-            "keeps_actions": bool(network.actions),
-        }
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sb3_quad.export", ""),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    text = environment.get_template("policy.h.j2").render(
+    text = render(
+        "policy.h.j2",
         name=name,
-        guard=f"{name.upper()}_POLICY_H",
         comment=_comment(metadata),
-        tables=[_table(f"{name}_policy_{key}", value.numpy()) for key, value in tables.items()],
-        layers=network.shapes,
+        table=_table,
+        network=network,
         features=OBSERVATION_SIZE,
-        position=F.position,
-        velocity=F.velocity,
-        result=network.result,
-        middle=_number(network.middle),
-        half_range=_number(network.half_range),
-        **{"keeps_actions": False, **state},
+        F=F,
     )
     return text.encode("ascii")
 
 
-def _comment(metadata: Mapping[str, str]) -> list[str]:
+def _comment(metadata: StrDict) -> list[str]:
     lines: list[str] = []
     for key, value in metadata.items():
         # A file may have any name, but the name must neither end the comment nor leave ASCII.
@@ -80,14 +53,12 @@ def _comment(metadata: Mapping[str, str]) -> list[str]:
     return lines
 
 
-def _number(value: Any) -> str:
-    """Return the fewest digits that tell a float32 from any other."""
-    return f"{np.float32(value)!s}f"
-
-
-def _table(name: str, values: Float32Array) -> str:
+def _table(name: str, tensor: Any) -> str:
+    values = tensor.numpy()
     size = "".join(f"[{length}]" for length in values.shape)
     # NumPy's brackets become C's braces.
-    with np.printoptions(threshold=values.size, linewidth=WIDTH, formatter={"float_kind": _number}):
+    with np.printoptions(
+        threshold=values.size, linewidth=WIDTH, formatter={"float_kind": c_number}
+    ):
         rows = np.array2string(values, separator=", ").translate(str.maketrans("[]", "{}"))
     return f"{name}{size} =\n{rows}"

@@ -5,12 +5,12 @@ difference.
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ExportError
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.batch import QuadcopterBatch
@@ -58,16 +58,11 @@ class Reference(NamedTuple):
     turn: Turn = Turn()
 
     @property
-    def turned_features(self) -> FloatArray:
-        """(18, 18), from features in the vehicle's own body frame to those the policy knows."""
-        return turn_features(self.turn)
-
-    @property
     def own_mean(self) -> FloatArray:
         """μ in the vehicle's own body frame, (OBSERVATION_SIZE,)."""
-        return self.mean @ self.turned_features
+        return self.mean @ turn_features(self.turn)
 
-    def results(self, actions: npt.ArrayLike) -> FloatArray:
+    def results(self, actions: Any) -> FloatArray:
         """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape,
         in float64.
         """
@@ -111,12 +106,7 @@ class Comparison(Hook):
     def __init__(self, reference: Reference, call: Call) -> None:
         self._reference = reference
         self._call = call
-        self._turned = reference.turned_features.astype(np.float32)
-        self._order = [*reference.turn.order]
-        integral = reference.observation.position_integral
-        self._limits = {}
-        if integral is not None:
-            self._limits = {"position": integral.distance, "velocity": integral.speed}
+        self._turned = turn_features(reference.turn).astype(np.float32)
         self._state = None
         self._sure = np.True_
         self.count = 0
@@ -132,16 +122,17 @@ class Comparison(Hook):
         # The present frame comes first in an observation. Unscaled, it is the file's input.
         scaled = observation[:, :OBSERVATION_SIZE]
         features = (scaled * self._reference.std + self._reference.mean).astype(np.float32)
-        if self._limits:
+        integral = self._reference.observation.position_integral
+        if integral is not None:
             # The position integral is a part of the observed position, and the file has its own.
             features[:, GROUPS["position"]] = state.position - state.target
-        # So close to a limit, rounding may begin to integrate one step earlier or later.
-        for group, limit in self._limits.items():
-            norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
-            self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
+            # So close to a limit, rounding may begin to integrate one step earlier or later.
+            for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
+                norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
+                self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
         # The file flies the vehicle in its own axes and order of rotors.
         results, self._state = self._call(features @ self._turned, self._state)
-        self._results = results[:, self._order]
+        self._results = results[:, self._reference.turn.order]
         self._compared = flying & self._sure
 
     def after_step(
@@ -167,7 +158,7 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
         finite.
     """
     # Far and fast starts, or long flights for a policy with a state.
-    changes: dict[str, Any] = {"task": "recovery_and_tracking", "task_kwargs": WIDE, "noise": 0.05}
+    changes: StrDict = {"task": "recovery_and_tracking", "task_kwargs": WIDE, "noise": 0.05}
     steps = SHORT
     if reference.observation.is_extended:
         changes = {"task": {"recovery_and_tracking": 1.0, NEAR: 1.0}, "noise": 0.0}

@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
+from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 N_ROTORS = 4
@@ -36,10 +37,10 @@ def load_torchscript(content: bytes) -> tuple[Call, str]:
     size = int(json.loads(extra["metadata.json"]).get("state_size", 0))
 
     @th.no_grad()
-    def run(*inputs: Float32Array) -> Sequence[Float32Array]:
+    def run(*inputs: Float32Array) -> list[Any]:
         outputs = module(*map(th.from_numpy, inputs))
         if not size:
-            return [outputs.numpy()]
+            outputs = [outputs]
         return [output.numpy() for output in outputs]
 
     return _call(run, size), f"torch {th.__version__}"
@@ -65,17 +66,16 @@ def load_onnx(content: bytes) -> tuple[Call, str]:
     return _call(run, size), f"onnxruntime {runtime.__version__}"
 
 
-def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
+def _call(run: Callable[..., Any], size: int) -> Call:
     """:param size: numbers in a state of ``run``; 0: it takes and gives none."""
 
-    def call(rows: Float32Array, state: Float32Array | None = None) -> tuple[Float32Array, Any]:
+    def call(rows: Float32Array, state: Any = None) -> Any:
         if not size:
             return run(rows)[0], None
         # Zeros begin a flight.
         if state is None:
             state = np.zeros((len(rows), size), dtype=np.float32)
-        results, following = run(rows, state)
-        return results, following
+        return tuple(run(rows, state))
 
     return call
 
@@ -93,26 +93,27 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
             "--format c needs a C compiler, to check what it writes: "
             "install gcc or clang (apt install gcc)"
         )
-    # The program below also flies a policy without a state, by a state that it does not use.
-    declarations = f"typedef char {name}_state;\n#define {name}_reset(state) (*(state) = 0)\n"
-    argument = ""
-    if f"}} {name}_state;".encode() in content:
-        declarations = ""
-        argument = "&states[k], "
-    program = f"""\
-#include "policy.h"
-{declarations}int size(void) {{ return (int)sizeof({name}_state); }}
-void run(const float *in, float *out, {name}_state *states, int begin, long n)
-{{
-    for (long k = 0; k < n; ++k) {{
-        if (begin) {name}_reset(&states[k]);
-        {name}_policy({argument}in + {OBSERVATION_SIZE} * k, out + {N_ROTORS} * k);
-    }}
-}}
-"""
-    library = _compile(compiler, content, program)
+    program = render(
+        "run.c.j2",
+        name=name,
+        stateful=f"}} {name}_state;".encode() in content,
+        features=OBSERVATION_SIZE,
+        rotors=N_ROTORS,
+    )
+    with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
+        Path(folder, "policy.h").write_bytes(content)
+        Path(folder, "run.c").write_text(program, encoding="ascii")
+        command = (compiler, *FLAGS, "-shared", "-fPIC", "-o", "run.so", "run.c", "-lm")
+        try:
+            subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+            library = ctypes.CDLL(f"{folder}/run.so")
+        except (subprocess.CalledProcessError, OSError) as error:
+            reason = one_line(error)
+            if isinstance(error, subprocess.CalledProcessError):
+                reason = f"{compiler} failed ({' '.join(error.stderr.split())[:200]})"
+            raise ExportError(f"the C header cannot be checked: {reason}") from None
 
-    def call(rows: Float32Array, state: Any = None) -> tuple[Float32Array, Any]:
+    def call(rows: Float32Array, state: Any = None) -> Any:
         begins = state is None
         if begins:
             # A new struct holds anything before its reset.
@@ -123,19 +124,3 @@ void run(const float *in, float *out, {name}_state *states, int begin, long n)
         return results, state
 
     return call, f"{compiler} {' '.join(FLAGS)}"
-
-
-def _compile(compiler: str, header: bytes, program: str) -> ctypes.CDLL:
-    """Compile and load a program that includes the header as ``policy.h``."""
-    with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
-        Path(folder, "policy.h").write_bytes(header)
-        Path(folder, "run.c").write_text(program, encoding="ascii")
-        command = (compiler, *FLAGS, "-shared", "-fPIC", "-o", "run.so", "run.c", "-lm")
-        try:
-            subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-            return ctypes.CDLL(str(Path(folder, "run.so")))
-        except subprocess.CalledProcessError as error:
-            reason = f"{compiler} failed ({' '.join(error.stderr.split())[:200]})"
-        except OSError as error:
-            reason = one_line(error)
-    raise ExportError(f"the C header cannot be checked: {reason}")

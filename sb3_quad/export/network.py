@@ -6,7 +6,6 @@ import copy
 import io
 import itertools
 import json
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,19 +14,18 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
-from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.imports import require
+from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import Reference
-from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
 from sb3_quad.vehicles.layout import Turn
 
 ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
 """Each output with the name and the unit of one of its four numbers."""
-EXAMPLE = th.zeros(2, OBSERVATION_SIZE)
 
 
 class Network(th.nn.Module):
@@ -38,28 +36,33 @@ class Network(th.nn.Module):
     a`` (Eq. 3.18): thrusts, N. For speeds, middle and half_range are divided by kF, and the result
     is the root of q, rad/s (Eq. 2.4).
 
+    A policy that sees more than the present features keeps the frames of
+    :mod:`sb3_quad.simulation.frames` in a state, float32 (batch, ``state_size``). The state is
+    zeros as a flight begins. It holds as much of these as the policy sees: the last action (4); the
+    integral s (3), m, with a 1 once a flight has begun; the earlier frames, scaled, the latest
+    first.
+
     :param layers: linear layers, each with the activation that follows it, if any; they are copied.
-    :param reference: its scaling, vehicle and output; features and rotors are those of the
-        vehicle's own layout.
+    :param reference: its scaling, vehicle, output and ``observation``; features and rotors are
+        those of the vehicle's own layout.
     """
 
     mean: th.Tensor
     inverse_std: th.Tensor
     middle: th.Tensor
     half_range: th.Tensor
-    examples: tuple[th.Tensor, ...] = (EXAMPLE,)
-    facts: Mapping[str, str] = {}  # for the file's metadata
 
     def __init__(self, layers: th.nn.Sequential, reference: Reference) -> None:
         super().__init__()
+        vehicle = reference.vehicle
+        observation = reference.observation
+        self.observation = observation
         self.output = reference.output
         self.result, self.unit = OUTPUTS[self.output]
-        self.inputs = ["observation"]
-        self.outputs = [self.result]
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
-        limits = np.array(reference.vehicle.thrust_range)
+        limits = np.array(vehicle.thrust_range)
         if self.output == "speeds":
-            limits /= reference.vehicle.thrust_coefficient
+            limits /= vehicle.thrust_coefficient
         buffers = {
             "mean": reference.own_mean,
             "inverse_std": 1.0 / reference.std,
@@ -69,83 +72,32 @@ class Network(th.nn.Module):
         for name, value in buffers.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float32))
         self.layers = own_layers(layers, reference).to(th.float32)
-        self.eval()
 
-    def forward(self, observation: th.Tensor) -> th.Tensor:
-        """Rotor thrusts or speeds, (batch, 4), of observations, (batch, OBSERVATION_SIZE)."""
-        scaled = (observation - self.mean) * self.inverse_std
-        return self.command(self.layers(scaled).clamp(-1.0, 1.0))
-
-    def command(self, action: th.Tensor) -> th.Tensor:
-        """Rotor thrusts or speeds, (batch, 4), of actions."""
-        value: th.Tensor = self.middle + self.half_range * action
-        if self.output == "thrusts":
-            return value
-        # Rounding may leave a rotor that can stand still a hair below zero.
-        return value.relu().sqrt()
-
-    @property
-    def steps(self) -> list[tuple[th.nn.Linear, str]]:
-        """Each linear layer with the name of the activation that follows it: ``tanh``, ``relu`` or
-        ``none``.
-        """
-        return [
-            (layer, ACTIVATIONS.get(type(after), "none"))
-            for layer, after in itertools.pairwise([*self.layers, None])
-            if isinstance(layer, th.nn.Linear)
-        ]
-
-    @property
-    def shapes(self) -> list[dict[str, Any]]:
-        """Inputs, outputs and activation of each linear layer."""
-        return [
-            {"inputs": layer.in_features, "outputs": layer.out_features, "activation": activation}
-            for layer, activation in self.steps
-        ]
-
-
-class StatefulNetwork(Network):
-    """A network with the frames of :mod:`sb3_quad.simulation.frames` in a state, float32 (batch,
-    ``state_size``).
-
-    The state is zeros as a flight begins. It holds as much of these as the policy sees: the last
-    action (4); the integral s (3), m, with a 1 once a flight has begun; the earlier frames, scaled,
-    the latest first.
-
-    :param reference: its ``observation`` says what the policy sees.
-    """
-
-    def __init__(self, layers: th.nn.Sequential, reference: Reference) -> None:
-        super().__init__(layers, reference)
-        observation = reference.observation
-        self.observation = observation
-        self.integral = observation.position_integral and observation.position_integral.numbers(
-            reference.vehicle.control_step
-        )
         # The state begins with the last action; the latest frame follows the integral.
+        integral = observation.position_integral
+        self.integral = integral and integral.numbers(vehicle.control_step)
         self.actions = 4 * observation.last_action
-        self.newest = self.actions + 4 * bool(self.integral)
-        state_size = self.newest + observation.ages[-1] * observation.frame_size
-        self.inputs = ["observation", "state"]
-        self.outputs = [self.result, "next_state"]
-        self.examples = (EXAMPLE, th.zeros(len(EXAMPLE), state_size))
+        self.newest = self.actions + 4 * bool(integral)
+        self.state_size = self.newest + observation.ages[-1] * observation.frame_size
         # From the integral to what it adds to the scaled features.
         self.shift = th.diag(self.inverse_std)[GROUPS["position"]]
-        settings = observation.model_dump(mode="json").items()
-        needs = ", ".join(f"{name} {value}" for name, value in settings if value)
-        self.facts = {
-            "state": (
-                "zeros begin a flight, then it is the next_state of the call before; "
-                f"in C a struct, which NAME_reset begins. It holds what {needs} need"
-            ),
-            "state_size": f"{state_size}",
-        }
+        # What the files take and give, and an example of it.
+        self.inputs = ["observation"]
+        self.outputs = [self.result]
+        self.examples = [th.zeros(2, OBSERVATION_SIZE)]
+        if observation.is_extended:
+            self.inputs.append("state")
+            self.outputs.append("next_state")
+            self.examples.append(th.zeros(2, self.state_size))
+        self.eval()
 
-    def forward(self, observation: th.Tensor, state: th.Tensor) -> Any:  # type: ignore[override]
-        """Rotor thrusts or speeds, (batch, 4), and the next state, of observations, (batch,
-        OBSERVATION_SIZE), and the present state.
+    def forward(self, observation: th.Tensor, state: th.Tensor | None = None) -> Any:
+        """Rotor thrusts or speeds, (batch, 4), of observations, (batch, OBSERVATION_SIZE); with a
+        state also the next one.
         """
         frame = (observation - self.mean) * self.inverse_std
+        if state is None:
+            return self.command(self.layers(frame).clamp(-1.0, 1.0))
         following = []
         if self.integral:
             gain, distance2, speed2, limit = self.integral
@@ -160,12 +112,34 @@ class StatefulNetwork(Network):
             following = [s, begun.clamp(min=1.0)]
         # The present frame ends with the last action; the earlier frames follow it.
         frames = th.cat([frame, state[:, : self.actions], state[:, self.newest :]], dim=1)
+        # The policy sees the frames of some ages; all but the oldest stay in the state.
         size = self.observation.frame_size
         ages = self.observation.ages
-        seen = th.cat([frames[:, age * size : (age + 1) * size] for age in ages], dim=1)
+        seen = frames.view(-1, ages[-1] + 1, size)[:, ages].flatten(1)
         action = self.layers(seen).clamp(-1.0, 1.0)
         following = [action[:, : self.actions], *following, frames[:, : ages[-1] * size]]
         return self.command(action), th.cat(following, dim=1)
+
+    def command(self, action: th.Tensor) -> th.Tensor:
+        """Rotor thrusts or speeds, (batch, 4), of actions."""
+        value: th.Tensor = self.middle + self.half_range * action
+        if self.output == "thrusts":
+            return value
+        # Rounding may leave a rotor that can stand still a hair below zero.
+        return value.relu().sqrt()
+
+    @property
+    def shapes(self) -> list[StrDict]:
+        """Inputs, outputs and activation (``tanh``, ``relu`` or ``none``) of each linear layer."""
+        return [
+            {
+                "inputs": layer.in_features,
+                "outputs": layer.out_features,
+                "activation": ACTIVATIONS.get(type(following), "none"),
+            }
+            for layer, following in itertools.pairwise([*self.layers, None])
+            if isinstance(layer, th.nn.Linear)
+        ]
 
 
 def build_network(reference: Reference, where: str = "model") -> Network:
@@ -192,17 +166,13 @@ def build_network(reference: Reference, where: str = "model") -> Network:
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
         )
-    # C knows these layers only, and a file with NaN would fail in flight.
+    # C knows these layers only.
     for layer in layers:
         if type(layer) is not th.nn.Linear and type(layer) not in ACTIVATIONS:
             raise ConfigError(
                 f"{where}: its network has a layer {layer}; "
                 "only linear layers, Tanh and ReLU export"
             )
-    if not parameters_to_vector(layers.parameters()).isfinite().all():
-        raise ConfigError(f"{where}: holds parameters that are not finite")
-    if reference.observation.is_extended:
-        return StatefulNetwork(layers, reference)
     return Network(layers, reference)
 
 
@@ -221,9 +191,9 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     observation = reference.observation
     std = reference.std
     frame = np.eye(observation.frame_size)
-    frame[:OBSERVATION_SIZE, :OBSERVATION_SIZE] = reference.turned_features * std / std[:, None]
+    frame[:OBSERVATION_SIZE, :OBSERVATION_SIZE] = turn_features(turn) * std / std[:, None]
     if observation.last_action:
-        frame[OBSERVATION_SIZE:, OBSERVATION_SIZE:] = np.eye(4)[[*turn.order]]
+        frame[OBSERVATION_SIZE:, OBSERVATION_SIZE:] = np.eye(4)[list(turn.order)]
     # Every observed frame is turned alike; the weights absorb it, so that files stay as fast.
     frames = np.kron(np.eye(len(observation.ages)), frame)
     linear[0].weight.copy_(linear[0].weight @ th.from_numpy(frames))
@@ -269,18 +239,18 @@ def check_policy(policy: Any, where: str) -> None:
         )
 
 
-def write_torchscript(network: Network, metadata: Mapping[str, str]) -> bytes:
+def write_torchscript(network: Network, metadata: StrDict) -> bytes:
     """Return the file that ``torch.jit.load`` reads, in Python and in C++, with ``metadata`` as the
     extra file ``metadata.json``.
     """
     # Tracing writes out the computation of an example, without this package's classes.
     buffer = io.BytesIO()
-    traced = th.jit.trace(network, network.examples)  # type: ignore[no-untyped-call]
-    th.jit.save(traced, buffer, _extra_files={"metadata.json": json.dumps(dict(metadata))})
+    traced = th.jit.trace(network, tuple(network.examples))  # type: ignore[no-untyped-call]
+    th.jit.save(traced, buffer, _extra_files={"metadata.json": json.dumps(metadata)})
     return buffer.getvalue()
 
 
-def write_onnx(network: Network, metadata: Mapping[str, str]) -> bytes:
+def write_onnx(network: Network, metadata: StrDict) -> bytes:
     """Return the model: ``observation`` float32 (batch, OBSERVATION_SIZE) to ``thrust`` or
     ``rotor_speed``, float32 (batch, 4).
 
@@ -293,7 +263,7 @@ def write_onnx(network: Network, metadata: Mapping[str, str]) -> bytes:
     buffer: Any = io.BytesIO()
     th.onnx.export(
         network,
-        network.examples,
+        tuple(network.examples),
         buffer,
         input_names=network.inputs,
         output_names=network.outputs,
@@ -305,6 +275,6 @@ def write_onnx(network: Network, metadata: Mapping[str, str]) -> bytes:
     )
     model = onnx.load_from_string(buffer.getvalue())
     model.producer_name = "sb3_quad"
-    onnx.helper.set_model_props(model, dict(metadata))
+    onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())

@@ -5,29 +5,24 @@ import re
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare, make_reference
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
-from sb3_quad.simulation.observation import FEATURES, GROUPS, OBSERVATION_SIZE
+from sb3_quad.export.templates import render
+from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
-# The groups of an observation whose names do not say enough.
-GROUPS_IN_WORDS = {
-    "position": "position minus target position, world frame",
-    "rotation": "rotation matrix world to body (v_body = R v_world), row by row",
-    "velocity": "linear velocity, body frame",
-    "body_rates": "body rates, body frame",
-}
 
 
 class Export(NamedTuple):
@@ -41,7 +36,7 @@ class Export(NamedTuple):
 
 
 def export_policy(
-    path: str | Path,
+    path: StrPath,
     file_format: str,
     output: str = "thrusts",
     vehicle: str | Path | Vehicle | None = None,
@@ -75,7 +70,7 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     # Each format has a writer, and a reader for the check.
-    formats: dict[str, tuple[Any, Any]] = {
+    formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
         "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
@@ -116,57 +111,25 @@ def export_policy(
 
 def _describe(
     path: Path, algorithm: str, network: Network, reference: Reference, vehicle: Vehicle
-) -> dict[str, str]:
+) -> StrDict:
     """Return what users of the file must know; ASCII but for names."""
+    text = render(
+        "metadata.j2",
+        version=__version__,
+        network=network,
+        reference=reference,
+        vehicle=vehicle,
+        # The limits of the results are those of the extreme actions.
+        limits=reference.results([-1.0, 1.0]),
+        features=FEATURES,
+        places=GROUPS,
+        n_parameters=parameters_to_vector(network.parameters()).numel(),
+        needs=network.observation.model_dump(mode="json"),
+    )
+    # The name of a file may hold anything, also the end of a line.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    # The limits of the results are those of the extreme actions.
-    low, high = reference.results([-1.0, 1.0])
-    places = zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True)
-    shapes = network.shapes
-    sizes = [shapes[0]["inputs"], *(shape["outputs"] for shape in shapes)]
-    hidden = ", ".join(shape["activation"] for shape in shapes[:-1]) or "none"
-    n_parameters = parameters_to_vector(network.parameters()).numel()
-    return {
-        "policy": f"{path.name} ({algorithm}), sha256 {digest}",
-        "made_by": f"sb3_quad {__version__}",
-        "vehicle": (
-            f"{vehicle.name}: hover thrust {vehicle.hover_thrust:.6g} N, "
-            f"kF {vehicle.thrust_coefficient:.6g} N s^2"
-        ),
-        "frames": "world: z up; body: x forward, y left, z up",
-        "observation": f"{OBSERVATION_SIZE} numbers, not scaled: {'; '.join(_features())}",
-        **network.facts,
-        "result": (
-            f"4 numbers: the {network.output.removesuffix('s')} to command of each rotor, "
-            f"{network.unit}, within {low:.6g} to {high:.6g}"
-        ),
-        "rotors": "; ".join(
-            f"{number} at x {x:.4g} m, y {y:.4g} m, yaw moment {'+' if sign > 0 else '-'}"
-            for number, ((x, y), sign) in enumerate(places)
-        ),
-        "period": f"{vehicle.control_step:g} s between calls, as in training",
-        "scaling": (
-            f"done inside, (x - mean) / std with mean {_numbers(reference.own_mean)} "
-            f"and std {_numbers(reference.std)}"
-        ),
-        "network": (
-            f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, "
-            f"{n_parameters} float32 parameters"
-        ),
-        "check": "pending",
-    }
-
-
-def _features() -> list[str]:
-    """Return each group of features with its places in an observation and its unit."""
-    lines = []
-    for feature in FEATURES:
-        rows = GROUPS[feature.name]
-        text = GROUPS_IN_WORDS.get(feature.name, feature.name)
-        unit = "" if feature.unit == "-" else f", {feature.unit}"
-        lines.append(f"{rows.start}-{rows.stop - 1} {text}{unit}")
-    return lines
-
-
-def _numbers(values: Any) -> str:
-    return ", ".join(f"{value:.6g}" for value in values)
+    metadata = {"policy": f"{path.name} ({algorithm}), sha256 {digest}"}
+    for line in text.splitlines():
+        key, _, value = line.partition(": ")
+        metadata[key] = value
+    return metadata

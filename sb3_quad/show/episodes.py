@@ -1,6 +1,6 @@
 """Recorded flights to be shown: the same episodes for all controllers, on PyBullet."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -10,9 +10,10 @@ import numpy as np
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.colours import COLOURS
 from sb3_quad.base.errors import ConfigError, ControllerError
+from sb3_quad.base.types import StrMapping
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose
-from sb3_quad.evaluation.flights import Hook, fly_settings
+from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
 from sb3_quad.simulation.checks import per_row
@@ -52,11 +53,6 @@ class Recording:
         return self.state.target[changed]
 
     @property
-    def landmarks(self) -> FloatArray:
-        """The points by which a camera's direction is chosen, (n, 3), m."""
-        return np.concatenate([self.state.position[::5], self.targets])
-
-    @property
     def disturbances(self) -> list[int]:
         """The steps after which a wrench has begun to act."""
         # A wrench begins to act where it acts in a step and not in the one before.
@@ -65,7 +61,7 @@ class Recording:
 
     def at(self, seconds: float) -> int:
         """The index of the last state not later than ``seconds``."""
-        return max(0, int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1)
+        return int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1
 
     def vehicle_and_target(self, step: int) -> FloatArray:
         """The positions of both, (2, 3), world frame, m."""
@@ -83,6 +79,14 @@ class Recording:
         return Pose(self.state.array[:, step], wrench, self.rotor_angles[step])
 
 
+def landmarks(recordings: Iterable[Recording]) -> FloatArray:
+    """Return the points and targets of flights, from which a camera is chosen, (n, 3), m."""
+    points = []
+    for recording in recordings:
+        points += [recording.state.position, recording.targets]
+    return np.concatenate(points)
+
+
 class Setting(NamedTuple):
     """The episodes that all controllers fly."""
 
@@ -90,7 +94,7 @@ class Setting(NamedTuple):
     settings: FlightSettings  # of all episodes
     plan: Callable[[int], Plan]  # the events of an episode, by its seed
     # Changes to the settings that go with a controller, by its label.
-    own: Mapping[str, Mapping[str, Any]] = {}
+    own: StrMapping = {}
 
 
 def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = None) -> Setting:
@@ -126,7 +130,7 @@ def scenario_setting(text: str, own: Any = None) -> Setting:
 
 
 def fly_all(
-    controllers: Mapping[str, Any],
+    controllers: StrMapping,
     setting: Setting,
     seed: int,
     n_timesteps: int | None,
@@ -157,47 +161,20 @@ def fly_all(
                 label = name if n_envs == 1 else f"seed {episode_seed}, {name}"
                 colour = COLOURS[len(episode) % len(COLOURS)]
                 plan = setting.plan(episode_seed)
+                log = _Log()
                 try:
-                    recording = _record(
-                        label, colour, controller, own, plan, episode_seed, deterministic
+                    flights = fly_settings(
+                        controller, own, [episode_seed], "pybullet", (), [log], plan, deterministic
                     )
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
-                episode.append(recording)
+                episode.append(log.recording(label, colour, flights))
         yield episode
         if n_timesteps is None:
             return
         # The longest flight counts, since the others wait for it.
         left -= max(len(recording.times) - 1 for recording in episode)
         seed += n_envs
-
-
-def _record(
-    name: str,
-    colour: str,
-    controller: Any,
-    settings: FlightSettings,
-    plan: Plan,
-    seed: int,
-    deterministic: bool,
-) -> Recording:
-    log = _Log()
-    flights = fly_settings(controller, settings, [seed], "pybullet", (), [log], plan, deterministic)
-    lost = ""
-    if flights.collision[0]:
-        lost = "collision"
-    elif not flights.survival[0]:
-        lost = "out of range"
-    return Recording(
-        name=name,
-        colour=colour,
-        vehicle=log.vehicle,
-        times=np.arange(len(log.states), dtype=np.float64) * log.vehicle.control_step,
-        state=QuadcopterState.concatenate(log.states),
-        wrench=np.stack(log.wrenches),
-        reward=float(flights.reward[0]),
-        lost=lost,
-    )
 
 
 class _Log(Hook):
@@ -221,3 +198,21 @@ class _Log(Hook):
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
     ) -> None:
         self.states.append(state.copy())
+
+    def recording(self, name: str, colour: str, flights: Flights) -> Recording:
+        """Return the flight, whose results are the only ones of ``flights``."""
+        lost = ""
+        if flights.collision[0]:
+            lost = "collision"
+        elif not flights.survival[0]:
+            lost = "out of range"
+        return Recording(
+            name=name,
+            colour=colour,
+            vehicle=self.vehicle,
+            times=np.arange(len(self.states), dtype=np.float64) * self.vehicle.control_step,
+            state=QuadcopterState.concatenate(self.states),
+            wrench=np.stack(self.wrenches),
+            reward=float(flights.reward[0]),
+            lost=lost,
+        )

@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import to_rgb
 
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
+from sb3_quad.base.types import StrDict
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
-from sb3_quad.show.episodes import Recording
+from sb3_quad.show.episodes import Recording, landmarks
 from sb3_quad.show.labels import side_by_side, with_header
 
 FPS = 25
@@ -60,7 +60,7 @@ def write_film(path: Path, frames: Iterable[Image]) -> None:
     """
     imageio = check_film(path)
     suffix = path.suffix.lower()
-    options: dict[str, Any] = {"duration": 1000 / FPS, "loop": 0}
+    options: StrDict = {"duration": 1000 / FPS, "loop": 0}
     if suffix == ".mp4":
         options = {"fps": FPS, **MP4}
     # In another folder: after an interruption, the encoder may still write for a moment.
@@ -94,7 +94,7 @@ def film_frames(
     """
     times = frame_times(recordings, speed)
     # One direction for all panels, so that their flights can be compared.
-    forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
+    forward = broadside(landmarks(recordings))
     lens = Lens(width, height)
     panels = [_panel(recording, times, forward, lens) for recording in recordings]
     # Frame by frame, because a film does not fit into memory.
@@ -120,12 +120,11 @@ def following_cameras(
     eye = None
     for seconds in times:
         points = []
-        # The vehicles, and their targets, or at most AHEAD of the way there.
+        # The vehicles, and their targets, or at most AHEAD of the way there along each axis.
         for recording in recordings:
             vehicle, target = recording.vehicle_and_target(recording.at(seconds))
-            way = target - vehicle
-            seen = min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9))
-            points += [vehicle, vehicle + seen * way]
+            way = np.clip(target - vehicle, -AHEAD * scale, AHEAD * scale)
+            points += [vehicle, vehicle + way]
         camera = framing_camera(np.stack(points), MARGIN * scale, forward, lens)
         if eye is not None:
             # The camera follows with a lag, so that a jump of the target is no jump of the picture.
@@ -146,7 +145,7 @@ def _panel(
             # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
             flown = recording.state.position[: step + 1 : 2]
-            pixels = scene.picture(camera, [Trail(flown, recording.colour, 0.03 * scene.scale)])
+            pixels = scene.picture(camera, [Trail(flown, recording.colour)])
             lines = [_caption(recording, step)]
             yield with_header(pixels, recording.name, lines, recording.colour, font_size)
 
@@ -179,7 +178,6 @@ def show_in_window(
         scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
         start_drawing(client)
         for recordings in episodes:
-            p.removeAllUserDebugItems(physicsClientId=client)
             _play(scene, recordings, Lens(width, height, WINDOW_SLOPE), speed)
     except p.error:
         # PyBullet also raises when somebody shuts the window; that is how this ends.
@@ -191,29 +189,21 @@ def show_in_window(
 
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
-    forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
+    forward = broadside(landmarks(recordings))
     cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
-    trail_ends = [0] * len(recordings)  # the steps up to which trails are drawn
     # The number of the frame follows the clock, so that flights are shown in real time.
     begun = time.perf_counter()
     number = 0
     while number < len(times):
-        steps = [recording.at(times[number]) for recording in recordings]
-        flights = list(zip(recordings, steps, strict=True))
-        poses = [recording.pose(step) for recording, step in flights]
-        scene.place(poses, np.stack([flight.state.target[step] for flight, step in flights]))
-        # PyBullet keeps the lines, so each frame adds the latest piece only.
-        for row, (recording, step) in enumerate(flights):
-            if step > trail_ends[row]:
-                p.addUserDebugLine(
-                    *recording.state.position[[trail_ends[row], step]].tolist(),
-                    lineColorRGB=to_rgb(recording.colour),
-                    lineWidth=3.0,
-                    physicsClientId=scene.client,
-                )
-                trail_ends[row] = step
-        middle = np.mean([flight.state.position[step] for flight, step in flights], axis=0)
-        point_window(scene.client, cameras[number], middle)
+        poses = []
+        both = []
+        for recording in recordings:
+            step = recording.at(times[number])
+            poses.append(recording.pose(step))
+            both.append(recording.vehicle_and_target(step))
+        vehicles, targets = np.stack(both, axis=1)
+        scene.place(poses, targets)
+        point_window(scene.client, cameras[number], vehicles.mean(axis=0))
         # Skip the frames that would come too late.
         number = max(number + 1, int((time.perf_counter() - begun) * FPS))
         time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))

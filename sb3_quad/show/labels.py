@@ -1,9 +1,7 @@
 """Words in pictures, in the font that comes with matplotlib."""
 
-import math
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -20,10 +18,9 @@ GAP = 4  # between pictures side by side, pixels
 
 
 @cache
-def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+def font(size: int, name: str = "DejaVuSans") -> ImageFont.FreeTypeFont:
     """DejaVu Sans, ``size`` in pixels."""
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", name)), size)
+    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/{name}.ttf", size)
 
 
 def tag_size(text: str, size: int) -> tuple[float, float]:
@@ -58,7 +55,7 @@ def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, 
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, 0, bar, band - 1), fill=colour)
     column = bar + 0.7 * size
-    draw.text((column, 0.35 * size), heading, font=font(size, bold=True), fill=INK)
+    draw.text((column, 0.35 * size), heading, font=font(size, "DejaVuSans-Bold"), fill=INK)
     for number, line in enumerate(lines, 1):
         row = (0.35 + number * STEP) * size
         draw.text((column, row), line, font=font(round(SMALLER * size)), fill=INK)
@@ -71,11 +68,10 @@ def side_by_side(pictures: Sequence[Image], columns: int) -> Image:
     """
     # Each picture stands in the top left corner of its field; the gap is on its other sides.
     columns = min(columns, len(pictures))
-    rows = math.ceil(len(pictures) / columns)
-    height, width, _ = np.add(pictures[0].shape, (GAP, GAP, 0))
-    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
-    for number, picture in enumerate(pictures):
-        top = number // columns * height
-        left = number % columns * width
-        sheet[top : top + height - GAP, left : left + width - GAP] = picture
-    return sheet[: sheet.shape[0] // 2 * 2, : sheet.shape[1] // 2 * 2]
+    padding = ((0, -len(pictures) % columns), (0, GAP), (0, GAP), (0, 0))
+    fields = np.pad(np.stack(pictures), padding, constant_values=255)
+    # Fields (rows, columns, height, width, colour) become one sheet, row by row.
+    _, height, width, _ = fields.shape
+    sheet = fields.reshape(-1, columns, height, width, 3).swapaxes(1, 2)
+    sheet = sheet.reshape(-1, columns * width, 3)
+    return sheet[: len(sheet) // 2 * 2, : columns * width // 2 * 2]

@@ -4,6 +4,7 @@ Fig. A.1).
 
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +14,9 @@ from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_came
 from sb3_quad.envs.rendering.models import span
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.show.episodes import Recording
+from sb3_quad.show.episodes import Recording, landmarks
 from sb3_quad.show.labels import side_by_side, tag_size, with_header, with_tags
+from sb3_quad.simulation.state import QuadcopterState
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays within that of its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
@@ -46,27 +48,28 @@ def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
     :return: uint8 (height, about panels * width, 3).
     """
     # One view for all panels, so that their poses can be compared.
-    ends = [last_step(recording) for recording in recordings]
-    view = view_of(recordings, ends, Lens(width, height))
-    panels = []
-    for recording, end in zip(recordings, ends, strict=True):
-        panels.append(_panel(recording, pose_steps(recording, end, view), end, view))
-    return side_by_side(panels, columns=len(panels))
+    settled = [until_settled(recording) for recording in recordings]
+    view = view_of(settled, Lens(width, height))
+    return side_by_side([_panel(recording, view) for recording in settled], len(settled))
 
 
-def last_step(recording: Recording) -> int:
-    """The step after which the vehicle stays at its target, or the last one."""
+def until_settled(recording: Recording) -> Recording:
+    """Return a flight without what follows once the vehicle stays at its target."""
     away = np.flatnonzero(recording.state.distance > SETTLED)
-    return min(int(away.max(initial=-1)) + 1, len(recording.times) - 1)
+    n = int(away.max(initial=-1)) + 2
+    if recording.lost:
+        return recording
+    return replace(
+        recording,
+        times=recording.times[:n],
+        state=QuadcopterState(recording.state.array[:, :n]),
+        wrench=recording.wrench[:n],
+    )
 
 
-def view_of(recordings: Sequence[Recording], ends: Sequence[int], lens: Lens) -> View:
-    """The view that has all flights up to the steps ``ends`` in its picture."""
-    # Everything that must be in the picture: flown paths and targets.
-    paths = []
-    for recording, end in zip(recordings, ends, strict=True):
-        paths += [recording.state.position[: end + 1], recording.targets]
-    points = np.concatenate(paths)
+def view_of(recordings: Sequence[Recording], lens: Lens) -> View:
+    """Return the view that has all flights in its picture."""
+    points = landmarks(recordings)
     forward = broadside(points)
     breadth = 2.0 * span(recordings[0].vehicle)
     size = 1.0
@@ -78,24 +81,24 @@ def view_of(recordings: Sequence[Recording], ends: Sequence[int], lens: Lens) ->
     return View(camera, size, size * breadth)
 
 
-def pose_steps(recording: Recording, end: int, view: View) -> list[int]:
+def pose_steps(recording: Recording, view: View) -> list[int]:
     """The steps of the poses: each that hides none before it, the disturbances, and the crash."""
-    places, breadth = view.project(recording.state.position[: end + 1])
+    places, breadth = view.project(recording.state.position)
     # The start, the disturbances and the crash are shown in any case.
-    shown = [0, *(step for step in recording.disturbances if step <= end)]
+    shown = [0, *recording.disturbances]
     if recording.lost:
-        shown.append(end)
+        shown.append(len(places) - 1)
     # Of the others, those are shown that are clear of all poses before them.
-    for step in range(1, end + 1):
-        apart = np.linalg.norm(places[shown] - places[step], axis=1).min()
+    for step, place in enumerate(places):
+        apart = np.linalg.norm(places[shown] - place, axis=1).min()
         if apart > APART * breadth[step]:
             shown.append(step)
     return sorted(set(shown))
 
 
-def _panel(recording: Recording, steps: Sequence[int], end: int, view: View) -> Image:
-    path = recording.state.position[: end + 1]
-    trail = Trail(path, recording.colour, 0.05 * view.breadth)
+def _panel(recording: Recording, view: View) -> Image:
+    steps = pose_steps(recording, view)
+    trail = Trail(recording.state.position, recording.colour)
     targets = recording.targets
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
@@ -104,34 +107,35 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: View) -> 
     size = max(12, round(view.camera.lens.height / 34))
     tag = round(0.92 * size)
     pixels = with_tags(pixels, time_tags(recording, steps, view, tag), tag)
-    lines = _explanation(recording, steps, end, view)
+    lines = _explanation(recording, steps, view)
     return with_header(pixels, recording.name, lines, recording.colour, size)
 
 
-def _explanation(recording: Recording, steps: Sequence[int], end: int, view: View) -> list[str]:
+def _explanation(recording: Recording, steps: list[int], view: View) -> list[str]:
     """The lines of text above a panel."""
     # The end of the flight comes first.
-    seconds = f"{recording.times[end]:.2f} s"
+    seconds = f"{recording.times[-1]:.2f} s"
+    distance = recording.state.distance[-1]
     if recording.lost:
-        lines = [f"{recording.lost} after {recording.times[-1]:.2f} s"]
-    elif end < len(recording.times) - 1:
+        lines = [f"{recording.lost} after {seconds}"]
+    elif distance <= SETTLED:
         lines = [f"within {SETTLED:g} m of its target from {seconds} on"]
     else:
-        lines = [f"{recording.state.distance[end]:.2f} m from its target after {seconds}"]
+        lines = [f"{distance:.2f} m from its target after {seconds}"]
     # Then whatever a reader could misunderstand: an enlarged vehicle, hoops and arrows.
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
     signs = "green hoops: target"
-    if recording.wrench[list(steps)].any():
+    if recording.wrench[steps].any():
         signs += "; arrows: force (red), torque (violet)"
     return [*lines, signs]
 
 
 def time_tags(
-    recording: Recording, steps: Sequence[int], view: View, size: int
+    recording: Recording, steps: list[int], view: View, size: int
 ) -> list[tuple[str, tuple[float, float]]]:
     """The time of each pose and the place of its text: above the pose, inside the picture."""
-    places, breadths = view.project(recording.state.position[list(steps)])
+    places, breadths = view.project(recording.state.position[steps])
     tags = []
     for step, place, breadth in zip(steps, places, breadths, strict=True):
         text = f"{recording.times[step]:.2f} s"

@@ -29,7 +29,7 @@ from sb3_quad.controllers.pretrained import pretrained
 
 COUNT = int(os.environ.get("SB3_QUAD_PICKLES", "300"))
 KNOWN = [
-    *(own._CLASSES | own._FUNCTIONS | own._ARGUMENTS),
+    *(name.rsplit(".", 1) for name in own._CLASSES | own._FUNCTIONS | own._ARGUMENTS),
     ("sb3_contrib.common.recurrent.policies", "RecurrentActorCriticPolicy"),
 ]
 FOREIGN = [
@@ -184,7 +184,8 @@ class Writer:
         return self.name(FOREIGN if self.rng.random() < 0.05 else KNOWN)
 
     def name(self, names: Iterable[tuple[str, str]]) -> bytes:
-        module, name = self.rng.choice([*names])
+        chosen = self.rng.choice([*names])
+        module, name = chosen.rsplit(".", 1) if isinstance(chosen, str) else chosen
         return text(module) + text(name) + b"\x93"
 
     def raw(self, depth: int = 0) -> bytes:

@@ -11,9 +11,7 @@ import re
 import zlib
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
-from typing import Any
 
-import jinja2
 import numpy as np
 from torch.nn.utils import parameters_to_vector
 
@@ -21,11 +19,13 @@ from sb3_quad.base import __version__
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.colours import COLOURS, colours_of
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import StrDict
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.export.check import make_reference
 from sb3_quad.export.network import Network, build_network
+from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
 from sb3_quad.simulation.state import STATE, STATE_SIZE, X
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
@@ -39,17 +39,8 @@ DEFAULT_AGENTS = (
 )
 LIMIT = 500_000  # bytes of a page, above which the largest networks are rounded to half precision
 # The modules of the page in the order of their imports: those that need no browser, and the others.
-MODEL = (
-    "tables",
-    "vehicle",
-    "dynamics",
-    "observation",
-    "network",
-    "experts",
-    "flight",
-    "weights",
-)
-VIEW = (
+MODEL = ["tables", "vehicle", "dynamics", "observation", "network", "experts", "flight", "weights"]
+VIEW = [
     "fleet",
     "camera",
     "airframe",
@@ -60,7 +51,7 @@ VIEW = (
     "board",
     "controls",
     "app",
-)
+]
 EXPERTS = ("pid", "geometric")
 FEATURES = {"position", "rotation", "velocity", "body_rates"}  # that observation.js computes
 TABLES = {
@@ -101,30 +92,29 @@ def make_page(
     colours = colours_of([spec.label for spec in specs])
     vehicles = {name: load_vehicle(name) for name in VEHICLES.names()}
     first = vehicle and _add(vehicles, vehicle)
-    agents = []
+    agents: StrDict = {}
     networks: dict[str, Network] = {}
     for spec in specs:
         described, network = describe(spec)
-        agents.append({"label": spec.label, "colour": colours[spec.label], **described})
+        agents[spec.label] = {"label": spec.label, "colour": colours[spec.label], **described}
         if network is not None:
             networks[spec.label] = network
         if spec.own and not spec.own.vehicles:
             own = _add(vehicles, first_vehicle(spec.own.vehicle))
             first = first or own
     first = first or vehicles["itm"]
-    data = {
-        "vehicles": [known.model_dump(mode="json") for known in vehicles.values()],
-        "vehicle": first.name,
-        "colours": COLOURS,
-        "agents": agents,
-    }
     # Round one network after the other, the largest first, until the page is small enough.
     by_size = sorted(networks, key=lambda label: -numbers(networks[label]).size)
     for count in range(len(by_size) + 1):
         rounded = by_size[:count]
-        for agent in agents:
-            if agent["label"] in networks:
-                agent.update(pack(networks[agent["label"]], agent["label"] in rounded))
+        for label, network in networks.items():
+            agents[label].update(pack(network, label in rounded))
+        data = {
+            "vehicles": [known.model_dump(mode="json") for known in vehicles.values()],
+            "vehicle": first.name,
+            "colours": COLOURS,
+            "agents": list(agents.values()),
+        }
         page = _render(data, rounded)
         if len(page.encode()) <= LIMIT:
             break
@@ -143,7 +133,7 @@ def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
     return vehicles.setdefault(vehicle.name, vehicle)
 
 
-def describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
+def describe(spec: ControllerSpec) -> tuple[StrDict, Network | None]:
     """Return a controller as the page knows it, but for its weights; and its network.
 
     :raises ConfigError: neither an expert of the page nor an agent in a zip that exports, or an
@@ -179,7 +169,7 @@ def numbers(network: Network) -> Float32Array:
     return parameters_to_vector(network.parameters()).numpy()
 
 
-def pack(network: Network, rounded: bool) -> dict[str, Any]:
+def pack(network: Network, rounded: bool) -> StrDict:
     """Return a network's numbers as text: planes, each of one byte of every number, deflated, in
     base64.
 
@@ -208,16 +198,14 @@ def join_modules(text: str) -> str:
     return PARTS.sub(lambda match: match["kept"] or "", text)
 
 
-def _render(data: dict[str, Any], rounded: Sequence[str]) -> str:
-    notes = (
-        f"sb3_quad {__version__}. "
-        "The page flies what sb3_quad flies in Python, in double precision."
-    )
-    if rounded:
-        notes += f" Weights of {' and '.join(rounded)} are rounded to half precision."
+def _render(data: StrDict, rounded: Sequence[str]) -> str:
     # Without "<", no text in the data can end the script element.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(__package__, ""), undefined=jinja2.StrictUndefined
+    return render(
+        "page.html.j2",
+        "sb3_quad.show.demo",
+        data=text,
+        script=script(),
+        rounded=rounded,
+        version=__version__,
     )
-    return environment.get_template("page.html.j2").render(data=text, script=script(), notes=notes)
