@@ -19,8 +19,30 @@ from pydantic import BaseModel
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict
-from sb3_quad.training.options import METAVARS, SHORT_FLAGS
 
+SHORT_FLAGS = {
+    "n_timesteps": "-n",
+    "trained_agent": "-i",
+    "log_folder": "-f",
+    "tensorboard_log": "-tb",
+    "uuid": "-uuid",
+    "progress": "-P",
+    "wandb_tags": "-tags",
+}
+"""rl-zoo's short names of some flags."""
+METAVARS = {
+    "vec_env": "KIND",
+    "expert": "SPEC",
+    "trained_agent": "ZIP",
+    "device": "DEVICE",
+    "snapshot_every": "SECONDS",
+    "log_folder": "DIR",
+    "tensorboard_log": "DIR",
+    "wandb_project_name": "NAME",
+    "wandb_entity": "NAME",
+    "wandb_group": "NAME",
+}
+"""The values of flags that take no number, as ``--help`` shows them."""
 # Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
 SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
 

@@ -43,6 +43,7 @@ _SET_BY_JOB = (
     "policy",
     "env",
     "expert",
+    "initial_policy",
     "policy_kwargs",
     "verbose",
     "tensorboard_log",

@@ -168,7 +168,9 @@ class TrainingConfig(Frozen):
             return {}
         if self.is_off_policy:
             return {"train_freq": n_steps}
-        batch_size = min(self.keyword("batch_size"), n_steps * self.n_envs)
+        rollout = n_steps * self.n_envs
+        # PPOBC chooses a batch size of its own unless it is given one.
+        batch_size = min(self.keyword("batch_size") or rollout, rollout)
         return {"n_steps": n_steps, "batch_size": batch_size}
 
     @model_validator(mode="after")

@@ -13,30 +13,6 @@ from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen
 
-SHORT_FLAGS = {
-    "n_timesteps": "-n",
-    "trained_agent": "-i",
-    "log_folder": "-f",
-    "tensorboard_log": "-tb",
-    "uuid": "-uuid",
-    "progress": "-P",
-    "wandb_tags": "-tags",
-}
-"""rl-zoo's short names of some flags."""
-METAVARS = {
-    "vec_env": "KIND",
-    "expert": "SPEC",
-    "trained_agent": "ZIP",
-    "device": "DEVICE",
-    "snapshot_every": "SECONDS",
-    "log_folder": "DIR",
-    "tensorboard_log": "DIR",
-    "wandb_project_name": "NAME",
-    "wandb_entity": "NAME",
-    "wandb_group": "NAME",
-}
-"""The values of flags that take no number, as ``--help`` shows them."""
-
 
 def _check_device(device: str) -> str:
     """Refuse CUDA on a machine without it; SB3 would take the CPU without a warning."""
