@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import one_line, read_arrays
-from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.files import read_arrays
+from sb3_quad.base.types import StrPath
 
 # The arrays of a file, (k, episodes), by what they are called here. Environments of others may not
 # report the last two.
 EPISODES = {"reward": "results", "success": "successes", "survival": "survivals"}
+OPTIONAL = ("successes", "survivals")
 
 
 class Curve(NamedTuple):
@@ -51,21 +51,21 @@ def read_curve(run: StrPath, task: str | None = None) -> Curve:
             reason = f"{task} is not one of this run's eval_tasks"
         raise ConfigError(f"{path}: no such file; {reason}")
     arrays = read_arrays(path)
-    # A file of another program may hold anything, which pandas refuses to put into one table.
-    try:
-        columns: StrDict = {"timesteps": arrays["timesteps"], "seconds": arrays["seconds"]}
-        for name, key in EPISODES.items():
-            if key in arrays or name == "reward":
-                columns[name] = arrays[key].mean(axis=1)
-        for key in arrays:
-            if key.startswith("train/"):
-                columns[key.removeprefix("train/")] = arrays[key]
-        table = pd.DataFrame(columns).astype(np.float64)
-    except KeyError as error:
-        raise ConfigError(f"{path}: cannot be read ({error}: no such array)") from None
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
-    if table.empty:
-        raise ConfigError(f"{path}: cannot be read (it holds no evaluations)")
-    measures = dict(zip(table, table.to_numpy().T, strict=True))
-    return Curve(measures.pop("timesteps"), measures.pop("seconds"), measures)
+    for name in ("timesteps", "seconds", *EPISODES.values()):
+        if name not in arrays:
+            if name in OPTIONAL:
+                continue
+            raise ConfigError(f"{path}: cannot be read ({name}: no such array)")
+        # A file of another program may hold anything. There is a row of episodes, or one number,
+        # for each evaluation.
+        array = arrays[name]
+        dimensions = 1 + (name in EPISODES.values())
+        fits = array.ndim == dimensions and len(array) == arrays["timesteps"].size > 0
+        if not fits or array.dtype.kind not in "fiub":
+            raise ConfigError(f"{path}: cannot be read ({name} does not fit to the other arrays)")
+    measures = {name: arrays[key].mean(axis=1) for name, key in EPISODES.items() if key in arrays}
+    for key in arrays:
+        if key.startswith("train/"):
+            measures[key.removeprefix("train/")] = arrays[key]
+    timesteps = arrays["timesteps"].astype(np.float64)
+    return Curve(timesteps, arrays["seconds"].astype(np.float64), measures)

@@ -5,6 +5,7 @@ import json
 import os
 import random
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,17 +60,21 @@ class SnapshotFile(BaseCallback):
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
     :param report: called with one line if a snapshot cannot be written; the training continues.
+    :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
     :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from
         before that update.
     """
 
     snapshot: Snapshot | None = None
 
-    def __init__(self, run: RunFolder, every: float, report: Report) -> None:
+    def __init__(
+        self, run: RunFolder, every: float, report: Report, hurry: Callable[[], bool]
+    ) -> None:
         super().__init__()
         self._run = run
         self._every = every
         self._report = report
+        self._hurry = hurry
         self._state: Arrays = {}
         self._next_taken = -np.inf  # s
         self._next_write = -np.inf  # s
@@ -103,7 +108,8 @@ class SnapshotFile(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         start = time.monotonic()
-        if isinstance(self.model, OffPolicyAlgorithm) and start < self._next_taken:
+        is_off_policy = isinstance(self.model, OffPolicyAlgorithm)
+        if is_off_policy and start < self._next_taken and not self._hurry():
             return
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():

@@ -259,7 +259,12 @@ class _Training:
     should_continue: ShouldContinue = lambda success, reward: True
 
     def __post_init__(self) -> None:
-        self.snapshots = SnapshotFile(self.run, self.job.snapshot_every, self.report)
+        self.snapshots = SnapshotFile(
+            self.run,
+            self.job.snapshot_every,
+            self.report,
+            lambda: self.signals.received is not None,
+        )
         self.best: BestModel | None = None
         others = dict(self.eval_envs)
         own = others.pop(OWN_TASK, None)
