@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_quad.base.yaml_files import YamlFolder, parse_yaml
+from sb3_quad.base.yaml_files import YamlFolder, parse_keys
 from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.controllers.pretrained import pretrained
@@ -61,14 +61,7 @@ SMALL = {
     "n_epochs": 2,
     "gradient_steps": 4,
 }
-NOT_FOR_ONE_ROLLOUT = {
-    "require",
-    "correct_offset",
-    "position_scale",
-    "overshoot_cost",
-    "correction_env_kwargs",
-    "correction_rounds",
-}
+NOT_FOR_ONE_ROLLOUT = ("require", "correct_offset")
 FLOWN = 100  # control steps, at most
 # Flags that are removed: SHORTER gives them, or they need a screen.
 WITHOUT = ("-n", "--n-trials", "--max-total-trials", "--sizes", "-P")
@@ -84,7 +77,7 @@ def documented() -> list[str]:
             if language == "bash":
                 found += block.replace("\\\n", " ").splitlines()
     for command in COMMANDS.values():
-        found += (command.__doc__ or "").splitlines()
+        found += (command.__doc__ or "").replace("\\\n", " ").splitlines()
     called = [
         re.match(r"(?:\w+=\S+ +)*\s*(?:sb3-quad|python -m sb3_quad\.cli) +(\w.*)", line)
         for line in found
@@ -168,7 +161,7 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
         "read",
         lambda self, source: (shorter(read(self, source)[0]), read(self, source)[1]),
     )
-    monkeypatch.setattr(load, "parse_yaml", lambda text, where: shorter(parse_yaml(text, where)))
+    monkeypatch.setattr(load, "parse_keys", lambda text, where: shorter(parse_keys(text, where)))
     # Worker processes would not see the patches below.
     monkeypatch.setattr(evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1))
     monkeypatch.setattr(

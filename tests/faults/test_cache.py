@@ -51,7 +51,7 @@ def test_a_read_only_installation_without_a_home_says_that_it_compiles_at_every_
     assert (
         result == "(1.0, 0.0, 0.0) 0\n"
         and len(said) == 1
-        and "cannot be kept" in said[0]
+        and "cannot be cached" in said[0]
         and "NUMBA_CACHE_DIR" in said[0]
     )
     for hits in (0, 1):
