@@ -35,6 +35,8 @@ ELSEWHERE = {
     "--track": "tests/test_tracking.py",
     "my_experts:": "tests/test_docs.py",
     "my_package.control:make": "a module of the reader",
+    "my_package.rewards:": "tests/test_evaluate.py",
+    "my_rewards:": "tests/test_evaluate.py",
     "$RUNS": "agents of a sweep of an hour and a half",
     "…": "an abbreviated line",
 }

@@ -97,4 +97,7 @@ def _mean_and_range(runs: Sequence[Curve], axis: str, measure: str) -> pd.DataFr
     lines = [pd.Series(curve.values(measure), getattr(curve, axis)).dropna() for curve in runs]
     table = pd.concat(lines, axis="columns").sort_index()
     table = table.interpolate("index", limit_area="inside").dropna()
+    # pandas cannot aggregate an empty table: a run has no values, or no two runs overlap.
+    if table.empty:
+        return table
     return table.agg(["mean", "min", "max"], axis="columns")
