@@ -18,13 +18,16 @@ from sb3_quad.envs.rendering.window import (
     point_window,
     start_drawing,
 )
-from sb3_quad.simulation.kernel import write_body
+from sb3_quad.simulation.physics import rotation_rows, to_body
 from sb3_quad.simulation.state import (
+    BODY_RATES,
     FORCE_WORLD,
     POSITION,
+    QUATERNION,
     ROTOR_SPEEDS,
     TARGET,
     TORQUE_WORLD,
+    VELOCITY,
     P,
     QuadcopterState,
 )
@@ -148,9 +151,15 @@ class BulletBody:
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
-        pose = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
-        velocity = p.getBaseVelocity(self.body, physicsClientId=self.client)
-        write_body(state, *pose, *velocity)
+        position, (x, y, z, w) = p.getBasePositionAndOrientation(
+            self.body, physicsClientId=self.client
+        )
+        velocity, rates = p.getBaseVelocity(self.body, physicsClientId=self.client)
+        state[POSITION, 0] = position
+        state[QUATERNION, 0] = w, x, y, z
+        state[VELOCITY, 0] = velocity
+        # PyBullet's body rates are in the world frame.
+        state[BODY_RATES, 0] = to_body.py_func(rotation_rows.py_func(w, x, y, z), *rates)
 
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""

@@ -54,7 +54,7 @@ def observations(rows, noise):
 
 def scores(rows):
     """The outcome of a control step that has left the rows as they are."""
-    rows.score()
+    rows.score(np.zeros((rows.n, 4)))
     return rows.outcome
 
 

@@ -17,7 +17,7 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 MAX_SIZE = 2048  # of a picture, pixels
 
 
-def per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
+def per_row(name: str, value: Any, rows: int, *size: int) -> FloatArray:
     """Return ``value`` of shape (size,) or (rows, size) as (size, rows); without a size, () or
     (rows,) as (1, rows).
     """
@@ -27,12 +27,12 @@ def per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
         raise ConfigError(f"{name} {value!r}: must be numbers") from None
     if not np.isfinite(array).all():
         raise ConfigError(f"{name} {array.tolist()}: every number must be finite")
-    inner = () if size is None else (size,)
-    if array.shape not in (inner, (rows, *inner)):
+    shape = (rows, *size)
+    if array.shape not in (size, shape):
         raise ConfigError(
-            f"{name} of shape {array.shape}: must be {inner}, or {(rows, *inner)} for {rows} rows"
+            f"{name} of shape {array.shape}: must be {size}, or {shape} for {rows} rows"
         )
-    return np.ascontiguousarray(np.broadcast_to(array, (rows, *inner)).T).reshape(-1, rows)
+    return np.ascontiguousarray(np.broadcast_to(array, shape).T).reshape(-1, rows)
 
 
 def whole_number(name: str, value: Any, least: int, most: int, unit: str = "") -> int:
@@ -58,13 +58,14 @@ def load_vehicles(
     """Return vehicles with the same time steps, in the layout of another vehicle if one is
     named.
     """
-    vehicles = [load_vehicle(source) for source in sources]
-    if layout is not None:
-        wanted = load_vehicle(layout)
-        vehicles = [vehicle.in_layout_of(wanted) for vehicle in vehicles]
-    steps = (vehicles[0].physics_step, vehicles[0].substeps)
-    for row, vehicle in enumerate(vehicles):
-        if (vehicle.physics_step, vehicle.substeps) != steps:
+    vehicles: list[Vehicle] = []
+    for row, source in enumerate(sources):
+        vehicle = load_vehicle(source)
+        if layout is not None:
+            vehicle = vehicle.in_layout_of(load_vehicle(layout))
+        vehicles.append(vehicle)
+        first = vehicles[0]
+        if (vehicle.physics_step, vehicle.substeps) != (first.physics_step, first.substeps):
             raise ConfigError(
                 f"vehicle of row {row}: physics_step and control_step must be those of row 0"
             )

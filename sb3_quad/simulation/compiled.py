@@ -57,6 +57,12 @@ def _source_stamp() -> str:
     return digest.hexdigest()
 
 
+fast = compiled(fastmath=True)
+"""Compile a function whose sums may be reordered, which vectorises its loops over lanes."""
+inlined = compiled(inline="always")
+"""Compile a function that numba inlines, with the options of its caller."""
+
+
 class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
         print_once("compiling the simulation, once; it is kept for later runs (about 15 s)")

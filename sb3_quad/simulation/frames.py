@@ -6,19 +6,21 @@ led there. An observation is the frames of several ages, one after the other. Th
 keep the frames of a row and build observations from them.
 """
 
-from typing import Any
+from typing import Annotated
 
 from numba import float32
 from pydantic import Field, PositiveFloat, field_validator
 
 from sb3_quad.base.validate import Frozen
-from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.compiled import compiled, inlined
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 MAX_AGE = 1000  # control steps
+# Neither true nor 1.0 is an age.
+Age = Annotated[int, Field(strict=True)]
 
 
-class PositionIntegral(Frozen):
+class PositionIntegral(Frozen, use_attribute_docstrings=True):
     """An integral s of the position error e, the observed position relative to the target.
 
     s += ``gain`` e dt in each control step in which |e| is less than ``distance`` and the observed
@@ -28,10 +30,14 @@ class PositionIntegral(Frozen):
     was trained without the integral can fly with it.
     """
 
-    gain: PositiveFloat = Field(default=0.5, le=100, description="1/s")
-    distance: PositiveFloat = Field(default=1.0, le=1e3, description="m")
-    speed: PositiveFloat = Field(default=1.5, le=1e3, description="m/s")
-    limit: PositiveFloat = Field(default=3.0, le=1e3, description="m")
+    gain: PositiveFloat = Field(default=0.5, le=100)
+    """1/s"""
+    distance: PositiveFloat = Field(default=1.0, le=1e3)
+    """m"""
+    speed: PositiveFloat = Field(default=1.5, le=1e3)
+    """m/s"""
+    limit: PositiveFloat = Field(default=3.0, le=1e3)
+    """m"""
 
     def numbers(self, control_step: float) -> list[float]:
         """Return gain dt, distance², speed² and limit, which :func:`integrate_position` reads.
@@ -41,36 +47,23 @@ class PositionIntegral(Frozen):
         return [self.gain * control_step, self.distance**2, self.speed**2, self.limit]
 
 
-class ObservationSettings(Frozen):
+class ObservationSettings(Frozen, use_attribute_docstrings=True):
     """The content of an observation; by default the 18 features alone."""
 
-    last_action: bool = Field(
-        default=False,
-        description="whether a frame ends with the action that led to it, clipped to [-1, 1]",
-    )
-    history: tuple[int, ...] | None = Field(
-        default=None,
-        description="ages of the frames, control steps, such as [0, 1, 2, 4]; frames from before"
-        " the episode are zeros",
-    )
-    position_integral: PositionIntegral | None = Field(
-        default=None, description="fields of PositionIntegral; {} for its defaults"
-    )
-
-    @field_validator("history", mode="before")
-    @classmethod
-    def _ages(cls, value: Any) -> Any:
-        if isinstance(value, (list, tuple)) and any(isinstance(age, bool) for age in value):
-            raise ValueError(f"{list(value)}: must be ages, whole control steps")
-        return value
+    last_action: bool = False
+    """whether a frame ends with the action that led to it, clipped to [-1, 1]"""
+    history: tuple[Age, ...] | None = None
+    """ages of the frames, control steps, such as [0, 1, 2, 4]; zeros before the episode"""
+    position_integral: PositionIntegral | None = None
+    """fields of PositionIntegral; {} for its defaults"""
 
     @field_validator("history")
     @classmethod
     def _rises(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
         if value is None:
             return None
-        rises = list(value) == sorted(set(value))
-        if not value or not rises or value[0] != 0 or value[-1] > MAX_AGE:
+        # Sorted with the present frame, they are as they were only if they rise from it.
+        if list(value) != sorted({0, *value}) or value[-1] > MAX_AGE:
             raise ValueError(
                 f"{list(value)}: must rise from 0, the present frame, to at most {MAX_AGE}"
             )
@@ -111,10 +104,8 @@ def store_action(i, step, action, frames):
 @compiled
 def clear_frames(i, frames, integral):
     """Clear the last action and the integral as row i begins an episode, in place."""
-    for k in range(frames.shape[2] - OBSERVATION_SIZE):
-        frames[i, 0, OBSERVATION_SIZE + k] = 0.0
-    for axis in range(integral.shape[0]):
-        integral[axis, i] = 0.0
+    frames[i, 0, OBSERVATION_SIZE:] = 0.0
+    integral[:, i] = 0.0
 
 
 @compiled
@@ -124,20 +115,21 @@ def integrate_position(i, feature, lane, mean, inverse_std, numbers, integral):
 
     :param numbers: float64 (4,), :meth:`PositionIntegral.numbers`.
     """
-    gain_dt, distance2, speed2, limit = numbers[0], numbers[1], numbers[2], numbers[3]
+    gain_dt = numbers[0]
+    limit = numbers[3]
     e2 = v2 = 0.0
     for axis in range(3):
         e = _unscaled(F.position + axis, feature, lane, mean, inverse_std)
         v = _unscaled(F.velocity + axis, feature, lane, mean, inverse_std)
         e2 += e * e
         v2 += v * v
-    if e2 < distance2 and v2 < speed2:
+    if e2 < numbers[1] and v2 < numbers[2]:
         for axis in range(3):
             e = _unscaled(F.position + axis, feature, lane, mean, inverse_std)
             integral[axis, i] = min(max(integral[axis, i] + gain_dt * e, -limit), limit)
 
 
-@compiled(inline="always")
+@inlined
 def _unscaled(k, feature, lane, mean, inverse_std):
     return feature[k, lane] / inverse_std[k, lane] + mean[k, lane]
 
@@ -154,7 +146,7 @@ def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, 
         slot s % depth.
     :param out: float32 (n, size).
     """
-    depth, size = frames.shape[1], frames.shape[2]
+    _, depth, size = frames.shape
     slot = step % depth
     for k in range(OBSERVATION_SIZE):
         frames[i, slot, k] = feature[k, lane]
@@ -163,11 +155,9 @@ def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, 
         frames[i, slot, k] += float32(integral[axis, i]) * inverse_std[k, lane]
     at = 0
     for age in ages:
+        # Frames from before the episode are zeros.
         if age <= step:
-            then = (step - age) % depth
-            for k in range(size):
-                out[i, at + k] = frames[i, then, k]
+            out[i, at : at + size] = frames[i, (step - age) % depth]
         else:
-            for k in range(size):
-                out[i, at + k] = 0.0
+            out[i, at : at + size] = 0.0
         at += size

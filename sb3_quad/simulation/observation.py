@@ -11,8 +11,8 @@ import numpy as np
 from numba import float32
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.simulation.compiled import LANES, compiled
-from sb3_quad.simulation.physics import rotation, to_body, vector
+from sb3_quad.simulation.compiled import LANES, fast, inlined
+from sb3_quad.simulation.physics import rotation, store, to_body, vector
 from sb3_quad.simulation.random import random_words, standard_normals
 from sb3_quad.simulation.state import first_rows, row_slices
 from sb3_quad.vehicles.layout import Turn
@@ -80,7 +80,7 @@ def turn_features(turn: Turn) -> FloatArray:
     return matrix
 
 
-@compiled(fastmath=True)
+@fast
 def features(b):
     """Write the features of a loaded block, in the units of the table and without noise.
 
@@ -95,18 +95,15 @@ def features(b):
             out[F.position + k, lane] = float32(b.position[k, lane] - b.target[k, lane])
             out[F.body_rates + k, lane] = float32(b.body_rates[k, lane])
             # From world to body: the transpose of r
-            out[F.rotation + k, lane] = float32(r[k][0])
-            out[F.rotation + 3 + k, lane] = float32(r[k][1])
-            out[F.rotation + 6 + k, lane] = float32(r[k][2])
-        out[F.velocity, lane] = float32(vx)
-        out[F.velocity + 1, lane] = float32(vy)
-        out[F.velocity + 2, lane] = float32(vz)
+            for row in range(3):
+                out[F.rotation + 3 * row + k, lane] = float32(r[k][row])
+        store(out[F.velocity :], lane, float32(vx), float32(vy), float32(vz))
 
 
-@compiled(fastmath=True)
+@fast
 def _disturb_and_scale(b):
     """Add noise to ``b.feature`` and scale it by Eq. 3.16, in place."""
-    feature, noise, mean, inverse_std = b.feature, b.noise, b.mean, b.inverse_std
+    feature = b.feature
     added = float32(0.0)
     for lane in range(LANES):
         added = max(added, b.additive[lane])
@@ -114,16 +111,16 @@ def _disturb_and_scale(b):
         for lane in range(LANES):
             if added == float32(0.0):
                 # Relative noise alone, the usual case, needs no square root.
-                noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
+                noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * b.noise[k, lane])
             else:
                 relative = b.noise_level[lane] * feature[k, lane]
-                fixed = b.additive[lane] / inverse_std[k, lane]
+                fixed = b.additive[lane] / b.inverse_std[k, lane]
                 spread = math.sqrt(relative * relative + fixed * fixed)
-                noisy = feature[k, lane] + spread * noise[k, lane]
-            feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
+                noisy = feature[k, lane] + spread * b.noise[k, lane]
+            feature[k, lane] = (noisy - b.mean[k, lane]) * b.inverse_std[k, lane]
 
 
-@compiled(inline="always")
+@inlined
 def observe(b):
     """Write the scaled features of a loaded block with their noise to ``b.feature``.
 

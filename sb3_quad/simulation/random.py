@@ -21,13 +21,14 @@ import numpy.typing as npt
 from gymnasium.utils import seeding
 from numba import float32, int32, uint32, uint64
 
-from sb3_quad.simulation.compiled import LANES, compiled
+from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 # Purposes: the last word of the counter
 OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND = range(7)
 ROUNDS = 10
-_MASK, _SHIFT = uint64(0xFFFFFFFF), uint64(32)
+_MASK = uint64(0xFFFFFFFF)
+_SHIFT = uint64(32)
 # The bits of sqrt(1/2) in float32
 _SQRT_HALF_BITS = 0x3F3504F3
 _LN2 = float32(math.log(2.0))
@@ -42,12 +43,12 @@ def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     from the operating system's entropy.
     """
     streams = np.zeros((4, len(seeds)), dtype=np.uint32)
-    keys = np.empty(len(seeds), dtype=np.uint64)
     for row, seed in enumerate(seeds):
-        generator, _ = seeding.np_random(None if seed is None else int(seed))
-        keys[row] = generator.integers(2**64, dtype=np.uint64)
-    streams[KEY_LO] = keys & np.uint64(0xFFFFFFFF)
-    streams[KEY_HI] = keys >> np.uint64(32)
+        # Gymnasium takes Python's integers only.
+        generator, _ = seeding.np_random(seed if seed is None else int(seed))
+        key = int(generator.integers(2**64, dtype=np.uint64))
+        streams[KEY_LO, row] = key % 2**32
+        streams[KEY_HI, row] = key >> 32
     return streams
 
 
@@ -96,10 +97,11 @@ def _to_uniform(high, low):
 @compiled
 def random_words(b):
     """Write ``b.word``: random words of every lane, a multiple of 4, from its key and counter."""
-    word, stream = b.word, b.stream
+    word = b.word
     for block in range(word.shape[0] // 4):
         for lane in range(LANES):
-            w0, w1, w2, w3 = _words(stream, lane, block, OBSERVATION_NOISE)
+            w0, w1, w2, w3 = _words(b.stream, lane, block, OBSERVATION_NOISE)
+            # Written out: a loop over the four is not vectorised.
             word[4 * block, lane] = w0
             word[4 * block + 1, lane] = w1
             word[4 * block + 2, lane] = w2
@@ -128,12 +130,13 @@ def _log(x):
     return m + m * m * (m * p - float32(0.5)) + float32(exponent) * _LN2
 
 
-@compiled(fastmath=True)
+@fast
 def standard_normals(b):
     """Write ``b.noise``: standard normals of every lane, two from each pair of its first words
     (Box-Muller).
     """
-    word, noise = b.word, b.noise
+    word = b.word
+    noise = b.noise
     for pair in range(noise.shape[0] // 2):
         for lane in range(LANES):
             u = (float32(int32(word[2 * pair, lane] >> uint32(1))) + float32(0.5)) * _TO_UNIT
@@ -159,6 +162,6 @@ def standard_normals(b):
             noise[2 * pair + 1, lane] = radius * _flip_sign(second, second_sign)
 
 
-@compiled(inline="always")
+@inlined
 def _flip_sign(x, sign_bit):
     return np.int32(np.float32(x).view(np.int32) ^ sign_bit).view(np.float32)

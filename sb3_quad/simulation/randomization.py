@@ -30,6 +30,10 @@ MAX_DELAY = 100  # control steps
 MAX_MAGNITUDE = {"SI": 1e4, "weight": 100.0}
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # of a quadcopter, SI
 Vector = tuple[Number, Number, Number]
+Metre = Annotated[float, Field(ge=-1, le=1)]  # m
+FactorLimit = Annotated[float, Field(ge=0.1, le=10)]
+WholeSteps = Annotated[float, Field(ge=0, le=MAX_DELAY, multiple_of=1)]
+Unit = Literal["SI", "weight"]
 VECTOR = {"length": _RANGE, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
 V = first_rows(VECTOR)
 VEHICLE_RANGES = (
@@ -60,15 +64,15 @@ RANDOMIZATION = {
 R = first_rows(RANDOMIZATION)
 
 
-class Range(Frozen):
+class Range(Frozen, use_attribute_docstrings=True):
     """Numbers from ``low`` to ``high``. You may write ``[low, high]``, or one number."""
 
-    low: Number = Field(description="the least number")
-    high: Number = Field(description="the greatest number, at least low")
-    distribution: Literal["uniform", "log_uniform", "uniform_cube_root"] = Field(
-        default="uniform",
-        description="of the number, of its logarithm (low > 0), or of its cube root",
-    )
+    low: Number
+    """the least number"""
+    high: Number
+    """the greatest number, at least low"""
+    distribution: Literal["uniform", "log_uniform", "uniform_cube_root"] = "uniform"
+    """of the number, of its logarithm (low > 0), or of its cube root"""
 
     @model_validator(mode="before")
     @classmethod
@@ -78,7 +82,8 @@ class Range(Frozen):
         if isinstance(data, (list, tuple)):
             if len(data) != 2:
                 raise ValueError(f"{list(data)!r}: must be [low, high]")
-            return dict(zip(("low", "high"), data, strict=True))
+            low, high = data
+            return {"low": low, "high": high}
         return data
 
     @model_validator(mode="after")
@@ -92,69 +97,76 @@ class Range(Frozen):
             raise ValueError(f"{given}: uniform_cube_root numbers must not be negative")
         return self
 
-    def numbers(self) -> list[float]:
-        """Return low, high, and the kind of the range."""
-        return [self.low, self.high, _KINDS[self.distribution]]
+
+def range_numbers(given: Range | None) -> tuple[float, float, float]:
+    """Return low, high, and the kind of a range; those of a FIXED one if it is not given."""
+    if given is None:
+        return FIXED_NUMBERS
+    return given.low, given.high, _KINDS[given.distribution]
 
 
 class NonNegativeRange(Range):
     """A :class:`Range` of numbers from 0."""
 
-    low: NonNegativeFloat = Field(description="the least number, at least 0")
+    low: NonNegativeFloat
+    """the least number, at least 0"""
 
 
 class PositiveRange(Range):
     """A :class:`Range` of numbers above 0."""
 
-    low: Annotated[float, Field(ge=1e-9)] = Field(description="the least number, at least 1e-9")
+    low: Annotated[float, Field(ge=1e-9)]
+    """the least number, at least 1e-9"""
 
 
 class Offset(Range):
     """A :class:`Range` of distances of at most 1 m either way."""
 
-    low: Annotated[float, Field(ge=-1, le=1)] = Field(description="the least number, at least -1")
-    high: Annotated[float, Field(ge=-1, le=1)] = Field(
-        description="the greatest number, from low to 1"
-    )
+    low: Metre
+    """the least number, at least -1"""
+    high: Metre
+    """the greatest number, from low to 1"""
+
+
+class Delay(Range):
+    """A :class:`Range` of whole numbers of control steps."""
+
+    low: WholeSteps
+    """the least number, in whole control steps"""
+    high: WholeSteps
+    """the greatest number, in whole control steps"""
 
 
 class Factor(Range):
     """A factor between 0.1 and 10, log-uniform unless ``distribution`` says otherwise."""
 
-    low: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the least factor")
-    high: Annotated[float, Field(ge=0.1, le=10)] = Field(
-        description="the greatest factor, at least low"
-    )
-    distribution: Literal["uniform", "log_uniform"] = Field(
-        default="log_uniform", description="of the factor or its logarithm"
-    )
+    low: FactorLimit
+    """the least factor"""
+    high: FactorLimit
+    """the greatest factor, at least low"""
+    distribution: Literal["uniform", "log_uniform"] = "log_uniform"
+    """of the factor or its logarithm"""
 
 
-class RandomVector(Frozen):
+UNCHANGED = Factor(low=1.0, high=1.0)
+
+
+class RandomVector(Frozen, use_attribute_docstrings=True):
     """A force or torque at the centre of mass, or a wind, constant during an episode.
 
     You may write ``[low, high]`` for its magnitude alone.
     """
 
-    magnitude: NonNegativeRange = Field(
-        description="its length, N, N m or m/s; or in the unit that unit names"
-    )
-    unit: Literal["SI", "weight"] = Field(
-        default="SI",
-        description="weight: a force in multiples of the weight m g, a torque of m g times the arm"
-        " length",
-    )
-    frame: Literal["world", "body"] | None = Field(
-        default=None,
-        description="frame in which it is constant; default: world for a force, body for a torque",
-    )
-    direction: Vector | None = Field(
-        default=None, description="its direction; default: uniformly random"
-    )
-    axes: tuple[AxisFactor, AxisFactor, AxisFactor] = Field(
-        default=(1.0, 1.0, 1.0),
-        description="factor of each component, such as [1, 1, 0] for a horizontal one",
-    )
+    magnitude: NonNegativeRange
+    """its length, N, N m or m/s; or in the unit that unit names"""
+    unit: Unit = "SI"
+    """weight: a force in multiples of the weight m g, a torque of m g times the arm length"""
+    frame: Literal["world", "body"] | None = None
+    """frame in which it is constant; default: world for a force, body for a torque"""
+    direction: Vector | None = None
+    """its direction; default: uniformly random"""
+    axes: tuple[AxisFactor, AxisFactor, AxisFactor] = (1.0, 1.0, 1.0)
+    """factor of each component, such as [1, 1, 0] for a horizontal one"""
 
     @model_validator(mode="before")
     @classmethod
@@ -181,12 +193,11 @@ class RandomVector(Frozen):
         direction = np.zeros(3)
         if self.direction is not None:
             direction = np.array(self.direction) / np.linalg.norm(self.direction)
-        by_weight = float(self.unit == "weight")
-        in_body = float((self.frame or frame) == "body")
-        return [*self.magnitude.numbers(), by_weight, in_body, *direction, *self.axes]
+        units = [self.unit == "weight", (self.frame or frame) == "body"]
+        return [*range_numbers(self.magnitude), *units, *direction, *self.axes]
 
 
-class Gusts(Frozen):
+class Gusts(Frozen, use_attribute_docstrings=True):
     """A force, or velocity of the air, that changes at random: each component in the world frame is
     an Ornstein-Uhlenbeck process.
 
@@ -199,15 +210,12 @@ class Gusts(Frozen):
     L / V.
     """
 
-    std: NonNegativeRange = Field(
-        description="standard deviation of each component, N, or m/s of wind; sampled per episode"
-    )
-    unit: Literal["SI", "weight"] = Field(
-        default="SI", description="weight: in multiples of the vehicle's weight m g"
-    )
-    time_constant: PositiveFloat = Field(
-        default=1.0, le=1e6, description="time after which a gust has faded to 1/e, s"
-    )
+    std: NonNegativeRange
+    """standard deviation of each component, N, or m/s of wind; sampled per episode"""
+    unit: Unit = "SI"
+    """weight: in multiples of the vehicle's weight m g"""
+    time_constant: PositiveFloat = Field(default=1.0, le=1e6)
+    """time after which a gust has faded to 1/e, s"""
 
     @model_validator(mode="after")
     def _of_a_quadcopter(self) -> "Gusts":
@@ -215,7 +223,7 @@ class Gusts(Frozen):
         return self
 
 
-class Randomization(Frozen):
+class Randomization(Frozen, use_attribute_docstrings=True):
     """The dynamics and disturbances that are random, sampled for each episode from the row's own
     stream. Fields that you do not give are not random.
 
@@ -224,81 +232,49 @@ class Randomization(Frozen):
     vehicle hovers before it is randomized.
     """
 
-    share: Share = Field(
-        default=1.0, description="fraction of the episodes whose vehicle is randomized"
-    )
-    mass: Factor | None = Field(
-        default=None, description="factor, such as [0.8, 1.25]; the thrusts in N do not change"
-    )
-    inertia: Factor | None = Field(
-        default=None,
-        description="factor of each of Ixx, Iyy and Izz; none exceeds the sum of the other two",
-    )
-    motor_gain: Factor | None = Field(default=None, description="factor of k_m (Eq. 4.1)")
-    motor_gain_up: Factor | None = Field(
-        default=None, description="another factor, of rotors that speed up"
-    )
-    motor_gain_down: Factor | None = Field(
-        default=None, description="another factor, of rotors that slow down"
-    )
-    thrust: Factor | None = Field(
-        default=None,
-        description="factor of the thrust of a command, such as that of an old battery",
-    )
-    arm: Factor | None = Field(
-        default=None, description="factor of the rotors' distances from the centre of mass"
-    )
-    center_of_mass: Offset | None = Field(
-        default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]"
-    )
-    delay: Range | None = Field(
-        default=None,
-        description="whole control steps from a command to its effect, such as [0, 3]; with"
-        " log_uniform short delays are more frequent",
-    )
-    drag: NonNegativeRange | None = Field(
-        default=None,
-        description="added drag along each body axis, 1/s times the nominal mass, such as [0, 0.5]",
-    )
-    wrench_share: Share = Field(
-        default=1.0, description="fraction of the episodes with force, torque, gusts and wind"
-    )
-    force: RandomVector | None = Field(
-        default=None, description="a constant force, such as {magnitude: [0, 5]}, N"
-    )
-    torque: RandomVector | None = Field(
-        default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, N m"
-    )
-    gusts: Gusts | None = Field(
-        default=None, description="a random force, such as {std: [0, 1], time_constant: 1}"
-    )
-    wind: RandomVector | None = Field(
-        default=None,
-        description="a constant velocity of the air, m/s, horizontal unless it has a direction; it"
-        " acts on vehicles with drag",
-    )
-    wind_gusts: Gusts | None = Field(
-        default=None, description="a random velocity added to the wind, such as {std: [0, 1]}, m/s"
-    )
+    share: Share = 1.0
+    """fraction of the episodes whose vehicle is randomized"""
+    mass: Factor | None = None
+    """factor, such as [0.8, 1.25]; the thrusts in N do not change"""
+    inertia: Factor | None = None
+    """factor of each of Ixx, Iyy and Izz; none exceeds the sum of the other two"""
+    motor_gain: Factor | None = None
+    """factor of k_m (Eq. 4.1)"""
+    motor_gain_up: Factor | None = None
+    """another factor, of rotors that speed up"""
+    motor_gain_down: Factor | None = None
+    """another factor, of rotors that slow down"""
+    thrust: Factor | None = None
+    """factor of the thrust of a command, such as that of an old battery"""
+    arm: Factor | None = None
+    """factor of the rotors' distances from the centre of mass"""
+    center_of_mass: Offset | None = None
+    """its offset in body x and in y, m, such as [-0.01, 0.01]"""
+    delay: Delay | None = None
+    """whole control steps from a command to its effect, such as [0, 3]"""
+    drag: NonNegativeRange | None = None
+    """added drag along each body axis, 1/s times the nominal mass, such as [0, 0.5]"""
+    wrench_share: Share = 1.0
+    """fraction of the episodes with force, torque, gusts and wind"""
+    force: RandomVector | None = None
+    """a constant force, such as {magnitude: [0, 5]}, N"""
+    torque: RandomVector | None = None
+    """a constant torque, such as {magnitude: [0, 0.1]}, N m"""
+    gusts: Gusts | None = None
+    """a random force, such as {std: [0, 1], time_constant: 1}"""
+    wind: RandomVector | None = None
+    """m/s, horizontal unless it has a direction; the air's velocity, acts on vehicles with drag"""
+    wind_gusts: Gusts | None = None
+    """a random velocity added to the wind, such as {std: [0, 1]}, m/s"""
 
     @model_validator(mode="after")
     def _possible(self) -> "Randomization":
-        delay = self.delay
-        if delay is not None:
-            is_whole = delay.low % 1 == 0 and delay.high % 1 == 0
-            if not is_whole or delay.low < 0 or delay.high > MAX_DELAY:
+        for wind in (self.wind, self.wind_gusts):
+            if wind is not None and (wind.unit != "SI" or getattr(wind, "frame", None)):
                 raise ValueError(
-                    f"delay [{delay.low:g}, {delay.high:g}]:"
-                    f" must be whole control steps of 0 to {MAX_DELAY}"
+                    "wind and wind_gusts: remove unit and frame;"
+                    " they are velocities, m/s, in the world frame"
                 )
-        constant, gusts = self.wind, self.wind_gusts
-        has_frame = constant is not None and constant.frame is not None
-        has_unit = any(wind is not None and wind.unit != "SI" for wind in (constant, gusts))
-        if has_frame or has_unit:
-            raise ValueError(
-                "wind and wind_gusts: remove unit and frame;"
-                " they are velocities, m/s, in the world frame"
-            )
         return self
 
     @property
@@ -317,20 +293,21 @@ class Randomization(Frozen):
         :raises ConfigError: it could not hover, or its motors would overshoot.
         """
         least, most = vehicle.thrust_limits
-        lightest, heaviest = _bounds(self.mass)
-        weakest, strongest = _bounds(self.thrust)
-        text = (
-            "randomize: with {:g} times its mass and {:g} times its thrust {} cannot hover;"
-            " its rotors {} times its weight"
-        )
-        if weakest * most <= heaviest:
-            raise ConfigError(text.format(heaviest, weakest, vehicle.name, f"lift {most:g}"))
-        if strongest * least > lightest:
-            limit = f"give at least {least:g}"
-            raise ConfigError(text.format(lightest, strongest, vehicle.name, limit))
-        up = vehicle.motor_gain_up * _bounds(self.motor_gain_up)[1]
-        down = vehicle.motor_gain_down * _bounds(self.motor_gain_down)[1]
-        gain = max(up, down) * _bounds(self.motor_gain)[1]
+        mass = self.mass or UNCHANGED
+        thrust = self.thrust or UNCHANGED
+        for is_wrong, heavy, weak, limit in (
+            (thrust.low * most <= mass.high, mass.high, thrust.low, f"lift {most:g}"),
+            (thrust.high * least > mass.low, mass.low, thrust.high, f"give at least {least:g}"),
+        ):
+            if is_wrong:
+                raise ConfigError(
+                    f"randomize: with {heavy:g} times its mass and {weak:g} times its thrust"
+                    f" {vehicle.name} cannot hover; its rotors {limit} times its weight"
+                )
+        # A rotor must not lose more than its whole error in a physics step.
+        up = vehicle.motor_gain_up * (self.motor_gain_up or UNCHANGED).high
+        down = vehicle.motor_gain_down * (self.motor_gain_down or UNCHANGED).high
+        gain = max(up, down) * (self.motor_gain or UNCHANGED).high
         if gain * vehicle.physics_step > 1.0:
             raise ConfigError(
                 f"randomize: motor_gain of {vehicle.name} may reach {gain:g};"
@@ -342,33 +319,29 @@ class Randomization(Frozen):
 
         :param control_step: s.
         """
-        numbers = [self.share if self.sets_vehicle else 0.0, self.wrench_share]
+        numbers = [self.share * self.sets_vehicle, self.wrench_share]
         for name in VEHICLE_RANGES:
-            given = getattr(self, name)
-            if name == "delay" and given is not None:
-                # floor(uniform(low, high + 1)) makes every whole number equally likely.
-                given = given.model_copy(update={"high": given.high + 1.0})
-            numbers += FIXED_NUMBERS if given is None else given.numbers()
+            numbers += range_numbers(getattr(self, name))
         for vector, frame in ((self.force, "world"), (self.torque, "body"), (self.wind, "world")):
             if vector is None:
-                numbers += [*FIXED_NUMBERS, *np.zeros(sum(VECTOR.values()) - _RANGE)]
+                # Zeros: its range is FIXED.
+                numbers += [0.0] * sum(VECTOR.values())
             else:
                 numbers += vector.numbers(frame)
-        by_weight = float(self.gusts is not None and self.gusts.unit == "weight")
-        numbers += [*_gust_numbers(self.gusts, control_step), by_weight]
-        return np.array([*numbers, *_gust_numbers(self.wind_gusts, control_step)])
-
-
-def _bounds(factor: Factor | None) -> tuple[float, float]:
-    """The least and the greatest value of a factor."""
-    return (1.0, 1.0) if factor is None else (factor.low, factor.high)
+        numbers += _gust_numbers(self.gusts, control_step)
+        by_weight = self.gusts is not None and self.gusts.unit == "weight"
+        numbers += [by_weight, *_gust_numbers(self.wind_gusts, control_step)]
+        table = np.array(numbers)
+        # floor(uniform(low, high + 1)) makes every whole number equally likely.
+        table[R.delay + 1] += 1.0
+        return table
 
 
 def _gust_numbers(gusts: Gusts | None, control_step: float) -> list[float]:
     """The range of the deviation, and the share of a gust that is left after a control step."""
     if gusts is None:
         return [*FIXED_NUMBERS, 0.0]
-    return [*gusts.std.numbers(), math.exp(-control_step / gusts.time_constant)]
+    return [*range_numbers(gusts.std), math.exp(-control_step / gusts.time_constant)]
 
 
 def _check_magnitude(numbers: Range, unit: str) -> None:
@@ -381,7 +354,9 @@ def between(table, k, u, nominal):
     """Return the number for u in (0, 1) from the range at ``table[k : k + 3]``; ``nominal`` if it
     is FIXED.
     """
-    low, high, kind = table[k], table[k + 1], table[k + 2]
+    low = table[k]
+    high = table[k + 1]
+    kind = table[k + 2]
     if kind == FIXED:
         return nominal
     if kind == CUBE_ROOT:

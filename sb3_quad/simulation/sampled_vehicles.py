@@ -28,23 +28,27 @@ def sample_vehicles(
     batch.reset()
     sampled = []
     for number, column in enumerate(batch.vehicles.T):
-        hover = column[P.hover_thrust]
-        middle = column[P.thrust_middle]
-        half = column[P.thrust_half_range]
+        # The parameters of this vehicle, by their names
+        p = P._make(column)
+        hover = p.hover_thrust
         roll, pitch = column[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4)
         changes = {
             "name": f"sampled_{seed}_{number}",
-            "mass": column[P.mass],
-            "inertia": tuple(column[P.ixx : P.izz + 1]),
+            "mass": p.mass,
+            "inertia": (p.ixx, p.iyy, p.izz),
+            # The roll arms are y of the rotors, the pitch arms -x.
             "rotor_positions": tuple(zip(-pitch, roll, strict=True)),
-            "moment_thrust_ratio": abs(column[P.yaw_arm_0]),
-            "thrust_coefficient": column[P.thrust_coefficient],
-            "motor_gain_up": column[P.motor_gain_up],
-            "motor_gain_down": column[P.motor_gain_down],
+            "moment_thrust_ratio": abs(p.yaw_arm_0),
+            "thrust_coefficient": p.thrust_coefficient,
+            "motor_gain_up": p.motor_gain_up,
+            "motor_gain_down": p.motor_gain_down,
             "motor_integration": "exact",
-            "drag": tuple(column[P.drag_x : P.drag_z + 1]),
-            "thrust_limits": ((middle - half) / hover, (middle + half) / hover),
-            "collision_radius": column[P.collision_radius],
+            "drag": (p.drag_x, p.drag_y, p.drag_z),
+            "thrust_limits": (
+                (p.thrust_middle - p.thrust_half_range) / hover,
+                (p.thrust_middle + p.thrust_half_range) / hover,
+            ),
+            "collision_radius": p.collision_radius,
         }
         sampled.append(base.model_copy(update=changes))
     return sampled

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.compiled import compiled, inlined
 from sb3_quad.simulation.observation import GUST_WORDS
 from sb3_quad.simulation.random import (
     DISTURBANCE,
@@ -36,13 +36,6 @@ _SUM_STD = math.sqrt(3 * (128**2 - 1) / 12)
 
 
 @compiled
-def count_episode(i, streams):
-    """Advance row i's stream to its next episode, in place."""
-    streams[EPISODE, i] += np.uint32(1)
-    streams[STEP, i] = np.uint32(0)
-
-
-@compiled
 def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights):
     """Begin the episode that row i's stream has come to, in place: sample task, state and target.
 
@@ -58,11 +51,8 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     :param weights: float64 (K,), cumulative.
     """
     u = uniforms(streams, i, 7, EPISODE_START)
-    k = 0
-    while k < weights.shape[0] - 1 and u[0] >= weights[k]:
-        k += 1
-    task_index[i] = k
-    task = tasks[k]
+    task_index[i] = np.sum(weights[:-1] <= u[0])
+    task = tasks[task_index[i]]
     s = state[:, i]
     vehicle = vehicles[:, min(i, vehicles.shape[1] - 1)]
 
@@ -79,12 +69,12 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
         s[X.position + axis] = task[T.start_position + axis]
         s[X.target + axis] = s[X.position + axis] + offset[axis]
 
+    s[X.quaternion : X.velocity] = 0.0
     s[X.quaternion] = 1.0
-    for axis in range(3):
-        s[X.quaternion + 1 + axis] = 0.0
     if task[T.random_attitude] != 0.0:
         # Uniform on SO(3) (Shoemake)
-        a, b = math.sqrt(1.0 - u[3]), math.sqrt(u[3])
+        a = math.sqrt(1.0 - u[3])
+        b = math.sqrt(u[3])
         s[X.quaternion] = b * math.cos(TURN * u[5])
         s[X.quaternion + 1] = a * math.sin(TURN * u[4])
         s[X.quaternion + 2] = a * math.cos(TURN * u[4])
@@ -96,30 +86,29 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
         s[X.velocity + axis] = velocity
         s[X.body_rates + axis] = rate
     hover = math.sqrt(vehicle[P.hover_thrust] / vehicle[P.thrust_coefficient])
-    for rotor in range(4):
-        s[X.rotor_speeds + rotor] = hover
-        for late in range(queue.shape[0]):
-            queue[late, rotor, i] = hover
+    s[X.rotor_speeds : X.target] = hover
+    queue[:, :, i] = hover
 
 
-@compiled(inline="always")
+@inlined
 def _spherical(length, up, azimuth):
     """Return the vector of that length and azimuth whose z is ``up`` times the length."""
     across = length * math.sqrt(max(0.0, 1.0 - up * up))
     return across * math.cos(azimuth), across * math.sin(azimuth), length * up
 
 
-@compiled(inline="always")
+@inlined
 def _normals(first_std, second_std, u, k):
     """Return two normals from the uniforms u[k] and u[k + 1] (Box-Muller)."""
-    radius, angle = math.sqrt(-2.0 * math.log(u[k])), TURN * u[k + 1]
+    radius = math.sqrt(-2.0 * math.log(u[k]))
+    angle = TURN * u[k + 1]
     return first_std * radius * math.cos(angle), second_std * radius * math.sin(angle)
 
 
 @compiled
 def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust, wind, wind_gust):
-    """Sample the vehicle, the constant wrench and wind, and the first gusts of row i's episode, in
-    place. Whatever is not random stays as it is.
+    """Advance row i's stream to its next episode, and sample its vehicle, constant wrench and wind,
+    and first gusts, in place. Whatever is not random stays as it is.
 
     :param base: float64 (len(PARAMETER_NAMES), n or 1), the vehicles before they are randomized.
     :param distribution: :meth:`.VehicleDistribution.numbers`.
@@ -130,68 +119,59 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
     :param gust: float64 (GUST_SIZE, n), or (GUST_SIZE, 0) without gusts; ``wind_gust`` likewise.
     :param wind: float64 (3, n).
     """
+    streams[EPISODE, i] += np.uint32(1)
+    streams[STEP, i] = np.uint32(0)
     has_own_vehicle = vehicles.shape[1] == wrench.shape[1]
     if has_own_vehicle:
-        for k in range(vehicles.shape[0]):
-            vehicles[k, i] = base[k, min(i, base.shape[1] - 1)]
+        vehicles[:, i] = base[:, min(i, base.shape[1] - 1)]
         sample_from_distribution(i, streams, distribution, vehicles)
 
     # Forces in weights are those of the vehicle before it is randomized.
     vehicle = vehicles[:, min(i, vehicles.shape[1] - 1)]
     weight = vehicle[P.mass] * vehicle[P.gravity]
     u = uniforms(streams, i, 4, DISTURBANCE)
-    is_disturbed = u[0] < table[R.wrench_share]
+    is_disturbed = np.float64(u[0] < table[R.wrench_share])
     if table[R.force + 2] != FIXED or table[R.torque + 2] != FIXED:
-        for k in range(wrench.shape[0]):
-            wrench[k, i] = 0.0
-        if is_disturbed:
-            size = _magnitude(table, R.force, u[1], weight)
-            in_body = table[R.force + V.in_body] != 0.0
-            rows = W.force_body if in_body else W.force_world
-            _write_vector(table, R.force, size, u[2], u[3], wrench, rows, i)
-            size = _magnitude(table, R.torque, u[4], weight * arm_length(vehicle))
-            in_body = table[R.torque + V.in_body] != 0.0
-            rows = W.torque_body if in_body else W.torque_world
-            _write_vector(table, R.torque, size, u[5], u[6], wrench, rows, i)
+        wrench[:, i] = 0.0
+        leverage = weight * arm_length(vehicle)
+        _sample_vector(table, R.force, is_disturbed, weight, u[1:4], wrench[W.force_world :, i])
+        _sample_vector(table, R.torque, is_disturbed, leverage, u[4:7], wrench[W.torque_world :, i])
     if gust.shape[1] > 0:
         unit = weight if table[R.gust_by_weight] != 0.0 else 1.0
-        _begin_gusts(i, table, R.gust_std, unit * is_disturbed, uniforms(streams, i, 4, GUST), gust)
+        _begin_gusts(
+            table, R.gust_std, unit * is_disturbed, uniforms(streams, i, 4, GUST), gust[:, i]
+        )
 
-    # The wind is horizontal unless its direction is given.
     if table[R.wind + 2] != FIXED or wind_gust.shape[1] > 0:
         u = uniforms(streams, i, 5, WIND)
         if table[R.wind + 2] != FIXED:
-            size = _magnitude(table, R.wind, u[8], 1.0) * is_disturbed
-            _write_vector(table, R.wind, size, 0.5, u[9], wind, 0, i)
+            # The wind is horizontal unless its direction is given.
+            _sample_vector(table, R.wind, is_disturbed, 1.0, (u[8], 0.5, u[9]), wind[:, i])
         if wind_gust.shape[1] > 0:
-            _begin_gusts(i, table, R.wind_std, 1.0 * is_disturbed, u, wind_gust)
+            _begin_gusts(table, R.wind_std, is_disturbed, u, wind_gust[:, i])
     if has_own_vehicle:
         _randomize_vehicle(i, streams, table, vehicles)
 
 
 @compiled
-def _magnitude(table, k, u, unit):
-    """Return the magnitude of the vector whose numbers begin at ``k``, in SI units.
+def _sample_vector(table, k, share, unit, u, out):
+    """Write the vector whose numbers begin at ``k``, (3,) in the world or the next 3 in the body
+    frame.
 
-    :param unit: of a magnitude that is given by weight.
+    :param share: 1, or 0 for none in this episode.
+    :param unit: of a magnitude that is given by weight, in SI units.
+    :param u: three numbers on (0, 1): magnitude, height and azimuth of a random direction.
     """
-    size = between(table, k, u, 0.0)
-    return size * unit if table[k + V.by_weight] != 0.0 else size
-
-
-@compiled
-def _write_vector(table, k, size, height, azimuth, target, row, i):
-    """Write the vector whose numbers begin at ``k`` to three rows of a wrench or wind.
-
-    :param height: uniform on (0, 1), as is ``azimuth``; they say a random direction.
-    """
-    x, y, z = _spherical(1.0, 2.0 * height - 1.0, TURN * azimuth)
-    to = k + V.direction
-    if table[to] != 0.0 or table[to + 1] != 0.0 or table[to + 2] != 0.0:
-        x, y, z = table[to], table[to + 1], table[to + 2]
-    target[row, i] = size * x * table[k + V.axes]
-    target[row + 1, i] = size * y * table[k + V.axes + 1]
-    target[row + 2, i] = size * z * table[k + V.axes + 2]
+    size = share * between(table, k, u[0], 0.0)
+    if table[k + V.by_weight] != 0.0:
+        size *= unit
+    # A direction of zeros stands for a random one.
+    direction = table[k + V.direction : k + V.axes]
+    if not direction.any():
+        direction = np.array(_spherical(1.0, 2.0 * u[1] - 1.0, TURN * u[2]))
+    axes = table[k + V.axes : k + V.axes + 3]
+    first = 3 * int(table[k + V.in_body])
+    out[first : first + 3] = size * direction * axes
 
 
 @compiled
@@ -205,13 +185,13 @@ def _randomize_vehicle(i, streams, table, vehicles):
     mass = between(table, R.mass, u[1], 1.0)
     v[P.mass] *= mass
     v[P.hover_thrust] *= mass
+    inertia = v[P.ixx : P.izz + 1]
     for axis in range(3):
-        v[P.ixx + axis] *= between(table, R.inertia, u[2 + axis], 1.0)
+        inertia[axis] *= between(table, R.inertia, u[2 + axis], 1.0)
         v[P.drag_x + axis] += nominal_mass * between(table, R.drag, u[13], 0.0)
     # No body has one moment larger than the other two together.
     for axis in range(3):
-        others = v[P.ixx + (axis + 1) % 3] + v[P.ixx + (axis + 2) % 3]
-        v[P.ixx + axis] = min(v[P.ixx + axis], others)
+        inertia[axis] = min(inertia[axis], inertia[axis - 1] + inertia[axis - 2])
 
     motor_gain = between(table, R.motor_gain, u[5], 1.0)
     v[P.motor_gain_up] *= motor_gain * between(table, R.motor_gain_up, u[11], 1.0)
@@ -233,19 +213,19 @@ def _randomize_vehicle(i, streams, table, vehicles):
 
 
 @compiled
-def _begin_gusts(i, table, k, unit, u, gust):
-    """Set how row i's gusts are in its episode, and sample the first, in place.
+def _begin_gusts(table, k, unit, u, gust):
+    """Set how the gusts of an episode are, (GUST_SIZE,), and sample the first, in place.
 
     :param k: where their numbers begin.
     :param u: eight uniforms.
     """
     std = unit * between(table, k, u[0], 0.0)
     keeps = table[k + len(FIXED_NUMBERS)]
-    gust[G.keeps, i] = keeps
-    gust[G.adds, i] = std * math.sqrt(1.0 - keeps * keeps)
+    gust[G.keeps] = keeps
+    gust[G.adds] = std * math.sqrt(1.0 - keeps * keeps)
     # The first gust has the deviation of all later ones.
     for axis in range(3):
-        gust[G.value + axis, i] = _normals(std, std, u, 2 + 2 * axis)[0]
+        gust[G.value + axis] = _normals(std, std, u, 2 + 2 * axis)[0]
 
 
 @compiled
@@ -268,13 +248,13 @@ def advance_gusts(b, gust, first, count):
     word = b.word
     for lane in range(count):
         i = first + lane
-        low, high = np.uint64(word[GUST_WORDS, lane]), np.uint64(word[GUST_WORDS + 1, lane])
-        bits = low | high << np.uint64(32)
+        low = np.uint64(word[GUST_WORDS, lane])
+        bits = low | np.uint64(word[GUST_WORDS + 1, lane]) << np.uint64(32)
         for axis in range(3):
             part = bits >> np.uint64(21 * axis)
-            total = part & _SEVEN_BITS
-            total += part >> np.uint64(7) & _SEVEN_BITS
-            total += part >> np.uint64(14) & _SEVEN_BITS
+            total = np.uint64(0)
+            for shift in (0, 7, 14):
+                total += part >> np.uint64(shift) & _SEVEN_BITS
             normal = (np.float64(np.int64(total)) - _SUM_MEAN) / _SUM_STD
             kept = gust[G.keeps, i] * gust[G.value + axis, i]
             gust[G.value + axis, i] = kept + gust[G.adds, i] * normal

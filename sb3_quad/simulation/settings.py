@@ -31,19 +31,20 @@ KEY = "flight_settings"
 Level = Annotated[float, Field(ge=0, le=100)]
 
 
-class Noise(Frozen):
+_OBSERVATION = set(ObservationSettings.model_fields)
+
+
+class Noise(Frozen, use_attribute_docstrings=True):
     """Observation noise: a feature x with scale σ (Eq. 3.16) gets the sum of two independent normal
     disturbances, with the standard deviation √((relative x)² + (additive σ)²).
 
     A number alone is ``relative``.
     """
 
-    relative: Level = Field(
-        default=0.0, description="as a fraction of the feature's value (thesis: 0.05)"
-    )
-    additive: Level = Field(
-        default=0.0, description="as a fraction of σ, the same wherever the vehicle is"
-    )
+    relative: Level = 0.0
+    """as a fraction of the feature's value (thesis: 0.05)"""
+    additive: Level = 0.0
+    """as a fraction of σ, the same wherever the vehicle is"""
 
 
 NoiseLevel = Level | list[Level] | Noise
@@ -56,44 +57,26 @@ class FlightSettings(ObservationSettings):
     give fewer vehicles or steps than rows, they repeat.
     """
 
-    task: Any = Field(
-        default="target_tracking",
-        description="name of a task or mixture, Task, or mixture {name: weight}",
-    )
-    task_kwargs: dict[str, Any] | None = Field(
-        default=None, description="fields of the task to override"
-    )
-    vehicle: Any = Field(
-        default="itm",
-        description="name, path or Vehicle; or a list of them with the same time steps",
-    )
-    rotor_layout: str | Path | Vehicle | None = Field(
-        default=None,
-        description="name, path or Vehicle to whose axes and rotor order the vehicle is turned",
-    )
-    noise: Annotated[NoiseLevel, AsList] = Field(
-        default=0.05,
-        description="relative standard deviation of the observation noise, one for all rows or"
-        " one for each; or fields of Noise",
-    )
-    observation_mean: Scaling = Field(
-        default=None, description="μ of Eq. 3.16, (18,) or (n, 18), in units; None: zero"
-    )
-    observation_std: Scaling = Field(
-        default=None, description="σ of Eq. 3.16, (18,) or (n, 18), in units; None: Table A.2"
-    )
-    vehicles: VehicleDistribution | None = Field(
-        default=None,
-        description="fields of VehicleDistribution, or {distribution: name}; each episode samples"
-        " a vehicle from it",
-    )
-    randomize: Randomization | None = Field(
-        default=None, description="fields of Randomization: dynamics that differ by episode"
-    )
-    max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = Field(
-        default=MAX_EPISODE_STEPS,
-        description="control steps after which an episode is truncated, for all rows or for each",
-    )
+    task: Any = "target_tracking"
+    """name of a task or mixture, Task, or mixture {name: weight}"""
+    task_kwargs: dict[str, Any] | None = None
+    """fields of the task to override"""
+    vehicle: Any = "itm"
+    """name, path or Vehicle; or a list of them with the same time steps"""
+    rotor_layout: str | Path | Vehicle | None = None
+    """name, path or Vehicle to whose axes and rotor order the vehicle is turned"""
+    noise: Annotated[NoiseLevel, AsList] = 0.05
+    """relative standard deviation of the noise, one for all rows or one each; or fields of Noise"""
+    observation_mean: Scaling = None
+    """μ of Eq. 3.16, (18,) or (n, 18), in units; None: zero"""
+    observation_std: Scaling = None
+    """σ of Eq. 3.16, (18,) or (n, 18), in units; None: Table A.2"""
+    vehicles: VehicleDistribution | None = None
+    """fields of VehicleDistribution, or {distribution: name}: a vehicle for each episode"""
+    randomize: Randomization | None = None
+    """fields of Randomization: dynamics that differ by episode"""
+    max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = MAX_EPISODE_STEPS
+    """control steps after which an episode is truncated, for all rows or for each"""
 
     @model_validator(mode="before")
     @classmethod
@@ -112,41 +95,32 @@ class FlightSettings(ObservationSettings):
     @property
     def longest_episode(self) -> int:
         """Control steps of an episode; of the longest where rows differ."""
-        steps = self.max_episode_steps
-        return max(steps) if isinstance(steps, list) else steps
+        return int(np.max(self.max_episode_steps))
 
     @property
     def observation(self) -> ObservationSettings:
         """The settings of the observation alone."""
-        return ObservationSettings(
-            **{name: getattr(self, name) for name in ObservationSettings.model_fields}
-        )
+        return ObservationSettings(**self.model_dump(include=_OBSERVATION))
 
     def in_any_task(self) -> dict[str, Any]:
         """Return the settings that were given and do not belong to a task: vehicles, noise,
         observation.
         """
-        others = ("task", "task_kwargs", "max_episode_steps", "randomize")
-        return {
-            name: value
-            for name, value in self
-            if name in self.model_fields_set and name not in others
-        }
+        kept = self.model_fields_set - {"task", "task_kwargs", "max_episode_steps", "randomize"}
+        return {name: value for name, value in self if name in kept}
 
     @property
     def observed(self) -> dict[str, Any]:
         """The settings that an agent needs wherever it flies: scaling and frames of its
         observations, and the order of its rotors.
         """
-        scaling = {"observation_mean", "observation_std"}
-        return self.model_dump(
-            mode="json", include={*ObservationSettings.model_fields, "rotor_layout", *scaling}
-        )
+        needed = _OBSERVATION | {"rotor_layout", "observation_mean", "observation_std"}
+        return self.model_dump(mode="json", include=needed)
 
     @property
     def layout(self) -> Vehicle:
         """The vehicle whose axes and rotor order an agent with these settings knows."""
-        return first_vehicle(self.vehicle if self.rotor_layout is None else self.rotor_layout)
+        return first_vehicle(self.rotor_layout or self.vehicle)
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """Return the same settings with some fields changed; a ``vehicle`` replaces ``vehicles``.
@@ -170,12 +144,9 @@ class FlightSettings(ObservationSettings):
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
-        layout = None if self.rotor_layout is None else load_vehicle(self.rotor_layout)
-        changes = {
-            "vehicle": first_vehicle(self.vehicle),
-            "vehicles": self.vehicles,
-            "rotor_layout": layout,
-        }
+        changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
+        if self.rotor_layout is not None:
+            changes["rotor_layout"] = load_vehicle(self.rotor_layout)
         setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
 
 

@@ -138,27 +138,22 @@ class QuadcopterState:
         return self._apply(lambda array: array[:, rows])
 
     def _apply(self, change: Callable[[FloatArray], FloatArray]) -> "QuadcopterState":
-        return QuadcopterState(
-            change(self.array),
-            None if self.vehicles is None else change(self.vehicles),
-            None if self.wrench is None else change(self.wrench),
-        )
+        others = [
+            array if array is None else change(array) for array in (self.vehicles, self.wrench)
+        ]
+        return QuadcopterState(change(self.array), *others)
 
     @staticmethod
     def concatenate(states: Sequence["QuadcopterState"]) -> "QuadcopterState":
         """Return several states as one batch, in order. Vehicles or wrench are unknown if one of
         the states does not know them.
         """
-        return QuadcopterState(
-            np.concatenate([state.array for state in states], axis=1),
-            _concatenate_known([state.vehicles for state in states]),
-            _concatenate_known([state.wrench for state in states]),
-        )
-
-
-def _concatenate_known(arrays: Sequence[FloatArray | None]) -> FloatArray | None:
-    known = [array for array in arrays if array is not None]
-    return np.concatenate(known, axis=1) if len(known) == len(arrays) else None
+        columns = [(state.array, state.vehicles, state.wrench) for state in states]
+        joined = []
+        for arrays in zip(*columns, strict=True):
+            known: Any = [array for array in arrays if array is not None]
+            joined.append(np.concatenate(known, axis=1) if len(known) == len(states) else None)
+        return QuadcopterState(*joined)
 
 
 def rotation_matrices(quaternions: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from pydantic import Field, PositiveFloat, field_validator, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
@@ -23,78 +23,56 @@ Speed = Annotated[float, Field(ge=0, le=1e3)]  # m/s, rad/s
 Cost = Annotated[float, Field(ge=0, le=1e6)]
 
 
-class Task(Frozen):
+class Task(Frozen, use_attribute_docstrings=True):
     """A task: start distribution, reward coefficients (Eqs. 4.5-4.9) and limits; units m, s, rad.
 
     Frozen. ``task_kwargs`` of the environments override its fields by name.
     """
 
-    name: str = Field(default="custom", min_length=1, description="what the task is called")
-    start_position: tuple[Coordinate, Coordinate, Coordinate] = Field(
-        default=(0.0, 0.0, 15.0), description="r0, world frame, m"
-    )
-    target_distance: Length = Field(
-        default=0.0,
-        description="|r_T - r0|, m, at most max_distance; 0 puts the target at r0",
-    )
-    nearest_target: Length | None = Field(
-        default=None,
-        description="if given, |r_T - r0| is uniform between this and target_distance, m",
-    )
-    target_clearance: Length = Field(
-        default=0.25,
-        description="least height of a target above the ground, beyond the collision radius, m",
-    )
-    random_attitude: bool = Field(
-        default=False, description="start attitude uniform on SO(3), else level"
-    )
-    velocity_std: Speed = Field(
-        default=0.0, description="standard deviation of v at the start, per axis, m/s"
-    )
-    body_rates_std: Speed = Field(
-        default=0.0,
-        description="standard deviation of the body rates at the start, per axis, rad/s",
-    )
-    hit_rates_std: Speed = Field(
-        default=0.0,
-        description="standard deviation of the body rates that a hit adds at the start, per axis,"
-        " rad/s",
-    )
-    max_distance: PositiveLength = Field(
-        default=30.0,
-        description="distance from the target beyond which the episode terminates, m",
-    )
-    success_distance: PositiveLength = Field(
-        default=0.1, description="greatest final distance from the target of a success, m"
-    )
-    success_tilt: PositiveFloat = Field(
-        default=np.pi, description="greatest final tilt of a success, rad"
-    )
-    position_cost: Cost = Field(default=0.003, description="per m and control step (Eq. 4.5)")
-    precision_cost: Cost = Field(
-        default=0.0,
-        description="per control step, times d / (d + precision_range) of the distance d",
-    )
-    precision_range: PositiveLength = Field(
-        default=0.3, description="distance at which half of precision_cost is due, m"
-    )
-    tilt_cost: Cost = Field(default=0.002, description="per rad and control step (Eq. 4.6)")
-    body_rates_cost: Cost = Field(
-        default=0.0005, description="per rad/s and control step (Eq. 4.7)"
-    )
-    collision_cost: Cost = Field(default=15.0, description="for touching the ground (Eq. 4.8)")
-    out_of_range_cost: Cost = Field(default=15.0, description="for leaving max_distance (Eq. 4.9)")
-
-    @field_validator("start_position")
-    @classmethod
-    def _above_ground(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        if value[2] <= 0.0:
-            raise ValueError("must lie above the ground (z > 0)")
-        return value
+    name: str = Field(default="custom", min_length=1)
+    """what the task is called"""
+    start_position: tuple[Coordinate, Coordinate, PositiveLength] = (0.0, 0.0, 15.0)
+    """r0, world frame, m, above the ground"""
+    target_distance: Length = 0.0
+    """|r_T - r0|, m, at most max_distance; 0 puts the target at r0"""
+    nearest_target: Length | None = None
+    """if given, |r_T - r0| is uniform between this and target_distance, m"""
+    target_clearance: Length = 0.25
+    """least height of a target above the ground, beyond the collision radius, m"""
+    random_attitude: bool = False
+    """start attitude uniform on SO(3), else level"""
+    velocity_std: Speed = 0.0
+    """standard deviation of v at the start, per axis, m/s"""
+    body_rates_std: Speed = 0.0
+    """standard deviation of the body rates at the start, per axis, rad/s"""
+    hit_rates_std: Speed = 0.0
+    """standard deviation of the body rates that a hit adds at the start, per axis, rad/s"""
+    max_distance: PositiveLength = 30.0
+    """distance from the target beyond which the episode terminates, m"""
+    success_distance: PositiveLength = 0.1
+    """greatest final distance from the target of a success, m"""
+    success_tilt: PositiveFloat = np.pi
+    """greatest final tilt of a success, rad"""
+    position_cost: Cost = 0.003
+    """per m and control step (Eq. 4.5)"""
+    precision_cost: Cost = 0.0
+    """per control step, times d / (d + precision_range) of the distance d"""
+    precision_range: PositiveLength = 0.3
+    """distance at which half of precision_cost is due, m"""
+    tilt_cost: Cost = 0.002
+    """per rad and control step (Eq. 4.6)"""
+    body_rates_cost: Cost = 0.0005
+    """per rad/s and control step (Eq. 4.7)"""
+    collision_cost: Cost = 15.0
+    """for touching the ground (Eq. 4.8)"""
+    out_of_range_cost: Cost = 15.0
+    """for leaving max_distance (Eq. 4.9)"""
 
     @model_validator(mode="after")
     def _nearest_first(self) -> "Task":
-        target, nearest, most = self.target_distance, self.nearest_target, self.max_distance
+        target = self.target_distance
+        nearest = self.nearest_target
+        most = self.max_distance
         if nearest is not None and nearest > target:
             raise ValueError(f"nearest_target {nearest} exceeds target_distance {target}")
         if target > most:
@@ -112,12 +90,11 @@ class Task(Frozen):
         return np.hstack([values[name] for name in TASK]).astype(np.float64)
 
 
-TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
+TASK = dict.fromkeys(list(Task.model_fields)[1:], 1) | {"start_position": 3}
 """Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
 T = first_rows(TASK)
 SCORED = list(TASK)[list(TASK).index("max_distance") :]
 """The fields that every control step needs: all from ``max_distance`` on, a number each."""
-S = first_rows(dict.fromkeys(SCORED, 1))
 
 RECOVERED = {"success_distance": 0.25, "success_tilt": np.radians(10.0)}
 """The success of tasks whose target is their start."""
@@ -220,7 +197,7 @@ def resolve_tasks(
     parameters = np.stack([_resolve(name, TASKS, overrides).parameters() for name in weights])
     given = list(weights.values())
     try:
-        shares = np.array([float(share) for share in given])
+        shares = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise ConfigError(f"task: the weights {given} must be numbers") from None
     if not np.isfinite(shares).all() or (shares < 0).any() or shares.sum() <= 0:

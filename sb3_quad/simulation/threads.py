@@ -15,8 +15,9 @@ import numpy as np
 
 from sb3_quad.simulation.compiled import atomic_add, compiled, give_way
 
+Function = Callable[..., Any]
 # Places in a control array, each on a cache line of its own, and its size
-LEFT, DONE, LATE, CONTROL = 0, 16, 32, 48
+LEFT, DONE, LATE, CONTROL = range(0, 64, 16)
 # Looks at a chunk that another thread still has, before that thread gets the core: about 30 µs
 SPIN = 20_000
 # Looks after that, with which the call counts as late: longer than a chunk takes
@@ -43,7 +44,7 @@ class _Pool:
 
     def __init__(self) -> None:
         self.begun = self.resting = 0
-        self.calls: queue.SimpleQueue[tuple[Callable[..., Any], Any]] = queue.SimpleQueue()
+        self.calls: queue.SimpleQueue[tuple[Function, Any]] = queue.SimpleQueue()
 
     def help(self) -> None:
         while True:
@@ -56,7 +57,7 @@ class _Pool:
 _pool = _Pool()
 
 
-def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> Any:
+def share_out(function: Function, helpers: int, *arguments: Any) -> Any:
     """Return ``function(control, True, *arguments)``, while up to ``helpers`` threads call it with
     False.
 

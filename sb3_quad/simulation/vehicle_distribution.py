@@ -26,6 +26,7 @@ from sb3_quad.simulation.randomization import (
     NonNegativeRange,
     PositiveRange,
     between,
+    range_numbers,
 )
 from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -48,11 +49,12 @@ DISTRIBUTION_NUMBERS = {
 }
 """Numbers of :meth:`VehicleDistribution.numbers`; ratios that are not given are 0."""
 D = first_rows(DISTRIBUTION_NUMBERS)
-NO_DISTRIBUTION = np.array([*FIXED_NUMBERS * len(_RANGES), *np.zeros(4)])
+# Its ranges are FIXED.
+NO_DISTRIBUTION = np.zeros(sum(DISTRIBUTION_NUMBERS.values()))
 Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
-class VehicleDistribution(Frozen):
+class VehicleDistribution(Frozen, use_attribute_docstrings=True):
     """Ranges of a quadcopter's parameters. Each is ``[low, high]``, a number, or a mapping with a
     ``distribution``.
 
@@ -61,33 +63,26 @@ class VehicleDistribution(Frozen):
     normal with mean -``size_deviation`` and standard deviation ``size_deviation``.
     """
 
-    mass: PositiveRange = Field(description="m, kg")
-    thrust_to_weight: PositiveRange = Field(
-        description="greatest thrust of all rotors, divided by the weight"
-    )
-    torque_to_inertia: PositiveRange = Field(
-        description="arm length times a rotor's greatest thrust, divided by Ixx, rad/s²"
-    )
-    motor_time_constant: PositiveRange = Field(description="1 / k_m, s (Eq. 4.1)")
-    motor_time_constant_down: PositiveRange | None = Field(
-        default=None, description="1 / k_m of a rotor that slows down, s; default: the same"
-    )
-    moment_thrust_ratio: PositiveRange = Field(description="kM / kF, m")
-    least_thrust: NonNegativeRange = Field(
-        default=NonNegativeRange(low=0, high=0),
-        description="least thrust of a rotor, in hover thrusts",
-    )
-    inertia_ratios: tuple[Ratio, Ratio, Ratio] | None = Field(
-        default=None, description="ratios of Ixx, Iyy and Izz; default: the base vehicle's"
-    )
-    drag: NonNegativeRange | None = Field(
-        default=None,
-        description="drag along each body axis, divided by the mass, 1/s; default: the base"
-        " vehicle's",
-    )
-    size_deviation: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.0, description="deviation of the arms' length, see above"
-    )
+    mass: PositiveRange
+    """m, kg"""
+    thrust_to_weight: PositiveRange
+    """greatest thrust of all rotors, divided by the weight"""
+    torque_to_inertia: PositiveRange
+    """arm length times a rotor's greatest thrust, divided by Ixx, rad/s²"""
+    motor_time_constant: PositiveRange
+    """1 / k_m, s (Eq. 4.1)"""
+    motor_time_constant_down: PositiveRange | None = None
+    """1 / k_m of a rotor that slows down, s; default: the same"""
+    moment_thrust_ratio: PositiveRange
+    """kM / kF, m"""
+    least_thrust: NonNegativeRange = NonNegativeRange(low=0, high=0)
+    """least thrust of a rotor, in hover thrusts"""
+    inertia_ratios: tuple[Ratio, Ratio, Ratio] | None = None
+    """ratios of Ixx, Iyy and Izz; default: the base vehicle's"""
+    drag: NonNegativeRange | None = None
+    """drag along each body axis, divided by the mass, 1/s; default: the base vehicle's"""
+    size_deviation: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """deviation of the arms' length, see above"""
 
     @model_validator(mode="before")
     @classmethod
@@ -138,11 +133,8 @@ class VehicleDistribution(Frozen):
         """Return the numbers that :func:`sample_from_distribution` reads, in the order of
         ``DISTRIBUTION_NUMBERS``.
         """
-        numbers: list[float] = []
-        for name in _RANGES:
-            given = getattr(self, name)
-            numbers += FIXED_NUMBERS if given is None else given.numbers()
-        return np.array([*numbers, *(self.inertia_ratios or np.zeros(3)), self.size_deviation])
+        ranges = [range_numbers(getattr(self, name)) for name in _RANGES]
+        return np.hstack([*ranges, self.inertia_ratios or np.zeros(3), self.size_deviation])
 
 
 @compiled
@@ -185,19 +177,16 @@ def sample_from_distribution(i, streams, table, vehicles):
     size = mass_ratio ** (1.0 / 3.0) * (1.0 + x if x >= 0.0 else 1.0 / (1.0 - x))
     v[P.collision_radius] *= size
     ratio = between(table, D.moment_thrust_ratio, u[4], 1.0)
+    v[P.roll_arm_0 : P.yaw_arm_0] *= size
     for rotor in range(4):
-        v[P.roll_arm_0 + rotor] *= size
-        v[P.pitch_arm_0 + rotor] *= size
         v[P.yaw_arm_0 + rotor] = math.copysign(ratio, v[P.yaw_arm_0 + rotor])
 
     # Inertia: the ratios of its axes, then its size by Ixx.
-    for axis in range(3):
-        if table[D.inertia_ratios] != 0.0:
-            v[P.ixx + axis] = table[D.inertia_ratios + axis]
+    inertia = v[P.ixx : P.izz + 1]
+    if table[D.inertia_ratios] != 0.0:
+        inertia[:] = table[D.inertia_ratios : D.inertia_ratios + 3]
     torque = arm_length(v) * hover * most
-    factor = torque / between(table, D.torque_to_inertia, u[2], 1.0) / v[P.ixx]
-    for axis in range(3):
-        v[P.ixx + axis] *= factor
+    inertia *= torque / between(table, D.torque_to_inertia, u[2], 1.0) / inertia[0]
 
 
 @compiled
@@ -208,6 +197,7 @@ def arm_length(vehicle):
     """
     longest = 0.0
     for rotor in range(4):
-        x, y = vehicle[P.pitch_arm_0 + rotor], vehicle[P.roll_arm_0 + rotor]
+        x = vehicle[P.pitch_arm_0 + rotor]
+        y = vehicle[P.roll_arm_0 + rotor]
         longest = max(longest, math.sqrt(x * x + y * y))
     return longest
