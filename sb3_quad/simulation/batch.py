@@ -114,8 +114,8 @@ class QuadcopterBatch:
         if self.randomize.delay is not None:
             longest = max(longest, int(self.randomize.delay.high))
         self.queue = np.zeros((longest, 4, n))
-        same_delay = bool((self.base_vehicles[P.delay] == longest).all())
-        self.own_delays = self.randomize.delay is not None or not same_delay
+        is_shorter = self.base_vehicles[P.delay] < longest
+        self.own_delays = self.randomize.delay is not None or bool(is_shorter.any())
 
         # The frames that a policy sees besides the present features.
         self.observation = settings.observation

@@ -523,14 +523,17 @@ def _end_episodes(
         out_of_range = distance[lane] > b.max_distance[lane]
         dones[i] = crashed | out_of_range | (b.stream[STEP, lane] >= limits[i])
         ended += dones[i]
+    # Few episodes end, and without this part the loop above has no branches.
+    if ended == 0 and autoreset:
+        return ended
+    for lane in range(count):
+        i = first + lane
         if autoreset and not dones[i]:
             continue
-        # How the episode has ended
-        survived = not (crashed or out_of_range)
-        outcome[i].collision = crashed
-        outcome[i].out_of_range = out_of_range
-        outcome[i].truncated = survived
-        outcome[i].success = survived and succeeds(b, lane)
+        outcome[i].collision = height[lane] <= b.radius[lane]
+        outcome[i].out_of_range = distance[lane] > b.max_distance[lane]
+        outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
+        outcome[i].success = outcome[i].truncated and succeeds(b, lane)
         outcome[i].distance = distance[lane]
         outcome[i].total = returns[i]
         outcome[i].reward = b.reward[lane]

@@ -149,9 +149,9 @@ class QuadcopterState:
         the states does not know them.
         """
         columns = [(state.array, state.vehicles, state.wrench) for state in states]
-        joined = []
+        joined: list[Any] = []
         for arrays in zip(*columns, strict=True):
-            known: Any = [array for array in arrays if array is not None]
+            known = [array for array in arrays if array is not None]
             joined.append(np.concatenate(known, axis=1) if len(known) == len(states) else None)
         return QuadcopterState(*joined)
 
