@@ -9,9 +9,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 from typing_extensions import Unpack
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import StrDict, StrMapping
+from sb3_quad.base.types import FloatArray, StrDict, StrMapping
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.batch import QuadcopterBatch, Rows
 from sb3_quad.simulation.frames import PositionIntegral

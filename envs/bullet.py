@@ -6,8 +6,8 @@ import weakref
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
+from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering.camera import ChaseCamera
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose, Scene

@@ -9,10 +9,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import Unpack
 
-from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import StrDict, StrMapping
+from sb3_quad.base.types import BoolArray, Float32Array, StrDict, StrMapping
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 

@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import Unpack
 
-from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import StrDict, StrMapping
+from sb3_quad.base.types import Float32Array, FloatArray, Image, StrDict, StrMapping
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.simulation.checks import check_size, per_row

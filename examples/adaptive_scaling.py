@@ -16,17 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.algorithms.offset_correction import N_OFFSETS, ROUNDS, hover_offset
-from sb3_quad.base.arrays import Float32Array, FloatArray
-from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.cli.output import console
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.report.scenario_plots import arrivals_plot

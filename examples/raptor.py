@@ -20,8 +20,8 @@ import foundation_policy
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle

@@ -18,8 +18,8 @@ from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import DAgger, GeometricExpert
-from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import Arrays
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder

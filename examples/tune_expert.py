@@ -21,8 +21,8 @@ import yaml
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
-from sb3_quad.base.arrays import BoolArray
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.types import BoolArray
 from sb3_quad.evaluation.flights import Flights, Hook, fly, fly_settings
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.settings import FlightSettings

@@ -25,10 +25,10 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_quad import PPOBC, DAgger, PIDExpert, load_pretrained
 from sb3_quad.algorithms.offset_correction import correct_offset
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.colours import COLOURS
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.results import COLOURS
 from sb3_quad.report.plots import STYLE
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})

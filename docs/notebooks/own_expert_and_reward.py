@@ -25,10 +25,10 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.colours import COLOURS
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.results import COLOURS
 from sb3_quad.experts.protocol import Expert
 from sb3_quad.report.plots import STYLE
 from sb3_quad.simulation.state import TARGET, QuadcopterState

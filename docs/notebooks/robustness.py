@@ -23,10 +23,10 @@ import tempfile
 import matplotlib.pyplot as plt
 import numpy as np
 
-from sb3_quad.base.colours import COLOURS
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
+from sb3_quad.evaluation.results import COLOURS
 from sb3_quad.evaluation.scenarios.load import axis_label, parse_suite
 from sb3_quad.report.plots import STYLE
 

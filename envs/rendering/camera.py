@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.simulation.state import POSITION, TARGET
 
 SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that distance hardly changes sizes

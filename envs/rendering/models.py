@@ -9,8 +9,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.bullet import p
+from sb3_quad.base.types import FloatArray
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector: TypeAlias = tuple[float, float, float]

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import ImageDraw
 
-from sb3_quad.base.arrays import Float32Array, FloatArray, Image
+from sb3_quad.base.types import Float32Array, FloatArray, Image
 from sb3_quad.envs.rendering.camera import Camera, Lens
 
 NEAR = 0.05  # distances between which bodies are drawn, m

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image as Pillow
 
-from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
+from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering import models
 from sb3_quad.envs.rendering.camera import Camera
 from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, add_body, move_body

@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.rendering.camera import Camera
 
 

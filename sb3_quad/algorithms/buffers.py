@@ -17,9 +17,9 @@ from stable_baselines3.common.buffers import (
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
-from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_arrays
+from sb3_quad.base.types import Arrays, Float32Array, IntArray
 
 
 class ExpertRolloutSamples(NamedTuple):

@@ -46,8 +46,8 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.controller import Controller, true_state_of
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.simulation.unobserved import UNOBSERVED, unobserved

@@ -27,9 +27,9 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings, levels

@@ -36,8 +36,8 @@ from sb3_quad.algorithms.networks.losses import (
     cloning_errors,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
+from sb3_quad.base.types import BoolArray, Float32Array
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.expert_like import ExpertLike
 

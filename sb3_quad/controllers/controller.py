@@ -7,9 +7,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import BoolArray, Float32Array, StrDict
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.simulation.state import QuadcopterState

@@ -5,7 +5,7 @@ from typing import Any, Protocol, TypeAlias
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_quad.base.arrays import Float32Array
+from sb3_quad.base.types import Float32Array
 from sb3_quad.simulation.state import QuadcopterState
 
 

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base import __version__
-from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
-from sb3_quad.base.types import Report, StrMapping
+from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward

@@ -9,8 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices

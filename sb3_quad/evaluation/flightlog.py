@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray
 from sb3_quad.base.files import read_arrays
-from sb3_quad.base.types import StrPath
+from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, StrPath
 from sb3_quad.evaluation.flights import Flights, Hook
 from sb3_quad.simulation.state import (
     FORCE_BODY,

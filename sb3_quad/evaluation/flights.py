@@ -14,10 +14,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet

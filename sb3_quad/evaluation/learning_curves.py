@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays
-from sb3_quad.base.types import StrPath
+from sb3_quad.base.types import FloatArray, StrPath
 
 # The arrays of a file, (k, episodes), by what they are called here. Environments of others may not
 # report the last two.

@@ -4,8 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share

@@ -9,7 +9,7 @@ A number that does not exist is None, never NaN.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Literal
@@ -17,7 +17,6 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
 from sb3_quad.base.types import StrDict, StrPath
@@ -36,6 +35,17 @@ _AXES = {
     "target": "x y z",
     "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",
 }
+
+
+# The colours that tell controllers apart, the same in every plot and picture. It is Okabe and Ito's
+# palette for the colour-blind, without black and yellow, which are hard to see on dark or light
+# paper, and without green, which marks targets. A few are shifted.
+COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8A5A3B", "#7F7F7F")
+
+
+def colours_of(names: Sequence[str]) -> dict[str, str]:
+    """Return a colour, ``#rrggbb``, for each name, by its position. They repeat after eight."""
+    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
 
 
 class ControllerRecord(Frozen):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 
 Z = 1.959963984540054  # the 97.5 % quantile of the normal distribution

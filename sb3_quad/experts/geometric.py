@@ -5,8 +5,8 @@ It recovers from nearly every attitude, spin and fall, and flies to targets.
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import FloatArray
 from sb3_quad.experts.geometric_gains import TrueConstants, constants_of, derived_gains
 from sb3_quad.experts.geometric_law import fly_geometric
 from sb3_quad.experts.protocol import Actions, Expert, Scaling

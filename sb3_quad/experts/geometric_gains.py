@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle

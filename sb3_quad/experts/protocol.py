@@ -5,8 +5,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ExpertError
+from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.state import (
     BODY_RATES,

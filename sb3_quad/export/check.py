@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ExportError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.batch import QuadcopterBatch

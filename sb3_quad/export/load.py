@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
+from sb3_quad.base.types import Float32Array
 from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 

@@ -12,8 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_quad.base.arrays import FloatArray
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.evaluation.statistics import Estimate
 
 INK = "#1c2430"

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.results import Results

@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
-from sb3_quad.base.colours import COLOURS
 from sb3_quad.base.errors import ConfigError, ControllerError
-from sb3_quad.base.types import StrMapping
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
+from sb3_quad.evaluation.results import COLOURS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
 from sb3_quad.simulation.checks import per_row

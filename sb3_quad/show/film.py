@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import FloatArray, Image, StrDict
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont, ImageOps
 
-from sb3_quad.base.arrays import Image
+from sb3_quad.base.types import Image
 
 INK = (24, 32, 44)
 PLATE = (255, 255, 255, 205)

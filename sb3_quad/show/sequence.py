@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray, Image
+from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.models import span
 from sb3_quad.envs.rendering.picture import Trail

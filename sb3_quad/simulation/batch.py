@@ -6,10 +6,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import available_cpus
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import compile_notice

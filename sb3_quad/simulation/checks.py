@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import FloatArray
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 MAX_SIZE = 2048  # of a picture, pixels

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numba import float32
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.simulation.compiled import LANES, fast, inlined
 from sb3_quad.simulation.physics import rotation, store, to_body, vector
 from sb3_quad.simulation.random import random_words, standard_normals

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.state import first_rows

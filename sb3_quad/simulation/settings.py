@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.frames import ObservationSettings

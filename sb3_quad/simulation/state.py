@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import FloatArray
 from sb3_quad.simulation.physics import rotation_rows
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 

@@ -11,8 +11,8 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.simulation.state import first_rows
 

@@ -4,8 +4,8 @@ that a network can learn to predict.
 
 import numpy as np
 
-from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import Float32Array
 from sb3_quad.simulation.state import FORCE_WORLD, P, QuadcopterState
 
 UNOBSERVED = ("load", "weight", "push_x", "push_y")

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.simulation.compiled import compiled

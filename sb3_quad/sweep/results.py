@@ -19,10 +19,9 @@ import numpy as np
 import pandas as pd
 
 from sb3_quad.base import __version__
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation import metric_tables
 from sb3_quad.evaluation.learning_curves import Curve, read_curve

@@ -20,8 +20,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_quad.algorithms.networks.gradients import mean_actions, network_of
 from sb3_quad.algorithms.offset_correction import Correction, first_layer, scaling
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import FloatArray
 from sb3_quad.evaluation.flights import NEAR, fly_settings
 from sb3_quad.simulation.observation import FEATURE_NAMES, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings

@@ -19,10 +19,9 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import model_bytes, one_line, read_arrays, write_arrays, write_bytes
-from sb3_quad.base.types import Report, StrDict
+from sb3_quad.base.types import Arrays, Report, StrDict
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder

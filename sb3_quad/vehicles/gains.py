@@ -3,8 +3,7 @@
 import numpy as np
 from pydantic import PositiveFloat
 
-from sb3_quad.base.arrays import FloatArray
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen
 
 

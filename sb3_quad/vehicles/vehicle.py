@@ -7,10 +7,9 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.base.process import print_once
-from sb3_quad.base.types import StrDict, StrMapping, StrPath
+from sb3_quad.base.types import FloatArray, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.vehicles.gains import GeometricGains

@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from sb3_quad.algorithms.networks import losses
 from sb3_quad.algorithms.networks.losses import Loss
 from sb3_quad.algorithms.networks.perceptron import Perceptron
-from sb3_quad.base.arrays import Float32Array, IntArray
+from sb3_quad.base.types import Float32Array, IntArray
 
 Terms = dict[str, float]
 """The terms of a loss without their weights, and ``loss``, their weighted sum, by logged name."""

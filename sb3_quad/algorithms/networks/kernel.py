@@ -12,7 +12,7 @@ import numpy as np
 from numba import float32, uint64
 
 from sb3_quad.algorithms.networks.losses import actor_loss, auxiliary_loss, critic_loss
-from sb3_quad.base.arrays import Float32Array, IntArray
+from sb3_quad.base.types import Float32Array, IntArray
 from sb3_quad.simulation.compiled import compiled
 
 # Rows of a block: long loops, and yet a layer of 64 and its gradients fit into half a megabyte

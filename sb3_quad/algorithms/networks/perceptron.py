@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, Layers, forward, gradient
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
-from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
+from sb3_quad.base.types import Float32Array, FloatArray, IntArray
 
 # A mini-batch is cut into at most so many chunks. Their sums are added up in order, so that the
 # number of threads changes no bit.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.seeds import SCENARIO_STREAM
+from sb3_quad.base.types import FloatArray
 from sb3_quad.evaluation.scenarios.parts import Attitude, VectorDistribution, Wrench
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices

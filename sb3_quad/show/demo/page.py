@@ -16,13 +16,12 @@ import numpy as np
 from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
-from sb3_quad.base.arrays import Float32Array
-from sb3_quad.base.colours import COLOURS, colours_of
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import Float32Array, StrDict
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
+from sb3_quad.evaluation.results import COLOURS, colours_of
 from sb3_quad.export.check import make_reference
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.export.templates import render
