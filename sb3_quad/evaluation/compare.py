@@ -27,7 +27,7 @@ THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
 class Comparison(dict[str, dict[str, Metrics]]):
     """The metrics by label and task; ``str`` and notebooks show them as tables.
 
-    ``tables`` (one :class:`~sb3_quad.evaluation.tables.Table` for each task) are what is shown.
+    ``tables`` (one for each task) are what is shown.
     """
 
     tables: list[Table]
