@@ -23,7 +23,7 @@ Age = Annotated[int, Field(strict=True)]
 class PositionIntegral(Frozen, use_attribute_docstrings=True):
     """An integral s of the position error e, the observed position relative to the target.
 
-    s += ``gain`` e dt in each control step in which |e| is less than ``distance`` and the observed
+    s += ``gain`` e dt in each control step in which e is shorter than ``distance`` and the observed
     speed less than ``speed``. Each component stays within ±``limit``, and s is zero when an episode
     starts. The policy sees e + s in place of e, also in earlier frames. It flies to where e + s is
     zero, so neither a constant force nor a bias of the policy leaves a steady error. A policy that
