@@ -2,6 +2,7 @@
 
 import secrets
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,8 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
+from sb3_quad.simulation.tape import FlightTape
 from sb3_quad.simulation.tasks import TaskSpec
 
 _OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
@@ -37,8 +38,8 @@ class RowSeeds(VecEnv):
         """
         if seed is None:
             seed = secrets.randbits(32)
-        self._seeds = [*row_seeds(seed, self.num_envs)]
-        return self._seeds.copy()
+        self._seeds = list(row_seeds(seed, self.num_envs))
+        return list(self._seeds)
 
 
 class QuadcopterVecEnv(BatchEnv, RowSeeds):
@@ -71,7 +72,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self,
         n_envs: int,
         task: TaskSpec = "target_tracking",
-        task_kwargs: StrMapping | None = None,
+        task_kwargs: Mapping[str, Any] | None = None,
         staggered: bool = False,
         seed: int | None = None,
         n_threads: int | None = None,
@@ -82,7 +83,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self.render_mode = None
         self._staggered = staggered
         # The list is reused in every step; only rows that end or have just ended change.
-        self._infos: list[StrDict] = [{} for _ in range(self.batch.n)]
+        self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
@@ -144,23 +145,33 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
                 "out_of_range": out_of_range,
             }
 
+    def record(self, n_steps: int, substeps: int | None = None) -> FlightTape:
+        """Return a tape that records flights of this environment and differentiates them.
+
+        :param n_steps: control steps of a recording.
+        :param substeps: physics steps in a control step from now on; None: the vehicle's. Two take
+            half the time of four, and differ little.
+        """
+        if substeps is not None:
+            self.batch.set_substeps(substeps)
+        return FlightTape(self.batch, n_steps)
+
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the given rows, one value per row."""
         rows = self.batch.rows(indices)
+        # Attributes of rows differ by row; all others belong to the environment.
         if attr_name == "vehicle":
-            values = self.batch.vehicle_list
-        elif attr_name in _OF_ROWS:
-            values = getattr(self, attr_name)
-        else:
-            # It belongs to the environment, not to a row.
-            return [getattr(self, attr_name)] * rows.size
-        return [values[row] for row in rows]
+            return [self.batch.vehicle_list[row] for row in rows]
+        value = getattr(self, attr_name)
+        return [value[row] if attr_name in _OF_ROWS else value for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set ``target``, ``wind`` or ``noise`` of the given rows."""
+        """Set ``target`` or ``noise`` of the given rows."""
+        if attr_name not in ("target", "noise"):
+            raise AttributeError(f"{attr_name!r} cannot be set; these can: target, noise")
         self.env_method(f"set_{attr_name}", value, indices=indices)
 
     def env_method(

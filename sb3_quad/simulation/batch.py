@@ -6,21 +6,21 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import available_cpus
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import compile_notice
 from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.simulation.kernel import (
-    BATCH_ARGUMENTS,
     CHUNK,
     FLY,
     LOOK,
     OUTCOME,
     SCORE,
+    BatchArrays,
     rotor_wrenches,
     step,
 )
@@ -45,8 +45,6 @@ from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
-AnyArray: TypeAlias = npt.NDArray[Any]
-StepResult: TypeAlias = tuple[Float32Array, Float32Array, BoolArray]
 MAX_ROWS = 2**20
 MAX_THREADS = 2**16
 # A snapshot keeps these: future flight depends on nothing else.
@@ -81,7 +79,7 @@ class QuadcopterBatch:
         say.
     """
 
-    _arrays: list[Any]
+    _arrays: BatchArrays
 
     def __init__(
         self,
@@ -104,26 +102,25 @@ class QuadcopterBatch:
         self.physics_step = vehicles[0].physics_step
         self.substeps = vehicles[0].substeps
         self.randomize_numbers = self.randomize.numbers(control_step)
-        # An array without columns stands for gusts, frames or an integral that nobody asked for.
-        self.gust = np.zeros((GUST_SIZE, n * bool(self.randomize.gusts)))
+        self.gust = np.zeros((GUST_SIZE, 0 if self.randomize.gusts is None else n))
         self.wind = np.zeros((3, n))
-        self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
+        self.wind_gust = np.zeros((GUST_SIZE, 0 if self.randomize.wind_gusts is None else n))
 
         # Commands wait in a queue that is as long as the longest delay of any episode.
         longest = max(vehicle.delay for vehicle in vehicles)
         if self.randomize.delay is not None:
             longest = max(longest, int(self.randomize.delay.high))
         self.queue = np.zeros((longest, 4, n))
-        is_shorter = self.base_vehicles[P.delay] < longest
-        self.own_delays = self.randomize.delay is not None or bool(is_shorter.any())
+        same_delay = bool((self.base_vehicles[P.delay] == longest).all())
+        self.own_delays = self.randomize.delay is not None or not same_delay
 
         # The frames that a policy sees besides the present features.
         self.observation = settings.observation
         integral = self.observation.position_integral
-        depth = (self.observation.ages[-1] + 1) * self.observation.is_extended
+        depth = self.observation.ages[-1] + 1 if self.observation.is_extended else 0
         self.frames = np.zeros((n, depth, self.observation.frame_size), dtype=np.float32)
         self.ages = np.array(self.observation.ages, dtype=np.int64)
-        self.integral = np.zeros((3 * bool(integral), n))
+        self.integral = np.zeros((0 if integral is None else 3, n))
         self.integral_numbers = np.array((integral or PositionIntegral()).numbers(control_step))
         self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
 
@@ -131,8 +128,11 @@ class QuadcopterBatch:
         self.task_kwargs = dict(settings.task_kwargs or {})
         self.task_parameters, self.task_weights = resolve_tasks(self.task, self.task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
-        steps = np.atleast_1d(settings.max_episode_steps).tolist()
-        self.max_steps = np.array(repeated("max_episode_steps", steps, n), dtype=np.int64)
+        steps = settings.max_episode_steps
+        steps_of_rows = repeated(
+            "max_episode_steps", steps if isinstance(steps, list) else [steps], n
+        )
+        self.max_steps = np.array(steps_of_rows, dtype=np.int64)
         # The episodes under way may be shorter, see stagger.
         self.limits = self.max_steps.copy()
 
@@ -145,8 +145,8 @@ class QuadcopterBatch:
         self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[:, None]
         self._bind()
         self.set_noise(settings.noise)
-        self._set_scaling(0, "observation_mean", settings.observation_mean)
-        self._set_scaling(OBSERVATION_SIZE, "observation_std", settings.observation_std)
+        self._set_scaling("observation_mean", settings.observation_mean)
+        self._set_scaling("observation_std", settings.observation_std)
         with compile_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
@@ -159,27 +159,28 @@ class QuadcopterBatch:
         """
         self.distribution = settings.vehicles
         self.randomize = settings.randomize or Randomization()
-        sources = settings.vehicle
-        columns = self.n
-        if not isinstance(sources, (list, tuple)):
-            sources = [sources]
-            columns = 1
+        several = isinstance(settings.vehicle, (list, tuple))
+        sources = settings.vehicle if several else [settings.vehicle]
         vehicles = load_vehicles(sources, settings.rotor_layout)
+        for vehicle in vehicles:
+            weakest = vehicle if self.distribution is None else self.distribution.weakest(vehicle)
+            self.randomize.check(weakest)
         self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, self.n)
-        parameters = [vehicle.parameters() for vehicle in self.vehicle_list[:columns]]
-        self.base_vehicles = np.stack(parameters, axis=1)
-        self.vehicles = self.base_vehicles.copy()
-        if self.distribution is not None or self.randomize.sets_vehicle:
-            self.vehicles = np.repeat(self.base_vehicles, self.n // columns, axis=1)
 
-        # All vehicles can fly if the weakest of a distribution can.
+        columns = self.vehicle_list if several else vehicles
+        self.base_vehicles = np.stack([vehicle.parameters() for vehicle in columns], axis=1)
+        if self.distribution is not None or self.randomize.sets_vehicle:
+            self.vehicles = np.repeat(self.base_vehicles, self.n // len(columns), axis=1)
+        else:
+            self.vehicles = self.base_vehicles.copy()
+
         self.distribution_numbers = NO_DISTRIBUTION
-        weakest = vehicles
+        random_drag: Any = self.randomize.drag
         if self.distribution is not None:
             self.distribution_numbers = self.distribution.numbers()
-            weakest = [self.distribution.weakest(vehicle) for vehicle in vehicles]
-        for vehicle in weakest:
-            self.randomize.check(vehicle)
+            random_drag = random_drag or self.distribution.drag
+        own_drag = self.base_vehicles[P.drag_x : P.drag_z + 1].any()
+        self.has_drag = bool(own_drag) or random_drag is not None
         return vehicles
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
@@ -188,14 +189,24 @@ class QuadcopterBatch:
         """
         self.streams[:, self.rows(rows)] = new_streams(seeds)
 
+    def set_substeps(self, substeps: int) -> None:
+        """Set the number of physics steps in a control step, which lasts as long as before."""
+        control_step = self.physics_step * self.substeps
+        self.physics_step = control_step / substeps
+        self.substeps = substeps
+        self._bind()
+
+    def set_autoreset(self, autoreset: bool) -> None:
+        """Set whether a row that ends begins its next episode within the same step."""
+        self.autoreset = autoreset
+        self._bind()
+
     def reset(self, rows: Rows = None) -> Float32Array:
         """Begin the next episode of the given rows, None for all.
 
         :return: the observations of all rows, float32 (n, size).
         """
-        begins = np.zeros(self.n, np.bool_)
-        begins[self.rows(rows)] = True
-        return self._run(LOOK, np.zeros((self.n, 4)), begins)[0]
+        return self._look(self.rows(rows))
 
     def stagger(self) -> None:
         """Stagger the present episodes: row i of n is truncated after (n - i) / n of
@@ -207,9 +218,9 @@ class QuadcopterBatch:
         """Return the present observations, float32 (n, ``observation.size``). They are the same
         numbers, noise included, until the next step.
         """
-        return self._run(LOOK, np.zeros((self.n, 4)), np.zeros(self.n, np.bool_))[0]
+        return self._look([])
 
-    def step(self, actions: AnyArray) -> StepResult:
+    def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         """Fly a control step of every row.
 
         Where a row is done, ``outcome`` (fields total, reward, length, distance, collision,
@@ -220,36 +231,50 @@ class QuadcopterBatch:
         :return: observations float32 (n, size), rewards float32 (n,), done bool (n,): fresh arrays.
         :raises ValueError: actions of another shape, or not finite.
         """
-        return self._run(FLY, actions, np.zeros(self.n, np.bool_))
+        return self._move(FLY, actions)
 
-    def score(self, actions: AnyArray) -> StepResult:
+    def score(
+        self, actions: npt.NDArray[Any] | None = None
+    ) -> tuple[Float32Array, Float32Array, BoolArray]:
         """Score a control step that another simulator has flown and written into ``state``; else
         like :meth:`step`.
 
-        :param actions: those that the policy sees in its next observation.
+        :param actions: those that the policy sees in its next observation; None: zeros.
         """
-        return self._run(SCORE, actions, np.zeros(self.n, np.bool_))
+        return self._move(SCORE, np.zeros((self.n, 4), np.float32) if actions is None else actions)
 
-    def _run(self, mode: int, actions: AnyArray, dones: BoolArray) -> StepResult:
-        """Call the compiled step with fresh arrays for its results."""
+    def _move(
+        self, mode: int, actions: npt.NDArray[Any]
+    ) -> tuple[Float32Array, Float32Array, BoolArray]:
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):
             raise ValueError(
                 f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment"
             )
-        observations = np.empty_like(self.last_observations)
+        observations, dones = self._new_observations()
         rewards = np.empty(self.n, np.float32)
-        results = observations, rewards, dones
-        # A thread pays off from two chunks on.
-        helpers = min(self.threads, self.n // (2 * CHUNK)) - 1
-        if not share_out(step, helpers, mode, array, *results, *self._arrays):
+        if not self._step(mode, array, observations, rewards, dones):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(
                 f"actions: row {row} is {array[row].tolist()}; every number must be finite"
             )
-        return results
+        return observations, rewards, dones
 
-    def turn_rotors(self, actions: AnyArray) -> FloatArray:
+    def _look(self, resetting: Any) -> Float32Array:
+        observations, dones = self._new_observations()
+        dones[resetting] = True
+        self._step(LOOK, np.empty((0, 4), np.float32), observations, np.empty(0, np.float32), dones)
+        return observations
+
+    def _new_observations(self) -> tuple[Float32Array, BoolArray]:
+        return np.empty(self.last_observations.shape, np.float32), np.zeros(self.n, np.bool_)
+
+    def _step(self, mode: int, *arrays: npt.NDArray[Any]) -> bool:
+        # A thread pays off from two chunks on.
+        threads = min(self.threads, self.n // (2 * CHUNK))
+        return bool(share_out(step, threads - 1, mode, *arrays, *self._arrays))
+
+    def turn_rotors(self, actions: npt.NDArray[Any]) -> FloatArray:
         """Advance the rotors of row 0 by a control step, for another simulator that moves the body.
 
         It then writes the state, and :meth:`score` scores the step.
@@ -309,11 +334,6 @@ class QuadcopterBatch:
             wrench[FORCE_WORLD] += drag_forces(self.state, vehicles, self.total_wind())
         return QuadcopterState(self.state, vehicles, wrench)
 
-    @property
-    def has_drag(self) -> bool:
-        """Whether some vehicle has drag."""
-        return bool(self.vehicles[P.drag_x : P.drag_z + 1].any())
-
     def total_wrench(self) -> FloatArray:
         """Return the external wrench of this control step, (WRENCH_SIZE, n): the one that was set
         or sampled, and gusts; without drag.
@@ -341,20 +361,23 @@ class QuadcopterBatch:
 
         :raises ConfigError: the snapshot is of other environments.
         """
-        own = self.snapshot()
-        for name in {*own, *snapshot}:
-            held = _kind(snapshot.get(name))
-            fits = held == _kind(own.get(name))
+        for name in {*_KEPT, *snapshot}:
+            array: Any = snapshot.get(name)
+            own = getattr(self, name) if name in _KEPT else None
+            if array is None or own is None:
+                fits = False
+            else:
+                fits = (array.dtype, array.shape) == (own.dtype, own.shape)
             if fits and name == "task_index":
-                # These number the tasks, of which there may be fewer now.
-                fits = bool(np.isin(snapshot[name], np.arange(self.task_weights.size)).all())
+                fits = bool(((array >= 0) & (array < self.task_weights.size)).all())
             if not fits:
+                held = "missing" if array is None else f"{array.dtype} of shape {array.shape}"
                 raise ConfigError(
                     f"the saved state of the environments does not fit these ({name}: {held});"
                     " use the run's own settings"
                 )
-        for name, array in snapshot.items():
-            getattr(self, name)[...] = array
+        for name in _KEPT:
+            getattr(self, name)[...] = snapshot[name]
 
     def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
         """Move targets r_T to a position, (3,) or (rows, 3), world frame, m, until the row's next
@@ -394,45 +417,40 @@ class QuadcopterBatch:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a
         ``Noise``; 0 switches it off.
         """
+        chosen = self.rows(indices)
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
+        columns = self._columns(indices, one_for_all=not isinstance(noise, list))
         relative, additive = levels(noise)
-        relative_rows = per_row("noise", relative, self.rows(indices).size)
-        both = np.vstack([relative_rows, np.full_like(relative_rows, additive)])
-        by_row = isinstance(noise, list) or indices is not None
-        self._write_scaling(2 * OBSERVATION_SIZE, both, by_row, indices)
+        rows = per_row("noise", relative, chosen.size, None)[0]
+        self.noise_level[columns] = rows[: columns.size]
+        self.additive_level[columns] = additive
 
-    def _set_scaling(self, first: int, name: str, value: Any) -> None:
+    def _set_scaling(self, name: str, value: Any) -> None:
         """Set μ or σ of Eq. 3.16, (18,) or (n, 18); None leaves it as it is."""
         if value is None:
             return
         values = per_row(name, value, self.n, OBSERVATION_SIZE)
-        if first > 0 and (values <= 0).any():
+        target = self.mean if name == "observation_mean" else self.std
+        if target is self.std and (values <= 0).any():
             raise ConfigError(f"{name}: every value must be positive")
-        self._write_scaling(first, values, np.ndim(value) == 2, None)
+        columns = self._columns(None, one_for_all=np.ndim(value) < 2)
+        # _columns may have set rows apart, and so have moved the arrays.
+        target = self.mean if name == "observation_mean" else self.std
+        target[:, columns] = values[:, : columns.size]
 
-    def _write_scaling(self, first: int, values: FloatArray, by_row: bool, rows: Rows) -> None:
-        """Write some of the scaling, from row ``first`` of the array on.
-
-        One column serves all rows until some are set ``by_row``.
+    def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
+        """Return the columns of noise level and scaling to write for some rows. One column serves
+        all rows until they are set apart.
         """
-        if by_row and self.scaling.shape[1] < self.n:
+        if self.scaling.shape[1] < self.n:
+            if rows is None and one_for_all:
+                return np.zeros(1, dtype=np.int64)
             self.scaling = np.repeat(self.scaling, self.n, axis=1)
             self._bind()
-        part = self.scaling[first : first + len(values)]
-        if part.shape[1] == self.n:
-            part[:, self.rows(rows)] = values
-        else:
-            part[:] = values[:, :1]
+        return self.rows(rows)
 
     def _bind(self) -> None:
         self.mean = self.scaling[:OBSERVATION_SIZE]
         self.std = self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
         self.noise_level, self.additive_level = self.scaling[-2:]
-        self._arrays = [getattr(self, name) for name in BATCH_ARGUMENTS]
-
-
-def _kind(array: AnyArray | None) -> str:
-    """Return the type and shape of an array in a snapshot."""
-    if array is None:
-        return "missing"
-    return f"{array.dtype} of shape {array.shape}"
+        self._arrays = BatchArrays(*(getattr(self, name) for name in BatchArrays._fields))

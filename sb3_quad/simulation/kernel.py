@@ -8,12 +8,12 @@ so that every loop runs over all lanes: a row's numbers then never depend on how
 on where in the batch it stands.
 """
 
-import inspect
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_quad.simulation.compiled import LANES, atomic_add, compiled, inlined
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
+from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
 from sb3_quad.simulation.frames import (
     clear_frames,
     integrate_position,
@@ -32,7 +32,8 @@ from sb3_quad.simulation.physics import (
     fly,
     moment,
     motor_factor,
-    store,
+    rotation_rows,
+    to_body,
     total_thrust,
     turn_rotors,
     vector,
@@ -42,6 +43,7 @@ from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.sampling import (
     add_gusts,
     advance_gusts,
+    count_episode,
     sample_episode,
     start_episode,
 )
@@ -51,10 +53,10 @@ from sb3_quad.simulation.state import (
     WRENCH,
     WRENCH_SIZE,
     P,
+    W,
     X,
-    row_slices,
 )
-from sb3_quad.simulation.tasks import SCORED, T
+from sb3_quad.simulation.tasks import SCORED, S, T
 from sb3_quad.simulation.threads import DONE, LEFT, finish
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
@@ -80,44 +82,42 @@ OUTCOME = np.dtype(
 )
 """How the last episode of a row ended."""
 
-# The shape of each quantity of a lane, by its kind of number; an int is a number of rows.
-_CONTENTS: dict[str, dict[str, Any]] = {
-    "i8": {"row": ()},  # of the batch
-    "f8": {
-        "state": STATE_SIZE,
-        # action, then the rotor speed it commands
-        "command": 4,
-        # rotor speeds to be reached in this control step
-        "wanted_speeds": 4,
-        "thrust": 4,  # of each rotor, N
-        "wrench": WRENCH_SIZE,
-        "wind": 3,  # velocity of the air
-        "vehicle": len(PARAMETER_NAMES),
-        # motor_factor of a rotor that speeds up, and of one that slows down
-        "motor": 2,
-        "velocity_gain": (),  # dt / m
-        "rates_gain": 3,  # dt / I
-        "fall": (),  # g dt
-        "gyro": 3,  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
-        # Both divided by kF
-        "thrust_middle": (),
-        "thrust_half_range": (),
-        "speed2": (),  # the larger of |v|² and |ω|²
-        # limits and costs of the row's task
-        "scored": len(SCORED),
-        "reward": (),
-        "distance": (),
-    },
-    "f4": {
-        "mean": OBSERVATION_SIZE,  # μ of Eq. 3.16
-        "inverse_std": OBSERVATION_SIZE,  # 1 / σ
-        "noise_level": (),  # relative
-        "additive": (),  # level of the noise that is added, in σ
-        "noise": NORMALS,
-        "feature": OBSERVATION_SIZE,
-    },
-    "u4": {"word": WORDS, "stream": 4},
+# The kind of number and the shape of each quantity of a lane; an int is a number of rows.
+_CONTENTS: dict[str, tuple[str, Any]] = {
+    "row": ("i8", ()),  # of the batch
+    "state": ("f8", STATE_SIZE),
+    "command": ("f8", 4),  # action, then the rotor speed it commands
+    "wanted_speeds": ("f8", 4),  # rotor speeds to be reached in this control step
+    "thrust": ("f8", 4),  # of each rotor, N
+    "wrench": ("f8", WRENCH_SIZE),
+    "wind": ("f8", 3),  # velocity of the air
+    "vehicle": ("f8", len(PARAMETER_NAMES)),
+    "motor": ("f8", 2),  # motor_factor of a rotor that speeds up, and of one that slows down
+    "velocity_gain": ("f8", ()),  # dt / m
+    "rates_gain": ("f8", 3),  # dt / I
+    "fall": ("f8", ()),  # g dt
+    "gyro": ("f8", 3),  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
+    "thrust_middle": ("f8", ()),  # divided by kF, as is the next
+    "thrust_half_range": ("f8", ()),
+    "speed2": ("f8", ()),  # the larger of |v|² and |ω|²
+    "scored": ("f8", len(SCORED)),  # limits and costs of the row's task
+    "reward": ("f8", ()),
+    "distance": ("f8", ()),
+    "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
+    "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
+    "noise_level": ("f4", ()),  # relative
+    "additive": ("f4", ()),  # level of the noise that is added, in σ
+    "noise": ("f4", NORMALS),
+    "feature": ("f4", OBSERVATION_SIZE),
+    "word": ("u4", WORDS),  # random
+    "stream": ("u4", 4),
 }
+
+
+def _add_alias(fields: Any, whole: str, part: str, row: int, shape: Any = ()) -> None:
+    """Let ``block.part`` be the rows of ``block.whole`` (float64) from ``row`` on."""
+    place = fields[whole][1] + 8 * LANES * row
+    fields[part] = np.dtype(("f8", (*np.empty(shape).shape, LANES))), place
 
 
 def _block_type() -> Any:
@@ -126,34 +126,66 @@ def _block_type() -> Any:
     Fields alias: block.velocity is a view of some rows of block.state, so that the state is loaded
     in one loop and each quantity still has its name.
     """
-    columns = []
-    for kind, shapes in _CONTENTS.items():
-        for name, shape in shapes.items():
-            columns.append((name, kind, (*np.empty(shape).shape, LANES)))
-    fields: Any = dict(np.dtype(columns).fields or {})
-    aliases: list[tuple[str, str, int, Any]] = [
-        ("vehicle", "inertia", P.ixx, 3),
-        ("vehicle", "drag", P.drag_x, 3),
-        ("vehicle", "lift", P.thrust_coefficient, ()),
-        ("vehicle", "exact", P.exact_motors, ()),
-        ("vehicle", "radius", P.collision_radius, ()),
-        ("vehicle", "delay", P.delay, ()),
-        # The moment of each rotor per thrust, by axis
-        ("vehicle", "arm", P.roll_arm_0, (3, 4)),
-    ]
-    for whole, sizes in (("state", STATE), ("wrench", WRENCH)):
-        for name, part in row_slices(sizes).items():
-            aliases.append((whole, name, part.start, sizes[name]))
-    aliases += [("scored", name, row, ()) for row, name in enumerate(SCORED)]
-    for whole, name, row, shape in aliases:
-        # Rows of the whole, float64, from one row on
-        place = fields[whole][1] + 8 * LANES * row
-        fields[name] = np.dtype(("f8", (*np.empty(shape).shape, LANES))), place
+    whole = np.dtype(
+        [(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()]
+    )
+    fields: Any = dict(whole.fields or {})
+    for name, size in STATE.items():
+        _add_alias(fields, "state", name, getattr(X, name), size)
+    for name, size in WRENCH.items():
+        _add_alias(fields, "wrench", name, getattr(W, name), size)
+    _add_alias(fields, "vehicle", "inertia", P.ixx, 3)
+    _add_alias(fields, "vehicle", "drag", P.drag_x, 3)
+    _add_alias(fields, "vehicle", "lift", P.thrust_coefficient)
+    _add_alias(fields, "vehicle", "exact", P.exact_motors)
+    _add_alias(fields, "vehicle", "radius", P.collision_radius)
+    _add_alias(fields, "vehicle", "delay", P.delay)
+    # The moment of each rotor per thrust, by axis
+    _add_alias(fields, "vehicle", "arm", P.roll_arm_0, (3, 4))
     return np.dtype(fields)
 
 
 BLOCK = _block_type()
 _SIZE = BLOCK.itemsize
+
+
+class BatchArrays(NamedTuple):
+    """The arrays and constants of n rows that :func:`step` reads and writes.
+
+    Where a shape says 1 or n, one column may serve all rows.
+    """
+
+    state: FloatArray  # (STATE_SIZE, n), see STATE
+    # (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s
+    queue: FloatArray
+    wrench: FloatArray  # (WRENCH_SIZE, n), see WRENCH
+    vehicles: FloatArray  # (parameters, 1 or n), that fly
+    base_vehicles: FloatArray  # (parameters, 1 or n), before anything is random
+    distribution_numbers: FloatArray  # VehicleDistribution.numbers()
+    randomize_numbers: FloatArray  # Randomization.numbers()
+    gust: FloatArray  # (GUST_SIZE, 0 or n), of force
+    wind: FloatArray  # (3, n), velocity of the air without gusts, world frame, m/s
+    wind_gust: FloatArray  # (GUST_SIZE, 0 or n)
+    # (n, depth, frame size); depth 0 where an observation is the present features
+    frames: Float32Array
+    ages: IntArray  # (ages,), of the frames in an observation, control steps
+    integral: FloatArray  # (0 or 3, n), of the position
+    integral_numbers: FloatArray  # (4,), see PositionIntegral
+    streams: Any  # uint32 (4, n), see random.py
+    # (2 OBSERVATION_SIZE + 2, 1 or n): μ and σ of Eq. 3.16, relative and additive noise level
+    scaling: FloatArray
+    task_index: IntArray  # (n,), of the episodes under way
+    task_parameters: FloatArray  # (tasks, columns), see TASK
+    task_weights: FloatArray  # (tasks,), cumulative
+    returns: FloatArray  # (n,), of the episodes so far
+    limits: IntArray  # (n,), control steps of the episodes under way
+    max_steps: IntArray  # (n,), of those that follow
+    outcome: Any  # OUTCOME (n,)
+    last_observations: Float32Array  # (n, size), of the episodes that outcome tells of
+    physics_step: float  # s
+    substeps: int  # physics steps in a control step
+    own_delays: bool  # whether delays differ by row
+    autoreset: bool  # whether a row that ends begins its next episode within the same step
 
 
 @compiled
@@ -173,36 +205,8 @@ def step(
     (``inline="always"``): where LLVM inlined them, a step took 5 to 8 % longer.
 
     :param leads: whether this is the thread that returns to the batch.
-    Where a shape says 1 or n, one column may serve all rows.
-
     :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and
-        ``dones`` bool (n,) are written.
-    :param state: (STATE_SIZE, n), see :data:`.state.STATE`.
-    :param queue: (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s.
-    :param wrench: (WRENCH_SIZE, n), see :data:`.state.WRENCH`.
-    :param vehicles: (parameters, 1 or n), that fly; ``base_vehicles`` before anything is random.
-    :param distribution_numbers: :meth:`.VehicleDistribution.numbers`.
-    :param randomize_numbers: :meth:`.Randomization.numbers`.
-    :param gust: (GUST_SIZE, 0 or n), of force; ``wind_gust`` (GUST_SIZE, 0 or n) of the wind.
-    :param wind: (3, n), velocity of the air without gusts, world frame, m/s.
-    :param frames: float32 (n, depth, frame size); depth 0 where an observation is the present
-        features.
-    :param ages: int64 (ages,), of the frames in an observation, control steps.
-    :param integral: (0 or 3, n), of the position; ``integral_numbers`` (4,), see
-        :class:`.PositionIntegral`.
-    :param streams: uint32 (4, n), see :mod:`.random`.
-    :param scaling: (2 OBSERVATION_SIZE + 2, 1 or n): μ and σ of Eq. 3.16, relative and additive
-        noise level.
-    :param task_index: int64 (n,), of the episodes under way.
-    :param task_parameters: (tasks, columns), see :data:`.tasks.TASK`; ``task_weights`` (tasks,),
-        cumulative.
-    :param returns: (n,), of the episodes so far.
-    :param limits: int64 (n,), control steps of the episodes under way; ``max_steps`` (n,), of those
-        that follow.
-    :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
-    :param physics_step: s; a control step has ``substeps`` of them.
-    :param own_delays: whether delays differ by row.
-    :param autoreset: whether a row that ends begins its next episode within the same step.
+        ``dones`` bool (n,) are written; the others are :class:`BatchArrays`.
     :return: False if an action is not finite, and then nothing has happened.
     """
     n = state.shape[1]
@@ -212,9 +216,7 @@ def step(
             return False
         control[LEFT] = chunks
     blocks = new_block()
-    b = blocks[0]
-    b.row[:] = 0
-    load_constants(b, 0, 1, True, scaling, vehicles, task_index, task_parameters, physics_step)
+    load_shared(blocks[0], scaling, vehicles, task_parameters, physics_step)
 
     # The rows whose observations are due at the end: those that begin an episode, or all in LOOK.
     due = np.empty(n, np.int64)
@@ -237,24 +239,16 @@ def step(
             count = min(LANES, n - first)
             for lane in range(LANES):
                 b.row[lane] = first + min(lane, count - 1)
-            load_constants(
-                b, first, count, False, scaling, vehicles, task_index, task_parameters,
-                physics_step,
-            )  # fmt: skip
+            load_own(b, first, count, scaling, vehicles, task_index, task_parameters, physics_step)
             load_rows(state, first, count, b.state)
             if mode == FLY:
-                # Gusts add to what was set or sampled.
-                load_rows(wrench, first, count, b.wrench)
-                load_rows(wind, first, count, b.wind)
-                add_gusts(b.force_world, gust, first, count)
-                add_gusts(b.wind, wind_gust, first, count)
+                load_wrench(b, first, count, wrench, gust, wind, wind_gust)
                 _load_commands(b, first, count, actions, queue, own_delays)
                 fly(b, physics_step, substeps)
                 for k in range(X.target):
                     for lane in range(count):
                         state[k, first + lane] = b.state[k, lane]
             score(b)
-            # The noise of the observation is that of the next step.
             for lane in range(count):
                 streams[STEP, first + lane] += np.uint32(1)
             load_rows(streams, first, count, b.stream)
@@ -272,7 +266,6 @@ def step(
                         due[n_due] = i
                         n_due += 1
 
-    # Begin the episodes that are due, and observe these rows, which are not neighbours.
     for first in range(0, n_due, LANES):
         b = blocks[0]
         count = min(LANES, n_due - first)
@@ -283,6 +276,7 @@ def step(
             if dones[i]:
                 returns[i] = 0.0
                 limits[i] = max_steps[i]
+                count_episode(i, streams)
                 sample_episode(
                     i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles,
                     wrench, gust, wind, wind_gust,
@@ -292,25 +286,12 @@ def step(
                 )
                 if frames.shape[1] > 0:
                     clear_frames(i, frames, integral)
-        # Lanes behind the last row keep a row of the last block, which nobody reads.
-        for lane in range(count):
-            for k in range(STATE_SIZE):
-                b.state[k, lane] = state[k, b.row[lane]]
-            for k in range(4):
-                b.stream[k, lane] = streams[k, b.row[lane]]
-        if scaling.shape[1] > 1:
-            load_scaling(b, scaling)
-        observe(b)
+        _observe_rows(b, count, state, streams, scaling)
         _write_observations(b, count, integral, ages, frames, observations)
     atomic_add(control, DONE, taken)
     if leads:
         finish(control, chunks)
     return True
-
-
-# The arguments of a step that are attributes of a batch: all from the state on
-_ARGUMENTS = list(inspect.signature(step.py_func).parameters)
-BATCH_ARGUMENTS = _ARGUMENTS[_ARGUMENTS.index("state") :]
 
 
 @compiled
@@ -338,7 +319,23 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, o
             out[substep, 0, axis] = b.force_body[axis, 0]
             out[substep, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0)
         out[substep, 0, 2] += total_thrust(b, 0)
-        state[X.rotor_speeds : X.target, 0] = b.rotor_speeds[:, 0]
+        for rotor in range(4):
+            state[X.rotor_speeds + rotor, 0] = b.rotor_speeds[rotor, 0]
+
+
+@compiled
+def write_body(state, position, quaternion, velocity, rates):
+    """Write another simulator's pose, quaternion (x, y, z, w), and world-frame velocities into
+    column 0 of ``state``.
+    """
+    x, y, z, w = quaternion
+    body_rates = to_body(rotation_rows(w, x, y, z), rates[0], rates[1], rates[2])
+    state[X.quaternion, 0] = w
+    for axis in range(3):
+        state[X.position + axis, 0] = position[axis]
+        state[X.quaternion + 1 + axis, 0] = quaternion[axis]
+        state[X.velocity + axis, 0] = velocity[axis]
+        state[X.body_rates + axis, 0] = body_rates[axis]
 
 
 @compiled
@@ -375,33 +372,38 @@ def load_rows(source, first, count, target):
                 target[k, lane] = source[k, first + min(lane, count - 1)]
 
 
-@inlined
-def load_constants(b, first, count, shared, scaling, vehicles, task_index, tasks, dt):
-    """Load what does not change during an episode: scaling, vehicles, limits and costs.
-
-    :param shared: whether to load what is the same for all rows, once for all blocks of a call, or
-        what differs by row.
-    """
-    if (scaling.shape[1] == 1) == shared:
+@compiled(inline="always")
+def load_shared(b, scaling, vehicles, tasks, dt):
+    """Load what is the same for all rows: these loads serve all blocks of a call."""
+    b.row[:] = 0
+    if scaling.shape[1] == 1:
         load_scaling(b, scaling)
-    if (vehicles.shape[1] == 1) == shared:
-        load_vehicles(b, vehicles, first, count, dt)
-    if (tasks.shape[0] == 1) == shared:
-        # Limits and costs are the last columns of a task.
+    if vehicles.shape[1] == 1:
+        load_vehicles(b, vehicles, 0, 1, dt)
+    if tasks.shape[0] == 1:
         for lane in range(LANES):
-            task = task_index[b.row[lane]]
-            for k in range(b.scored.shape[0]):
-                b.scored[k, lane] = tasks[task, T.max_distance + k]
+            _load_task(b, lane, tasks, 0)
 
 
-@inlined
+@compiled(inline="always")
+def load_own(b, first, count, scaling, vehicles, task_index, tasks, dt):
+    """Load what differs by row."""
+    if scaling.shape[1] > 1:
+        load_scaling(b, scaling)
+    if vehicles.shape[1] > 1:
+        load_vehicles(b, vehicles, first, count, dt)
+    if tasks.shape[0] > 1:
+        for lane in range(LANES):
+            _load_task(b, lane, tasks, task_index[b.row[lane]])
+
+
+@compiled(inline="always")
 def load_vehicles(b, vehicles, first, count, dt):
     """Load the vehicles of a block, with the divisions of a control step done."""
     load_rows(vehicles, first, count, b.vehicle)
     v = b.vehicle
     for lane in range(LANES):
-        lift = b.lift[lane]
-        exact = b.exact[lane]
+        lift, exact = b.lift[lane], b.exact[lane]
         b.motor[0, lane] = motor_factor(v[P.motor_gain_up, lane], exact, dt)
         b.motor[1, lane] = motor_factor(v[P.motor_gain_down, lane], exact, dt)
         b.thrust_middle[lane] = v[P.thrust_middle, lane] / lift
@@ -409,8 +411,18 @@ def load_vehicles(b, vehicles, first, count, dt):
         b.velocity_gain[lane] = dt / v[P.mass, lane]
         b.fall[lane] = dt * v[P.gravity, lane]
         ixx, iyy, izz = vector(b.inertia, lane)
-        store(b.gyro, lane, izz - iyy, ixx - izz, iyy - ixx)
-        store(b.rates_gain, lane, dt / ixx, dt / iyy, dt / izz)
+        b.gyro[0, lane] = izz - iyy
+        b.gyro[1, lane] = ixx - izz
+        b.gyro[2, lane] = iyy - ixx
+        for axis in range(3):
+            b.rates_gain[axis, lane] = dt / b.inertia[axis, lane]
+
+
+@compiled(inline="always")
+def _load_task(b, lane, tasks, task):
+    """Load limits and costs of the task that a row is flying; they are the last of its columns."""
+    for k in range(b.scored.shape[0]):
+        b.scored[k, lane] = tasks[task, T.max_distance + k]
 
 
 @compiled
@@ -425,20 +437,28 @@ def load_scaling(b, scaling):
             b.inverse_std[k, lane] = np.float32(1.0) / np.float32(scaling[OBSERVATION_SIZE + k, i])
 
 
-@inlined
+@compiled(inline="always")
+def load_wrench(b, first, count, wrench, gust, wind, wind_gust):
+    """Load wrench and wind of a block, and add their gusts."""
+    load_rows(wrench, first, count, b.wrench)
+    load_rows(wind, first, count, b.wind)
+    add_gusts(b.force_world, gust, first, count)
+    add_gusts(b.wind, wind_gust, first, count)
+
+
+@compiled(inline="always")
 def _load_commands(b, first, count, actions, queue, own_delays):
     """Put the commands of a block into the queue, and take those that are due to
     ``b.wanted_speeds``.
 
     A command enters at the queue's end, or where delays differ at the row's own delay.
     """
-    command = b.command
-    wanted = b.wanted_speeds
-    own = b.delay
+    command, wanted, own = b.command, b.wanted_speeds, b.delay
     delay = queue.shape[0]
     for lane in range(LANES):
+        i = first + min(lane, count - 1)
         for k in range(4):
-            command[k, lane] = actions[b.row[lane], k]
+            command[k, lane] = actions[i, k]
     command_rotors(b)
     if delay == 0:
         for k in range(4):
@@ -452,19 +472,17 @@ def _load_commands(b, first, count, actions, queue, own_delays):
             here = queue[late, k, first : first + count]
             behind = queue[late + 1, k, first : first + count]
             for lane in range(count):
-                new = command[k, lane]
-                old = behind[lane]
+                new, old = command[k, lane], behind[lane]
                 here[lane] = new if own_delays and own[lane] == late + 1.0 else old
         if own_delays:
             for lane in range(LANES):
-                new = command[k, lane]
-                old = wanted[k, lane]
+                new, old = command[k, lane], wanted[k, lane]
                 wanted[k, lane] = new if own[lane] == 0.0 else old
         for lane in range(count):
             queue[delay - 1, k, first + lane] = command[k, lane]
 
 
-@inlined
+@compiled(inline="always")
 def _advance_disturbances(b, first, count, gust, wind_gust):
     """Advance the gusts of a block by a control step; those of the wind have words of their own."""
     if gust.shape[1] > 0:
@@ -474,7 +492,7 @@ def _advance_disturbances(b, first, count, gust, wind_gust):
         advance_gusts(b, wind_gust, first, count)
 
 
-@inlined
+@compiled(inline="always")
 def _advance_frames(b, first, count, actions, integral_numbers, integral, frames):
     """Keep the actions of a block and advance its position integrals, where a policy sees them."""
     if frames.shape[1] == 0:
@@ -498,12 +516,11 @@ def _write_observations(b, count, integral, ages, frames, out):
                 out[i, k] = b.feature[k, lane]
         return
     for lane in range(count):
-        i = b.row[lane]
-        since = np.int64(b.stream[STEP, lane])
+        i, since = b.row[lane], np.int64(b.stream[STEP, lane])
         observe_frames(i, since, b.feature, lane, b.inverse_std, integral, ages, frames, out)
 
 
-@inlined
+@compiled(inline="always")
 def _end_episodes(
     b, first, count, autoreset, observations, rewards, dones, returns, limits,
     outcome, last_observations,
@@ -512,18 +529,16 @@ def _end_episodes(
 
     Without autoreset the outcome is that of every row's last step.
     """
-    height = b.position[2]
-    distance = b.distance
+    height, distance, limit = b.position[2], b.distance, b.scored[S.max_distance]
     ended = 0
     for lane in range(count):
         i = first + lane
         returns[i] += b.reward[lane]
         rewards[i] = b.reward[lane]
         crashed = height[lane] <= b.radius[lane]
-        out_of_range = distance[lane] > b.max_distance[lane]
+        out_of_range = distance[lane] > limit[lane]
         dones[i] = crashed | out_of_range | (b.stream[STEP, lane] >= limits[i])
         ended += dones[i]
-    # Few episodes end, and without this part the loop above has no branches.
     if ended == 0 and autoreset:
         return ended
     for lane in range(count):
@@ -531,12 +546,33 @@ def _end_episodes(
         if autoreset and not dones[i]:
             continue
         outcome[i].collision = height[lane] <= b.radius[lane]
-        outcome[i].out_of_range = distance[lane] > b.max_distance[lane]
+        outcome[i].out_of_range = distance[lane] > limit[lane]
         outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
         outcome[i].success = outcome[i].truncated and succeeds(b, lane)
         outcome[i].distance = distance[lane]
         outcome[i].total = returns[i]
         outcome[i].reward = b.reward[lane]
         outcome[i].length = b.stream[STEP, lane]
-        last_observations[i] = observations[i]
+        for k in range(observations.shape[1]):
+            last_observations[i, k] = observations[i, k]
     return ended
+
+
+@compiled(inline="always")
+def _observe_rows(b, count, state, streams, scaling):
+    """Observe ``count`` rows of the batch, those in ``b.row``."""
+    if scaling.shape[1] > 1:
+        load_scaling(b, scaling)
+    first = b.row[0]
+    if b.row[count - 1] - first == count - 1:
+        # The rows are neighbours, since they ascend.
+        load_rows(state, first, count, b.state)
+        load_rows(streams, first, count, b.stream)
+    else:
+        # Lanes behind the last row keep a row of the last block, which nobody reads.
+        for lane in range(count):
+            for k in range(STATE_SIZE):
+                b.state[k, lane] = state[k, b.row[lane]]
+            for k in range(4):
+                b.stream[k, lane] = streams[k, b.row[lane]]
+    observe(b)

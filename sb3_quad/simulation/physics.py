@@ -17,12 +17,12 @@ three axes are written out where each axis has a formula of its own.
 
 import math
 
-from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
+from sb3_quad.simulation.compiled import LANES, compiled
 
 MAX_COORDINATE_VELOCITY = 100.0  # btMultiBody's m_maxCoordinateVelocity, m/s and rad/s
 
 
-@inlined
+@compiled(inline="always")
 def rotation_rows(qw, qx, qy, qz):
     """Return the rotation matrix of a unit quaternion, body to world, row by row."""
     return (
@@ -32,48 +32,41 @@ def rotation_rows(qw, qx, qy, qz):
     )
 
 
-@inlined
+@compiled(inline="always")
 def rotation(quaternion, lane):
     """Return the rotation matrix of a lane, body to world, row by row."""
-    qw, qx, qy, qz = four(quaternion, lane)
-    return rotation_rows(qw, qx, qy, qz)
+    return rotation_rows(
+        quaternion[0, lane], quaternion[1, lane], quaternion[2, lane], quaternion[3, lane]
+    )
 
 
-@inlined
+@compiled(inline="always")
 def vector(rows, lane):
     """Return x, y and z of a lane."""
     return rows[0, lane], rows[1, lane], rows[2, lane]
 
 
-@inlined
-def four(rows, lane):
-    """Return the four numbers of a lane, such as those of its quaternion."""
-    return rows[0, lane], rows[1, lane], rows[2, lane], rows[3, lane]
-
-
-@inlined
-def store(rows, lane, x, y, z):
-    """Write x, y and z of a lane."""
-    rows[0, lane] = x
-    rows[1, lane] = y
-    rows[2, lane] = z
-
-
-@inlined
+@compiled(inline="always")
 def to_world(r, x, y, z):
     """Rotate a vector from the body frame to the world frame."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = r
-    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+    return (
+        r[0][0] * x + r[0][1] * y + r[0][2] * z,
+        r[1][0] * x + r[1][1] * y + r[1][2] * z,
+        r[2][0] * x + r[2][1] * y + r[2][2] * z,
+    )
 
 
-@inlined
+@compiled(inline="always")
 def to_body(r, x, y, z):
     """Rotate a vector from the world frame to the body frame."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = r
-    return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
+    return (
+        r[0][0] * x + r[1][0] * y + r[2][0] * z,
+        r[0][1] * x + r[1][1] * y + r[2][1] * z,
+        r[0][2] * x + r[1][2] * y + r[2][2] * z,
+    )
 
 
-@fast
+@compiled(fastmath=True)
 def command_rotors(b):
     """Replace the actions in ``b.command`` by rotor speeds, rad/s (Eqs. 3.18 and 2.4)."""
     for lane in range(LANES):
@@ -84,7 +77,7 @@ def command_rotors(b):
             )
 
 
-@inlined
+@compiled(inline="always")
 def motor_factor(gain, exact, dt):
     """Return the share of its error that a rotor speed loses in a physics step.
 
@@ -95,7 +88,7 @@ def motor_factor(gain, exact, dt):
     return x / (1.0 + exact * (x / 2.0 + x * x / 12.0))
 
 
-@inlined
+@compiled(inline="always")
 def turn_rotors(b, lane):
     """Advance the rotor speeds of a lane by a physics step (Eq. 4.1), in place.
 
@@ -113,31 +106,30 @@ def turn_rotors(b, lane):
         b.rotor_speeds[k, lane] = new
 
 
-@inlined
+@compiled(inline="always")
 def total_thrust(b, lane):
     """Return the sum of the rotor thrusts, N."""
-    f0, f1, f2, f3 = four(b.thrust, lane)
-    return (f0 + f1) + (f2 + f3)
+    thrust = b.thrust
+    return (thrust[0, lane] + thrust[1, lane]) + (thrust[2, lane] + thrust[3, lane])
 
 
-@inlined
+@compiled(inline="always")
 def moment(b, axis, lane):
     """Return the moment of the rotor thrusts about a body axis, N m (Eq. 2.7, any layout)."""
-    a0, a1, a2, a3 = four(b.arm[axis], lane)
-    f0, f1, f2, f3 = four(b.thrust, lane)
-    return (a0 * f0 + a1 * f1) + (a2 * f2 + a3 * f3)
+    arm, thrust = b.arm[axis], b.thrust
+    return (arm[0, lane] * thrust[0, lane] + arm[1, lane] * thrust[1, lane]) + (
+        arm[2, lane] * thrust[2, lane] + arm[3, lane] * thrust[3, lane]
+    )
 
 
-@fast
+@compiled(fastmath=True)
 def accelerate(b):
     """Advance rotor speeds, velocities and body rates by a physics step, in place.
 
     :return: whether some velocity may exceed PyBullet's limit.
     """
-    v = b.velocity
-    w = b.body_rates
+    v, w, gyro, rates_gain = b.velocity, b.body_rates, b.gyro, b.rates_gain
     for lane in range(LANES):
-        # The rotors come first: their thrusts are those of this physics step.
         turn_rotors(b, lane)
         r = rotation(b.quaternion, lane)
 
@@ -153,21 +145,20 @@ def accelerate(b):
         vy += b.velocity_gain[lane] * (b.force_world[1, lane] + fy)
         vz += b.velocity_gain[lane] * (b.force_world[2, lane] + fz) - b.fall[lane]
 
-        # Euler's equations in the body frame
+        # Euler's equations in the body frame.
         gx, gy, gz = vector(b.torque_world, lane)
         tx, ty, tz = to_body(r, gx, gy, gz)
         wx, wy, wz = vector(w, lane)
-        tx += b.torque_body[0, lane] - b.gyro[0, lane] * wy * wz + moment(b, 0, lane)
-        ty += b.torque_body[1, lane] - b.gyro[1, lane] * wz * wx + moment(b, 1, lane)
-        tz += b.torque_body[2, lane] - b.gyro[2, lane] * wx * wy + moment(b, 2, lane)
-        wx += b.rates_gain[0, lane] * tx
-        wy += b.rates_gain[1, lane] * ty
-        wz += b.rates_gain[2, lane] * tz
+        tx += b.torque_body[0, lane] - gyro[0, lane] * wy * wz + moment(b, 0, lane)
+        ty += b.torque_body[1, lane] - gyro[1, lane] * wz * wx + moment(b, 1, lane)
+        tz += b.torque_body[2, lane] - gyro[2, lane] * wx * wy + moment(b, 2, lane)
+        wx += rates_gain[0, lane] * tx
+        wy += rates_gain[1, lane] * ty
+        wz += rates_gain[2, lane] * tz
 
-        store(v, lane, vx, vy, vz)
-        store(w, lane, wx, wy, wz)
+        v[0, lane], v[1, lane], v[2, lane] = vx, vy, vz
+        w[0, lane], w[1, lane], w[2, lane] = wx, wy, wz
         b.speed2[lane] = max(wx * wx + wy * wy + wz * wz, vx * vx + vy * vy + vz * vz)
-    # In a loop of its own: a sum over lanes keeps the one above from being vectorised.
     over = 0
     for lane in range(LANES):
         over += b.speed2[lane] > MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY
@@ -182,8 +173,7 @@ def _limit(value):
 @compiled
 def limit_velocities(b):
     """Limit each world component of v and ω as PyBullet does, in the rare lanes that exceed it."""
-    v = b.velocity
-    w = b.body_rates
+    v, w = b.velocity, b.body_rates
     for lane in range(LANES):
         for k in range(3):
             v[k, lane] = _limit(v[k, lane])
@@ -193,10 +183,10 @@ def limit_velocities(b):
         r = rotation(b.quaternion, lane)
         wx, wy, wz = to_world(r, wx, wy, wz)
         wx, wy, wz = to_body(r, _limit(wx), _limit(wy), _limit(wz))
-        store(w, lane, wx, wy, wz)
+        w[0, lane], w[1, lane], w[2, lane] = wx, wy, wz
 
 
-@inlined
+@compiled(inline="always")
 def quaternion_product(qw, qx, qy, qz, aw, ax, ay, az):
     """Return the product of two quaternions."""
     return (
@@ -207,18 +197,25 @@ def quaternion_product(qw, qx, qy, qz, aw, ax, ay, az):
     )
 
 
-@inlined
+@compiled(inline="always")
 def sinc_and_cosine(h2):
     """Return sin(h)/h and cos(h) of h², by their series, for h up to 0.2166."""
-    # Horner's scheme, from the last term to the first
-    sinc = 1.0 - h2 / 42.0 * (1.0 - h2 / 72.0 * (1.0 - h2 / 110.0))
-    sinc = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * sinc)
-    cosine = 1.0 - h2 / 56.0 * (1.0 - h2 / 90.0 * (1.0 - h2 / 132.0))
-    cosine = 1.0 - h2 / 2.0 * (1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * cosine))
+    # Horner's scheme, from the last term to the first.
+    sinc = 1.0 - h2 / 110.0
+    sinc = 1.0 - h2 / 72.0 * sinc
+    sinc = 1.0 - h2 / 42.0 * sinc
+    sinc = 1.0 - h2 / 20.0 * sinc
+    sinc = 1.0 - h2 / 6.0 * sinc
+    cosine = 1.0 - h2 / 132.0
+    cosine = 1.0 - h2 / 90.0 * cosine
+    cosine = 1.0 - h2 / 56.0 * cosine
+    cosine = 1.0 - h2 / 30.0 * cosine
+    cosine = 1.0 - h2 / 12.0 * cosine
+    cosine = 1.0 - h2 / 2.0 * cosine
     return sinc, cosine
 
 
-@fast
+@compiled(fastmath=True)
 def move(b, dt):
     """Move position and attitude by the new velocities, in place.
 
@@ -227,18 +224,17 @@ def move(b, dt):
     double precision. The new quaternion is off unit norm by rounding only; one step of Newton's
     method corrects it.
     """
-    q = b.quaternion
+    q, x, v, w = b.quaternion, b.position, b.velocity, b.body_rates
     half_step = 0.5 * dt
     for lane in range(LANES):
         for k in range(3):
-            b.position[k, lane] += dt * b.velocity[k, lane]
-        wx, wy, wz = vector(b.body_rates, lane)
-        hx = half_step * wx
-        hy = half_step * wy
-        hz = half_step * wz
-        sinc, cosine = sinc_and_cosine(hx * hx + hy * hy + hz * hz)
-        qw, qx, qy, qz = four(q, lane)
-        nw, nx, ny, nz = quaternion_product(qw, qx, qy, qz, cosine, sinc * hx, sinc * hy, sinc * hz)
+            x[k, lane] += dt * v[k, lane]
+        ax, ay, az = half_step * w[0, lane], half_step * w[1, lane], half_step * w[2, lane]
+        h2 = ax * ax + ay * ay + az * az
+        sinc, cosine = sinc_and_cosine(h2)
+        nw, nx, ny, nz = quaternion_product(
+            q[0, lane], q[1, lane], q[2, lane], q[3, lane], cosine, sinc * ax, sinc * ay, sinc * az
+        )
         scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
         q[0, lane] = nw * scale
         q[1, lane] = nx * scale
@@ -246,7 +242,7 @@ def move(b, dt):
         q[3, lane] = nz * scale
 
 
-@inlined
+@compiled(inline="always")
 def fly(b, physics_step, substeps):
     """Compute the physics steps of one control step of a loaded block, in place."""
     for _ in range(substeps):
