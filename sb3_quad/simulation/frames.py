@@ -20,7 +20,7 @@ MAX_AGE = 1000  # control steps
 Age = Annotated[int, Field(strict=True)]
 
 
-class PositionIntegral(Frozen, use_attribute_docstrings=True):
+class PositionIntegral(Frozen):
     """An integral s of the position error e, the observed position relative to the target.
 
     s += ``gain`` e dt in each control step in which e is shorter than ``distance`` and the observed
@@ -47,7 +47,7 @@ class PositionIntegral(Frozen, use_attribute_docstrings=True):
         return [self.gain * control_step, self.distance**2, self.speed**2, self.limit]
 
 
-class ObservationSettings(Frozen, use_attribute_docstrings=True):
+class ObservationSettings(Frozen):
     """The content of an observation; by default the 18 features alone."""
 
     last_action: bool = False

@@ -64,7 +64,7 @@ RANDOMIZATION = {
 R = first_rows(RANDOMIZATION)
 
 
-class Range(Frozen, use_attribute_docstrings=True):
+class Range(Frozen):
     """Numbers from ``low`` to ``high``. You may write ``[low, high]``, or one number."""
 
     low: Number
@@ -151,7 +151,7 @@ class Factor(Range):
 UNCHANGED = Factor(low=1.0, high=1.0)
 
 
-class RandomVector(Frozen, use_attribute_docstrings=True):
+class RandomVector(Frozen):
     """A force or torque at the centre of mass, or a wind, constant during an episode.
 
     You may write ``[low, high]`` for its magnitude alone.
@@ -197,7 +197,7 @@ class RandomVector(Frozen, use_attribute_docstrings=True):
         return [*range_numbers(self.magnitude), *units, *direction, *self.axes]
 
 
-class Gusts(Frozen, use_attribute_docstrings=True):
+class Gusts(Frozen):
     """A force, or velocity of the air, that changes at random: each component in the world frame is
     an Ornstein-Uhlenbeck process.
 
@@ -223,7 +223,7 @@ class Gusts(Frozen, use_attribute_docstrings=True):
         return self
 
 
-class Randomization(Frozen, use_attribute_docstrings=True):
+class Randomization(Frozen):
     """The dynamics and disturbances that are random, sampled for each episode from the row's own
     stream. Fields that you do not give are not random.
 

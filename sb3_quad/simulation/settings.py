@@ -34,7 +34,7 @@ Level = Annotated[float, Field(ge=0, le=100)]
 _OBSERVATION = set(ObservationSettings.model_fields)
 
 
-class Noise(Frozen, use_attribute_docstrings=True):
+class Noise(Frozen):
     """Observation noise: a feature x with scale σ (Eq. 3.16) gets the sum of two independent normal
     disturbances, with the standard deviation √((relative x)² + (additive σ)²).
 

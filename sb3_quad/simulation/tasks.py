@@ -23,7 +23,7 @@ Speed = Annotated[float, Field(ge=0, le=1e3)]  # m/s, rad/s
 Cost = Annotated[float, Field(ge=0, le=1e6)]
 
 
-class Task(Frozen, use_attribute_docstrings=True):
+class Task(Frozen):
     """A task: start distribution, reward coefficients (Eqs. 4.5-4.9) and limits; units m, s, rad.
 
     Frozen. ``task_kwargs`` of the environments override its fields by name.

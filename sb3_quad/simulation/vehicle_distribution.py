@@ -54,7 +54,7 @@ NO_DISTRIBUTION = np.zeros(sum(DISTRIBUTION_NUMBERS.values()))
 Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
-class VehicleDistribution(Frozen, use_attribute_docstrings=True):
+class VehicleDistribution(Frozen):
     """Ranges of a quadcopter's parameters. Each is ``[low, high]``, a number, or a mapping with a
     ``distribution``.
 

@@ -7,7 +7,7 @@ from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen
 
 
-class GeometricGains(Frozen, use_attribute_docstrings=True):
+class GeometricGains(Frozen):
     """The named gains of :class:`~sb3_quad.experts.geometric.GeometricExpert`.
 
     They are ``geometric_gains`` in a vehicle's YAML.

@@ -66,7 +66,7 @@ _NO_LIMITS = (0.0, 0.0)
 _FOUND = ("geometric_gains", "time_optimal")
 
 
-class Vehicle(Frozen, use_attribute_docstrings=True):
+class Vehicle(Frozen):
     """The parameters of one quadcopter, and the values that follow from them.
 
     They are those of the specification table and of thesis 4.1.1. The rotors' limits may be given
