@@ -225,7 +225,6 @@ def test_what_the_code_imports_is_declared(options):
         "yaml": "pyyaml",
         "stable_baselines3": "stable-baselines3",
         "PIL": "pillow",
-        "sb3_contrib": "sb3-contrib",
     }
     brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
     declared = requirements(options["options"]["install_requires"])

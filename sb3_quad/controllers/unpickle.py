@@ -1,33 +1,25 @@
 """A strict reader of the pickles in SB3's zips.
 
-Python's own reader calls any function that a pickle names (docs/security.md). This one interprets
-the opcodes one by one. It looks names up in the tables of this file alone. It calls only functions
-of this file, which check their arguments, and changes only objects that the same pickle has made.
-So nothing outside the result changes.
+Python's own reader calls any function that a pickle names (docs/security.md). This one is made of
+it, but knows only the opcodes that SB3's pickles use. It looks names up in the tables of this file
+alone. It calls only functions of this file, which check their arguments, and changes only objects
+that the same pickle has made. So nothing outside the result changes.
 """
 
 import base64
-import math
-import pickletools
+import io
+import pickle
+import pkgutil
 import re
 from collections import OrderedDict, deque
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium import spaces
 from numpy.random import PCG64, Generator, SeedSequence
-from stable_baselines3.common import buffers, noise, policies, torch_layers, utils
-from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
-from stable_baselines3.dqn import policies as dqn
-from stable_baselines3.her import GoalSelectionStrategy
-from stable_baselines3.her import her_replay_buffer as her
-from stable_baselines3.sac import policies as sac
-from stable_baselines3.td3 import policies as td3
-from torch import nn, optim
 
-from sb3_quad.base.errors import ConfigError, MissingExtra
-from sb3_quad.base.imports import require
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import TRUST_VARIABLE
 from sb3_quad.base.types import StrDict
 
@@ -43,11 +35,9 @@ def unpickle(text: str, where: str) -> Any:
         of that has been imported or called.
     """
     try:
-        return _interpret(base64.b64decode(text))
+        return _Reader(io.BytesIO(base64.b64decode(text))).load()
     except _UnknownName as error:
         raise ConfigError(f"{where} names {error}, which may run anything; {WAY_OUT}") from None
-    except MissingExtra:
-        raise
     except Exception as error:  # what wrong types raise depends on the types
         # Other errors' messages may show an object of the pickle, and to show it is to call it.
         reason = str(error) if isinstance(error, _Refusal) else type(error).__name__
@@ -87,14 +77,11 @@ def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) ->
 
 
 def _fill_array(array: Any, state: Any) -> None:
-    """Do what ``ndarray.__setstate__`` does."""
+    """Do what ``ndarray.__setstate__`` does, which itself trusts the state."""
     _, shape, dtype, by_columns, content = state
-    _check(isinstance(dtype, np.dtype), "an array")
-    _check(type(content) is bytes and type(by_columns) is bool, "an array")
-    is_shape = type(shape) is tuple and all(type(n) is int and n >= 0 for n in shape)
-    _check(is_shape, "the shape of an array")
-    _check(len(content) == math.prod(shape) * dtype.itemsize, "the size of an array")
-    array.__setstate__((1, shape, dtype, by_columns, content))
+    values = _array(content, dtype, shape, "F" if by_columns is True else "C")
+    _, _, checked_state = values.__reduce__()
+    array.__setstate__(checked_state)
 
 
 def _dtype(code: Any, *_: Any) -> Any:
@@ -130,46 +117,71 @@ def _set_generator(generator: Any, state: Any) -> None:
 # Tables: what a pickle may name.
 
 
-def _by_name(*classes: type) -> StrDict:
-    return {f"{kind.__module__}.{kind.__qualname__}": kind for kind in classes}
-
-
-def _members(names: dict[Any, str]) -> StrDict:
-    """Return classes by their full names.
-
-    :param names: the names of the classes in each module.
-    """
-    classes = []
-    for module, text in names.items():
-        classes += [getattr(module, name) for name in text.split()]
-    return _by_name(*classes)
+def _by_name(*names: str) -> StrDict:
+    return {name: pkgutil.resolve_name(name) for name in names}
 
 
 # Instances of these classes are made, and get attributes.
-_WITH_ATTRIBUTES = _members(
-    {
-        spaces: "Box Dict Discrete MultiBinary MultiDiscrete",
-        noise: "NormalActionNoise OrnsteinUhlenbeckActionNoise VectorizedActionNoise",
-        utils: "ConstantSchedule FloatSchedule LinearSchedule",
-    }
+_WITH_ATTRIBUTES = _by_name(
+    "gymnasium.spaces.box.Box",
+    "gymnasium.spaces.dict.Dict",
+    "gymnasium.spaces.discrete.Discrete",
+    "gymnasium.spaces.multi_binary.MultiBinary",
+    "gymnasium.spaces.multi_discrete.MultiDiscrete",
+    "stable_baselines3.common.noise.NormalActionNoise",
+    "stable_baselines3.common.noise.OrnsteinUhlenbeckActionNoise",
+    "stable_baselines3.common.noise.VectorizedActionNoise",
+    "stable_baselines3.common.utils.ConstantSchedule",
+    "stable_baselines3.common.utils.FloatSchedule",
+    "stable_baselines3.common.utils.LinearSchedule",
 )
-_NAMED = {
-    policies: "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy",
-    sac: "SACPolicy CnnPolicy MultiInputPolicy",
-    td3: "TD3Policy CnnPolicy MultiInputPolicy",
-    dqn: "DQNPolicy CnnPolicy MultiInputPolicy",
-    torch_layers: "FlattenExtractor NatureCNN CombinedExtractor",
-    buffers: ("RolloutBuffer DictRolloutBuffer ReplayBuffer DictReplayBuffer NStepReplayBuffer"),
-    her: "HerReplayBuffer",
-    nn: (
-        "CELU ELU GELU Hardswish Hardtanh LeakyReLU Mish ReLU ReLU6 SELU Sigmoid SiLU Softplus "
-        "Softsign Tanh"
-    ),
-    optim: "Adagrad Adam Adamax AdamW NAdam RAdam RMSprop SGD",
-    np: "float32 float64",
-}
 # The others of these are only named, but for TrainFreq, a named tuple.
-_CLASSES = _WITH_ATTRIBUTES | _members(_NAMED) | _by_name(RMSpropTFLike, TrainFreq)
+_CLASSES = _WITH_ATTRIBUTES | _by_name(
+    "numpy.float32",
+    "numpy.float64",
+    "stable_baselines3.common.buffers.DictReplayBuffer",
+    "stable_baselines3.common.buffers.DictRolloutBuffer",
+    "stable_baselines3.common.buffers.NStepReplayBuffer",
+    "stable_baselines3.common.buffers.ReplayBuffer",
+    "stable_baselines3.common.buffers.RolloutBuffer",
+    "stable_baselines3.common.policies.ActorCriticCnnPolicy",
+    "stable_baselines3.common.policies.ActorCriticPolicy",
+    "stable_baselines3.common.policies.MultiInputActorCriticPolicy",
+    "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
+    "stable_baselines3.common.torch_layers.CombinedExtractor",
+    "stable_baselines3.common.torch_layers.FlattenExtractor",
+    "stable_baselines3.common.torch_layers.NatureCNN",
+    "stable_baselines3.common.type_aliases.TrainFreq",
+    "stable_baselines3.sac.policies.CnnPolicy",
+    "stable_baselines3.sac.policies.MultiInputPolicy",
+    "stable_baselines3.sac.policies.SACPolicy",
+    "stable_baselines3.td3.policies.CnnPolicy",
+    "stable_baselines3.td3.policies.MultiInputPolicy",
+    "stable_baselines3.td3.policies.TD3Policy",
+    "torch.nn.modules.activation.CELU",
+    "torch.nn.modules.activation.ELU",
+    "torch.nn.modules.activation.GELU",
+    "torch.nn.modules.activation.Hardswish",
+    "torch.nn.modules.activation.Hardtanh",
+    "torch.nn.modules.activation.LeakyReLU",
+    "torch.nn.modules.activation.Mish",
+    "torch.nn.modules.activation.ReLU",
+    "torch.nn.modules.activation.ReLU6",
+    "torch.nn.modules.activation.SELU",
+    "torch.nn.modules.activation.SiLU",
+    "torch.nn.modules.activation.Sigmoid",
+    "torch.nn.modules.activation.Softplus",
+    "torch.nn.modules.activation.Softsign",
+    "torch.nn.modules.activation.Tanh",
+    "torch.optim.adagrad.Adagrad",
+    "torch.optim.adam.Adam",
+    "torch.optim.adamax.Adamax",
+    "torch.optim.adamw.AdamW",
+    "torch.optim.nadam.NAdam",
+    "torch.optim.radam.RAdam",
+    "torch.optim.rmsprop.RMSprop",
+    "torch.optim.sgd.SGD",
+)
 # The function that is called for a name. Items and state of its result follow in the pickle.
 _FUNCTIONS: StrDict = {
     "numpy.dtype": _dtype,
@@ -182,92 +194,33 @@ _FUNCTIONS: StrDict = {
     "numpy.core.multiarray.scalar": lambda dtype, content: _array(content, dtype, (), "C")[()],
     "collections.OrderedDict": lambda: OrderedDict(),
     "collections.deque": lambda _, length=None: deque(maxlen=length),
+    # A member of this enumeration is called for by its value.
+    "stable_baselines3.common.type_aliases.TrainFrequencyUnit": (
+        TrainFrequencyUnit._value2member_map_.__getitem__
+    ),
 }
-# Members of enumerations, by their values.
-for _key, _kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items():
-    _FUNCTIONS[_key] = {member.value: member for member in _kind}.__getitem__
 # Arguments of these functions, which know by themselves what they make.
-_ARGUMENTS = {key: key for key in _by_name(np.ndarray, PCG64, SeedSequence)}
-# How an object that has been made gets its state.
+_ARGUMENTS = {
+    "numpy.ndarray": "an array",
+    "numpy.random._pcg64.PCG64": "a bit generator",
+    "numpy.random.bit_generator.SeedSequence": "seeds",
+}
+_KNOWN = _CLASSES | _FUNCTIONS | _ARGUMENTS
+# How an object that has been made gets its state. For others that is by attributes.
 _CHANGES: dict[type, Any] = {
     np.ndarray: _fill_array,
     PCG64: _set_bit_generator,
     Generator: _set_generator,
     SeedSequence: lambda *_: None,
 }
-for _code in "?bhilqBHILQefdgFDG":
-    _CHANGES[type(np.dtype(_code))] = _check_dtype
-
-
-# What the opcodes do. Each function takes the items of the stack and returns what replaces them.
-
-
-def _find(module: Any, name: Any) -> Any:
-    _check(type(module) is str and type(name) is str, "a name")
-    # NumPy 2 moved its core.
-    full_name = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
-    names = _CLASSES | _FUNCTIONS | _ARGUMENTS
-    if full_name.startswith("sb3_contrib.common.recurrent."):
-        recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
-        names |= _members(
-            {
-                recurrent.policies: (
-                    "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
-                    "RecurrentMultiInputActorCriticPolicy"
-                ),
-                recurrent.buffers: "RecurrentRolloutBuffer RecurrentDictRolloutBuffer",
-            }
-        )
-    if full_name not in names:
-        raise _UnknownName(full_name.encode("unicode_escape").decode()[:200])
-    return names[full_name]
-
-
-def _call(function: Any, arguments: Any) -> Any:
-    _check(_is_one_of(function, _FUNCTIONS) and type(arguments) is tuple, "a call")
-    return function(*arguments)
-
-
-def _new(kind: Any, arguments: Any) -> Any:
-    _check(type(arguments) is tuple, "an instance")
-    if kind is TrainFreq:
-        return TrainFreq(*arguments)
-    _check(_is_one_of(kind, _WITH_ATTRIBUTES) and not arguments, "an instance")
-    return kind.__new__(kind)
-
-
-def _change(instance: Any, state: Any) -> Any:
-    kind = type(instance)
-    if kind in _CHANGES:
-        _CHANGES[kind](instance, state)
-        return instance
-    _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")
-    _check(all(type(name) is str and not name.startswith("__") for name in state), "attributes")
-    if hasattr(kind, "__setstate__"):
-        kind.__setstate__(instance, state)
-    else:
-        instance.__dict__.update(state)
-    return instance
-
-
-def _extend(items: Any, *new: Any) -> Any:
-    _check(type(items) in (list, deque), "a container")
-    items.extend(new)
-    return items
-
-
-def _update(items: Any, *new: Any) -> Any:
-    _check(type(items) in (dict, OrderedDict), "a container")
-    items.update(zip(new[::2], new[1::2], strict=True))
-    return items
-
-
-def _tuple(*items: Any) -> Any:
-    return items
-
-
-# Opcodes that push their argument.
-_LITERALS = [
+# Opcodes that only put plain values on the stack, or move what is there.
+_HARMLESS = (
+    "PROTO",
+    "FRAME",
+    "STOP",
+    "NONE",
+    "NEWTRUE",
+    "NEWFALSE",
     "BININT",
     "BININT1",
     "BININT2",
@@ -278,67 +231,109 @@ _LITERALS = [
     "SHORT_BINBYTES",
     "BINBYTES",
     "BYTEARRAY8",
-]
-# Opcodes that replace so many items of the stack by the result of a function.
-_OPERATIONS: StrDict = {
-    "NONE": (0, lambda: None),
-    "NEWTRUE": (0, lambda: True),
-    "NEWFALSE": (0, lambda: False),
-    "EMPTY_TUPLE": (0, _tuple),
-    "EMPTY_LIST": (0, list),
-    "EMPTY_DICT": (0, dict),
-    "TUPLE1": (1, _tuple),
-    "TUPLE2": (2, _tuple),
-    "TUPLE3": (3, _tuple),
-    "TUPLE": (0, _tuple),
-    "APPEND": (2, _extend),
-    "APPENDS": (1, _extend),
-    "SETITEM": (3, _update),
-    "SETITEMS": (1, _update),
-    "STACK_GLOBAL": (2, _find),
-    "REDUCE": (2, _call),
-    "NEWOBJ": (2, _new),
-    "BUILD": (2, _change),
-}
-# These replace all items above the last mark as well.
-_TO_MARK = ("TUPLE", "APPENDS", "SETITEMS")
+    "EMPTY_TUPLE",
+    "EMPTY_LIST",
+    "EMPTY_DICT",
+    "TUPLE",
+    "TUPLE1",
+    "TUPLE2",
+    "TUPLE3",
+    "MARK",
+    # The memo is how a pickle names an object twice.
+    "MEMOIZE",
+    "BINGET",
+    "LONG_BINGET",
+    # They ask _Reader.find_class.
+    "GLOBAL",
+    "STACK_GLOBAL",
+)
 
 
-def _interpret(content: bytes) -> Any:
-    """Return what a pickle holds.
+class _Reader(pickle._Unpickler):
+    """Python's reader for few opcodes, which checks what they name, call and change."""
 
-    Known are the opcodes of protocols 4 and 5 that are used for what SB3 saves.
-    """
-    memo: list[Any] = []
-    stack: list[Any] = []
-    below: list[list[Any]] = []  # the stacks below each mark
-    argument: Any
-    for opcode, argument, _ in pickletools.genops(content):
-        name = opcode.name
-        if name in _LITERALS:
-            stack.append(argument)
-        elif name in _OPERATIONS:
-            # Take the items off the stack, and push the result.
-            above: list[Any] = []
-            if name in _TO_MARK:
-                above = stack
-                stack = below.pop()
-            count, operation = _OPERATIONS[name]
-            items = [stack.pop() for _ in range(count)]
-            stack.append(operation(*reversed(items), *above))
-        elif name == "GLOBAL":
-            stack.append(_find(*argument.split(" ")))
-        # A mark begins a new stack on top of the present one.
-        elif name == "MARK":
-            below.append(stack)
-            stack = []
-        elif name == "POP":
-            stack.pop()
-        # The memo is how a pickle names an object twice.
-        elif name == "MEMOIZE":
-            memo.append(stack[-1])
-        elif name in ("BINGET", "LONG_BINGET"):
-            stack.append(memo[argument])
+    # Python's, which have no public types.
+    stack: list[Any]
+    pop_mark: Callable[[], list[Any]]
+
+    def find_class(self, module: str, name: str) -> Any:
+        # NumPy 2 moved its core.
+        full_name = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
+        if full_name not in _KNOWN:
+            raise _UnknownName(full_name.encode("unicode_escape").decode()[:200])
+        return _KNOWN[full_name]
+
+    def call(self) -> None:
+        arguments = self.stack.pop()
+        function = self.stack.pop()
+        _check(_is_one_of(function, _FUNCTIONS) and type(arguments) is tuple, "a call")
+        self.stack.append(function(*arguments))
+
+    def make(self) -> None:
+        arguments = self.stack.pop()
+        kind = self.stack.pop()
+        _check(type(arguments) is tuple, "an instance")
+        if kind is not TrainFreq:
+            _check(_is_one_of(kind, _WITH_ATTRIBUTES) and not arguments, "an instance")
+        self.stack.append(kind.__new__(kind, *arguments))
+
+    def change(self) -> None:
+        state = self.stack.pop()
+        instance = self.stack[-1]
+        kind = type(instance)
+        if isinstance(instance, np.dtype):
+            _check_dtype(instance, state)
+        elif kind in _CHANGES:
+            _CHANGES[kind](instance, state)
         else:
-            _check(name in ("PROTO", "FRAME", "STOP"), f"opcode {name}")
-    return stack.pop()
+            _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")
+            are_plain = all(type(name) is str and not name.startswith("__") for name in state)
+            _check(are_plain, "attributes")
+            if hasattr(kind, "__setstate__"):
+                kind.__setstate__(instance, state)
+            else:
+                instance.__dict__.update(state)
+
+    def drop(self) -> None:
+        # Python's would also take a mark, which no pickler writes.
+        self.stack.pop()
+
+    def append_item(self) -> None:
+        self.extend([self.stack.pop()])
+
+    def append_items(self) -> None:
+        self.extend(self.pop_mark())
+
+    def extend(self, new: list[Any]) -> None:
+        items = self.stack[-1]
+        _check(type(items) in (list, deque), "a container")
+        items.extend(new)
+
+    def set_item(self) -> None:
+        value = self.stack.pop()
+        key = self.stack.pop()
+        self.update([key, value])
+
+    def set_items(self) -> None:
+        self.update(self.pop_mark())
+
+    def update(self, new: list[Any]) -> None:
+        items = self.stack[-1]
+        _check(type(items) in (dict, OrderedDict), "a container")
+        items.update(zip(new[::2], new[1::2], strict=True))
+
+    dispatch: ClassVar[dict[int, Any]] = {
+        pickle.POP[0]: drop,
+        pickle.REDUCE[0]: call,
+        pickle.NEWOBJ[0]: make,
+        pickle.BUILD[0]: change,
+        pickle.APPEND[0]: append_item,
+        pickle.APPENDS[0]: append_items,
+        pickle.SETITEM[0]: set_item,
+        pickle.SETITEMS[0]: set_items,
+    }
+
+
+for _name in _HARMLESS:
+    _opcode = getattr(pickle, _name)[0]
+    _Reader.dispatch[_opcode] = pickle._Unpickler.dispatch[_opcode]

@@ -14,7 +14,6 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.files import one_line
-from sb3_quad.base.imports import require
 from sb3_quad.base.process import trusted
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.unpickle import unpickle
@@ -24,10 +23,8 @@ Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 # The module of the saved policy class tells the algorithm's family.
 _FAMILIES = {
     "stable_baselines3.common.policies": "PPO",
-    "sb3_contrib.common.recurrent.policies": "RecurrentPPO",
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
-    "stable_baselines3.dqn.policies": "DQN",
 }
 # This package's algorithms with their family, and a setting that only they save. Apart from that
 # their zips are those of the stock algorithm.
@@ -74,7 +71,7 @@ def _incomplete(where: str, error: Exception) -> ConfigError:
 def saved_algorithm(path: StrPath) -> str:
     """Return the name of the algorithm that made an SB3 ``.zip``.
 
-    It is PPO, A2C, SAC, TD3, DDPG, DQN or RecurrentPPO; or PPOBC, SACBC or DAgger of this package.
+    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, SACBC or DAgger of this package.
     A zip does not name its algorithm. The policy class and the settings in it tell.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an
@@ -154,20 +151,16 @@ def load_zip(
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     """Return the model in an SB3 ``.zip``, ready for ``predict``.
 
-    It may be of any algorithm of Stable-Baselines3 or of this package.
+    It may be of PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, or of this package.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown
         family, parameters that are not finite, or a file that may run code of its own.
-    :raises MissingExtra: a recurrent model, and sb3-contrib is not installed.
     """
     name = saved_algorithm(path)
     # ``predict`` of this package's algorithms is that of the stock ones.
     if name in _OURS:
         name, _ = _OURS[name]
-    library = stable_baselines3
-    if name == "RecurrentPPO":
-        library = require("sb3_contrib", "", f"model {path}")
-    algorithm: type[BaseAlgorithm] = getattr(library, name)
+    algorithm: type[BaseAlgorithm] = getattr(stable_baselines3, name)
     model = load_zip(algorithm, path, to_fly=True, device=device)
     for parameter, tensor in model.policy.state_dict().items():
         if not th.isfinite(tensor).all():

@@ -14,7 +14,7 @@ import cloudpickle
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.buffers import BaseBuffer, RolloutBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -226,9 +226,9 @@ def test_what_flying_does_not_need_is_not_even_read(key):
     assert same_actions(agent, whole)
 
 
-@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3, DDPG, DQN])
+@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3, DDPG])
 def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
-    off_policy = algorithm in (SAC, TD3, DDPG, DQN)
+    off_policy = algorithm in (SAC, TD3, DDPG)
     kwargs = {"buffer_size": 200} if off_policy else {"n_steps": 16}
     kwargs |= (
         {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}
@@ -242,9 +242,8 @@ def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
             "optimizer_class": torch.optim.SGD,
         }
     }
-    env = "CartPole-v1" if algorithm is DQN else "Pendulum-v1"
     model = algorithm(
-        "MlpPolicy", env, learning_rate=lambda progress: 1e-3 * progress, **kwargs
+        "MlpPolicy", "Pendulum-v1", learning_rate=lambda progress: 1e-3 * progress, **kwargs
     ).learn(32)
     model.save("agent.zip")
     again = load_model("agent.zip")
