@@ -51,14 +51,14 @@ def test_the_example_runs(name, tmp_path, monkeypatch):
 
 
 def test_the_page_lists_every_callback_and_its_settings_are_read():
-    from sb3_quad.base.yaml_files import parse_yaml
+    from sb3_quad.base.yaml_files import parse_keys
     from sb3_quad.training.algorithms import import_class
     from sb3_quad.training.config import build_config
 
     page = (ROOT / "docs" / "callbacks.md").read_text(encoding="utf-8")
     assert set(callbacks.__all__) <= set(re.findall(r"^\| `(\w+)`", page, flags=re.MULTILINE))
     blocks = [
-        parse_yaml(text, "page") for text in re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)
+        parse_keys(text, "page") for text in re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)
     ]
     settings = {"n_timesteps": 100, **blocks[0]}
     config = build_config("ppo_bc", "QuadStateRecovery-v0", settings)

@@ -36,6 +36,7 @@ from sb3_quad.show.demo.page import (
     pack,
     script,
 )
+from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
 STEPS = 1000  # control steps
@@ -225,7 +226,7 @@ def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path):
     env = Env(
         **{**env_kwargs(name), "task": task, "vehicle": flown, "noise": 0.0, "vehicles": None}
     )
-    start, turn = start_of(env), flown.turn_to(spec.own.layout)
+    start, turn = start_of(env), find_turn(flown, spec.own.layout)
     if (
         turn.angle
     ):  # the page flies the vehicle in its own axes, Python in those that the agent knows

@@ -133,7 +133,8 @@ def test_adaptive_scaling(run, tmp_path):
         "from sb3_quad import PIDExpert\n"
         "def make(vehicle):\n"
         "    mean = np.zeros(18); mean[0] = -0.3\n"
-        "    expert = PIDExpert(vehicle, observation_mean=mean)\n"
+        "    expert = PIDExpert(vehicle)\n"
+        "    expert.observation_mean = mean\n"
         "    return lambda observation: expert.predict(observation)[0]\n"
     )
     printed = run(

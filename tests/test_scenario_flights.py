@@ -39,7 +39,8 @@ class OnObservations:
     def __init__(self, offset=(0.0, 0.0, 0.0)):
         mean = np.zeros(18)
         mean[:3] = -np.asarray(offset)
-        self.expert = PIDExpert(observation_mean=mean)
+        self.expert = PIDExpert()
+        self.expert.observation_mean = mean
 
     def predict(self, observation, deterministic=True):
         return self.expert.predict(observation)

@@ -31,6 +31,7 @@ from sb3_quad.simulation.state import (
     QuadcopterState,
 )
 from sb3_quad.simulation.tasks import SCORED, TASK, T, Task, in_words, resolve_tasks
+from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
@@ -136,7 +137,7 @@ def features_of(state):
 @pytest.mark.parametrize("name", ["hummingbird", "crazyflie"])
 def test_turned_features_are_those_of_the_turned_vehicle(name):
     """A body whose axes are turned about z sees the same flight in its own axes."""
-    turn = load_vehicle(name).turn_to(ITM)
+    turn = find_turn(load_vehicle(name), ITM)
     state = QuadcopterState(start(50, "recovery_and_tracking", seed=2).state)
     turned = state.copy()
     angle = -turn.angle / 2.0

@@ -9,7 +9,7 @@ import yaml
 from stable_baselines3 import SAC
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.yaml_files import parse_yaml
+from sb3_quad.base.yaml_files import parse_keys
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 
@@ -24,7 +24,7 @@ TAGGED = """!!python/object/apply:collections.OrderedDict
 
 
 def test_yaml_of_rl_zoo3_is_read_without_running_it():
-    assert parse_yaml(TAGGED, "config.yml") == {
+    assert parse_keys(TAGGED, "config.yml") == {
         "env_kwargs": {"task": "state_recovery"},
         "policy_kwargs": {"activation_fn": "nn.Tanh", "net_arch": [64, 64]},
     }
@@ -43,7 +43,7 @@ def test_yaml_of_rl_zoo3_is_read_without_running_it():
 )
 def test_other_tags_are_refused(text):
     with pytest.raises(ConfigError, match=r"config\.yml: not valid YAML"):
-        parse_yaml(text, "config.yml")
+        parse_keys(text, "config.yml")
 
 
 @pytest.fixture

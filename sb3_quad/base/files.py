@@ -2,7 +2,7 @@
 
 import io
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import StrDict, StrMapping, StrPath
+from sb3_quad.base.types import StrDict, StrPath
 
 LOCK = ".lock"
 
@@ -87,18 +87,6 @@ def locked(folder: Path, what: str) -> Iterator[None]:
 def write_text(path: StrPath, text: str) -> None:
     """Write text in UTF-8 by :func:`replacing`."""
     write_bytes(path, text.encode("utf-8"))
-
-
-def write_csv(path: StrPath, columns: Iterable[str], rows: Iterable[StrMapping]) -> None:
-    """Write a table by :func:`replacing`.
-
-    A cell is empty where its row lacks the key. Keys without a column are ignored.
-    """
-    # Imported here because --help needs no tables.
-    import pandas as pd
-
-    table = pd.DataFrame(list(rows), columns=list(columns), dtype=object)
-    write_text(path, table.to_csv(index=False))
 
 
 def write_arrays(path: StrPath, compressed: bool = False, **arrays: Any) -> None:

@@ -42,24 +42,16 @@ class Loader(yaml.SafeLoader):
 Loader.add_multi_constructor("tag:yaml.org,2002:python/", Loader.construct_python)
 
 
-def parse_yaml(text: str, where: str) -> Any:
-    """Return the content of a YAML text.
-
-    :raises ConfigError: The text is not YAML. The message is one line.
-    """
-    try:
-        return yaml.load(text, Loader=Loader)
-    except Exception as error:
-        # A value that does not fit its tag may raise anything.
-        raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from None
-
-
 def parse_keys(text: str, where: str) -> dict[Any, Any]:
     """Return the keys and values of a YAML text.
 
-    :raises ConfigError: The text is not YAML, or holds something else.
+    :raises ConfigError: The text is not YAML, or holds something else. The message is one line.
     """
-    content = parse_yaml(text, where)
+    try:
+        content = yaml.load(text, Loader=Loader)
+    except Exception as error:
+        # A value that does not fit its tag may raise anything.
+        raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from None
     if not isinstance(content, dict):
         raise ConfigError(f"{where}: must hold keys and values")
     return content

@@ -24,6 +24,7 @@ from sb3_quad.base.process import TRUST_VARIABLE
 from sb3_quad.base.types import StrDict
 
 WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {TRUST_VARIABLE}=1)"
+_UNLIKE_SB3 = "is not what Stable-Baselines3 pickles"
 
 
 def unpickle(text: str, where: str) -> Any:
@@ -36,18 +37,12 @@ def unpickle(text: str, where: str) -> Any:
     """
     try:
         return _Reader(io.BytesIO(base64.b64decode(text))).load()
-    except _UnknownName as error:
-        raise ConfigError(f"{where} names {error}, which may run anything; {WAY_OUT}") from None
+    except _Refusal as error:
+        fault = str(error)
     except Exception as error:  # what wrong types raise depends on the types
-        # Other errors' messages may show an object of the pickle, and to show it is to call it.
-        reason = str(error) if isinstance(error, _Refusal) else type(error).__name__
-        raise ConfigError(
-            f"{where} is not what Stable-Baselines3 pickles ({reason}); {WAY_OUT}"
-        ) from None
-
-
-class _UnknownName(Exception):
-    """A pickle names something that is in no table."""
+        # Its message may show an object of the pickle, and to show it is to call it.
+        fault = f"{_UNLIKE_SB3} ({type(error).__name__})"
+    raise ConfigError(f"{where} {fault}; {WAY_OUT}")
 
 
 class _Refusal(Exception):
@@ -56,7 +51,7 @@ class _Refusal(Exception):
 
 def _check(fits: bool, what: str) -> None:
     if not fits:
-        raise _Refusal(what)
+        raise _Refusal(f"{_UNLIKE_SB3} ({what})")
 
 
 def _is_one_of(value: Any, names: StrDict) -> bool:
@@ -260,7 +255,8 @@ class _Reader(pickle._Unpickler):
         # NumPy 2 moved its core.
         full_name = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
         if full_name not in _KNOWN:
-            raise _UnknownName(full_name.encode("unicode_escape").decode()[:200])
+            shown = full_name.encode("unicode_escape").decode()[:200]
+            raise _Refusal(f"names {shown}, which may run anything")
         return _KNOWN[full_name]
 
     def call(self) -> None:

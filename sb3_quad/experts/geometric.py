@@ -9,7 +9,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray
 from sb3_quad.experts.geometric_gains import TrueConstants, constants_of, derived_gains
 from sb3_quad.experts.geometric_law import fly_geometric
-from sb3_quad.experts.protocol import Actions, Expert, Scaling
+from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.state import (
     FORCE_WORLD,
     WRENCH_SIZE,
@@ -68,13 +68,11 @@ class GeometricExpert(Expert):
         self,
         vehicle: VehicleSource = "itm",
         gains: GeometricGains | None = None,
-        observation_mean: Scaling = None,
-        observation_std: Scaling = None,
         privileged: bool = False,
         reserve: float = 0.0,
         late: dict[str, float] | None = None,
     ) -> None:
-        super().__init__(vehicle, observation_mean, observation_std)
+        super().__init__(vehicle)
         late = late or {}
         is_valid = privileged and reserve >= 0.0 and late.keys() <= set(GAIN_NAMES)
         if (reserve or late) and not is_valid:

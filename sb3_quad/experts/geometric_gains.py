@@ -38,7 +38,7 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
 
     The factors were found by search, for ITM, Crazyflie, Hummingbird, a vehicle with slow motors
     and vehicles of the distribution ``raptor`` together, with a privileged expert. The scales are
-    the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest angular
+    the lag τ from a command to its thrust (:func:`command_lag`); the greatest angular
     acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the
     greatest accelerations: upwards, g (c - 1), sideways at constant height, g √(c² - 1), and
     downwards, g (1 - l), with thrust limits l and c in hover thrusts.
@@ -54,7 +54,7 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
     """
     # How quickly the vehicle can turn: the weaker of roll and pitch counts.
     gravity = v[P.gravity]
-    lag = _command_lag(v, control_step)
+    lag = command_lag(v, control_step)
     roll_pitch_arms = v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)
     moments = np.abs(roll_pitch_arms).sum(axis=1) * v[P.thrust_half_range]
     turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
@@ -86,8 +86,12 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
     return np.stack([gains[name] for name in GAIN_NAMES])
 
 
-def _command_lag(v: FloatArray, control_step: float) -> FloatArray:
-    """Return ``Vehicle.command_lag`` of n vehicles, (n,), s."""
+def command_lag(v: FloatArray, control_step: float) -> FloatArray:
+    """Return the times τ from a command to its thrust, s, of parameters as for the others.
+
+    It is the delay, half the control step it is held for, and the motors' time constant: 1/k_m, the
+    mean of a rotor that speeds up and one that slows down.
+    """
     held = (v[P.delay] + 0.5) * control_step
     return np.asarray(held + 0.5 / v[P.motor_gain_up] + 0.5 / v[P.motor_gain_down])
 
@@ -102,7 +106,7 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
     arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
     mixers = np.concatenate([np.ones_like(arms[:1]), arms])
     inverse = np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0)
-    constants = (v, gains, _command_lag(v, control_step), inverse)
+    constants = (v, gains, command_lag(v, control_step), inverse)
     return LawConstants._make(np.array(values, order="C") for values in constants)
 
 
@@ -138,7 +142,7 @@ class TrueConstants:
         return self._kept
 
     def _compute(self, v: FloatArray) -> LawConstants:
-        lag = _command_lag(v, self._control_step)
+        lag = command_lag(v, self._control_step)
         lateness = np.clip((lag - _LATE_FROM) / (_LATE_TO - _LATE_FROM), 0.0, 1.0)
         gains = self._scale * gains_by_authority(v, self._control_step)
         gains *= 1.0 + (self._late - 1.0) * lateness

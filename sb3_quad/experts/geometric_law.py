@@ -158,11 +158,11 @@ def seen_later(b, omega, time):
     n_cross_b = cross(n, b)
     cosine = math.cos(rate * time)
     sine = -math.sin(rate * time)
-    along = dot(n, b) * (1.0 - cosine)
+    shares = cosine, sine, dot(n, b) * (1.0 - cosine)
     return (
-        cosine * b[0] + sine * n_cross_b[0] + along * n[0],
-        cosine * b[1] + sine * n_cross_b[1] + along * n[1],
-        cosine * b[2] + sine * n_cross_b[2] + along * n[2],
+        dot(shares, (b[0], n_cross_b[0], n[0])),
+        dot(shares, (b[1], n_cross_b[1], n[1])),
+        dot(shares, (b[2], n_cross_b[2], n[2])),
     )
 
 
@@ -217,13 +217,12 @@ def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, t
     # Scale the differences for roll and pitch until they fit; then shift the common thrust.
     least = 0.0
     most = 0.0
-    largest = 0.0
     for rotor in range(4):
         share = mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
         tilting[rotor] = share
         least = min(least, share)
         most = max(most, share)
-        largest = max(largest, abs(share))
+    largest = max(most, -least)
     scale = 1.0
     if largest > half:
         scale = half / largest

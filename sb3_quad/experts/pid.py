@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.experts.protocol import Actions, Expert, Scaling
+from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.experts.vectors import difference, rotated, rotations_at, vector_at
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.state import QuadcopterState, X
@@ -40,22 +40,14 @@ class PIDExpert(Expert):
         kd: float = 4.1,
         natural_frequency: float = 9.0,
         damping: float = 1.0,
-        observation_mean: Scaling = None,
-        observation_std: Scaling = None,
     ) -> None:
-        super().__init__(vehicle, observation_mean, observation_std)
-        gains = {
-            "kp": kp,
-            "ki": ki,
-            "kd": kd,
-            "natural_frequency": natural_frequency,
-            "damping": damping,
-        }
-        for name, value in gains.items():
-            if not 0.0 <= value < math.inf:
-                raise ConfigError(
-                    f"PIDExpert: {name} is {value}, must be a finite number of at least 0"
-                )
+        super().__init__(vehicle)
+        gains = (kp, ki, kd, natural_frequency, damping)
+        if not all(0.0 <= gain < math.inf for gain in gains):
+            raise ConfigError(
+                f"PIDExpert: kp, ki, kd, natural_frequency, damping are {gains}, must be finite "
+                "numbers of at least 0"
+            )
         # Table A.1, for any inertia (Eq. 3.15).
         v = self.vehicle
         inertia = np.asarray(v.inertia)

@@ -19,7 +19,6 @@ from sb3_quad.simulation.state import (
 from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 Actions = Float32Array
-Scaling = npt.ArrayLike | None
 Floats = npt.NDArray[np.floating]
 
 
@@ -35,24 +34,15 @@ class Expert(ABC):
 
     :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that the expert
         is designed for.
-    :param observation_mean: μ of Eq. 3.16, shape (18,), which :meth:`predict` undoes; None: the
-        environment's default.
-    :param observation_std: σ of Eq. 3.16, shape (18,), likewise.
     """
 
-    def __init__(
-        self,
-        vehicle: VehicleSource = "itm",
-        observation_mean: Scaling = None,
-        observation_std: Scaling = None,
-    ) -> None:
+    # μ and σ of Eq. 3.16, shape (18,), which `predict` undoes. They are the environments' defaults;
+    # set those of an environment that has others.
+    observation_mean: FloatArray = DEFAULT_MEAN
+    observation_std: FloatArray = DEFAULT_STD
+
+    def __init__(self, vehicle: VehicleSource = "itm") -> None:
         self.vehicle = load_vehicle(vehicle)
-        if observation_mean is None:
-            observation_mean = DEFAULT_MEAN
-        if observation_std is None:
-            observation_std = DEFAULT_STD
-        self.observation_mean = np.array(observation_mean, np.float64)
-        self.observation_std = np.array(observation_std, np.float64)
 
     @abstractmethod
     def actions(self, state: QuadcopterState) -> Actions:

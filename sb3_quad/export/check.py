@@ -24,7 +24,7 @@ from sb3_quad.simulation.observation import (
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import Task
-from sb3_quad.vehicles.layout import Turn
+from sb3_quad.vehicles.layout import Turn, find_turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
@@ -90,7 +90,7 @@ def make_reference(
         std=row.std[:, 0],
         output=output,
         observation=row.observation,
-        turn=vehicle.turn_to(layout),
+        turn=find_turn(vehicle, layout),
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 from optuna.trial import FrozenTrial
 
-from sb3_quad.base.files import write_csv, write_text
+from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrDict
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
@@ -21,11 +21,17 @@ def write_results(search: Search) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
+    # Imported here because --help needs no tables.
+    import pandas as pd
+
     folder = Path(search.job.log_folder)
     # The table is written after each trial, so that an interruption loses none.
     columns = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds"]
     columns += [*search.space.dimensions, RUN, ERROR]
-    write_csv(folder / TRIALS, columns, [_row(search, trial) for trial in search.trials()])
+    rows = [_row(search, trial) for trial in search.trials()]
+    # A cell is empty where its row lacks the key. Keys without a column are ignored.
+    table = pd.DataFrame(rows, columns=columns, dtype=object)
+    write_text(folder / TRIALS, table.to_csv(index=False))
     best = search.best
     if best is None:
         return

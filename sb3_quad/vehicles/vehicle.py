@@ -215,13 +215,6 @@ class Vehicle(Frozen):
             replaced.add("thrust_limits")
         return Vehicle.model_validate({**self.model_dump(exclude=replaced), **changes})
 
-    def turn_to(self, other: "Vehicle") -> Turn:
-        """Return the turn of the axes and the rotors' order that give it the layout of ``other``.
-
-        :raises ConfigError: there is none.
-        """
-        return find_turn(self, other)
-
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
         """Return this vehicle with axes turned about z, and rotors in the order of ``other``.
 
@@ -231,7 +224,7 @@ class Vehicle(Frozen):
         :raises ConfigError: no turn brings its rotors there; or it would turn axes of different
             moments of inertia, off which there are products of inertia.
         """
-        turn = self.turn_to(other)
+        turn = find_turn(self, other)
         if turn == Turn():
             return self
         positions = np.array(self.rotor_positions)[list(turn.order)] @ turn.axes[:2, :2].T
@@ -298,19 +291,6 @@ class Vehicle(Frozen):
         """Least and greatest speed of one rotor, rad/s (Eq. 2.4 at the thrust limits)."""
         low, high = self.thrust_range
         return math.sqrt(low / self.thrust_coefficient), math.sqrt(high / self.thrust_coefficient)
-
-    @property
-    def command_lag(self) -> float:
-        """Time τ from a command to its thrust, s.
-
-        It is the delay, half the control step it is held for, and the motors' time constant.
-        """
-        return (self.delay + 0.5) * self.control_step + self.motor_time_constant
-
-    @property
-    def motor_time_constant(self) -> float:
-        """1/k_m, the mean of a rotor that speeds up and one that slows down, s."""
-        return (1.0 / self.motor_gain_up + 1.0 / self.motor_gain_down) / 2.0
 
     @property
     def greatest_moments(self) -> FloatArray:

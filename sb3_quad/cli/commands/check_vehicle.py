@@ -115,6 +115,8 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     """Return the lines of the table: names and values."""
     import numpy as np
 
+    from sb3_quad.experts.geometric_gains import command_lag
+
     least, most = vehicle.thrust_limits
     speeds = np.array([*vehicle.rotor_speed_range, vehicle.hover_rotor_speed])
     text = PARAMETERS.format(
@@ -132,7 +134,7 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
         physical="unphysical" if vehicle.inertia_fault else "physical",
         motor_up=1000.0 / vehicle.motor_gain_up,
         motor_down=1000.0 / vehicle.motor_gain_down,
-        lag=1000.0 * vehicle.command_lag,
+        lag=1000.0 * command_lag(vehicle.parameters(), vehicle.control_step),
     )
     return [line.split(" | ") for line in text.splitlines()]
 
