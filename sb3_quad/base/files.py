@@ -1,6 +1,5 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
-import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -154,19 +153,13 @@ def make_folder(path: StrPath, what: str, flag: str) -> None:
         ) from None
 
 
-def model_bytes(model: Any) -> bytes:
-    """Return the zip that Stable-Baselines3's ``model.save`` writes."""
-    buffer = io.BytesIO()
-    model.save(buffer)
-    return buffer.getvalue()
-
-
 def save_model(model: Any, path: StrPath) -> None:
     """Save a model by :func:`replacing`.
 
     :raises ConfigError: A folder that cannot be written, or a full disk.
     """
-    write_bytes(path, model_bytes(model))
+    with replacing(path) as stream:
+        model.save(stream)
 
 
 def one_line(error: BaseException) -> str:

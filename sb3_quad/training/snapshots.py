@@ -20,7 +20,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, TrainingError
-from sb3_quad.base.files import model_bytes, one_line, read_arrays, write_arrays, write_bytes
+from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
 from sb3_quad.base.types import Arrays, Report, StrDict
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
@@ -117,7 +117,9 @@ class SnapshotFile(BaseCallback):
                     "lower learning_rate"
                 )
         self._next_taken = start + PAUSE
-        self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model))
+        model = io.BytesIO()
+        self.model.save(model)
+        self.snapshot = Snapshot(self.model.num_timesteps, model.getvalue())
         # The stores' rows are read when the snapshot is written. A rollout later they hold more,
         # and the oldest of a full store are replaced; the resumed training adds the same rows again
         # before it reads any.
