@@ -7,7 +7,13 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
+from sb3_quad.base.errors import (
+    ConfigError,
+    ControllerError,
+    ExpertError,
+    SB3QuadError,
+    raised_as,
+)
 from sb3_quad.base.types import BoolArray, Float32Array, StrDict
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
@@ -65,12 +71,11 @@ class Controller:
             raise error(f"{who}: is a class; give an instance, such as {self.name}()")
         if not isinstance(action_space, spaces.Box):
             raise error(f"action space {action_space}: a {kind} gives Box actions only")
-        sees_state = hasattr(source, "actions")
-        sees_observation = hasattr(source, "predict") or callable(source)
-        if not (sees_state or sees_observation):
+        self.needs_state = hasattr(source, "actions") and true_state is not None
+        if not (self.needs_state or hasattr(source, "predict") or callable(source)):
             raise error(
-                f"{kind} {source!r}: needs actions(state) or predict(observation), "
-                "or must be a function of observations"
+                f"{kind} {source!r}: must be a function of observations or have "
+                "predict(observation), or actions(state) if the environment has true_state()"
             )
         # SB3's models and policies have spaces. Other controllers need none.
         for name, ours in (
@@ -83,9 +88,6 @@ class Controller:
                     f"{who}: its {name.replace('_', ' ')} has shape {theirs.shape}, "
                     f"the environment's {ours.shape}"
                 )
-        self.needs_state = sees_state and true_state is not None
-        if not (self.needs_state or sees_observation):
-            raise error(f"{who}: needs the true state, and this environment has no true_state()")
 
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
@@ -140,12 +142,9 @@ class Controller:
         """
         error = ExpertError if self.kind == "expert" else ControllerError
         who = f"{self.kind} {self.name}"
-        try:
+        # A user's controller may raise anything.
+        with raised_as(error, f"{who}: fails"):
             raw = np.asarray(self._ask(observation, episode_start))
-        except SB3QuadError:
-            raise
-        except (Exception, SystemExit) as failure:  # a user's controller may raise anything
-            raise error(f"{who}: fails with {type(failure).__name__}: {failure}") from failure
 
         # Floats, integers and booleans.
         if raw.dtype.kind not in "fiub":
