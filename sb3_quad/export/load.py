@@ -16,8 +16,8 @@ import torch as th
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import Float32Array
-from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 N_ROTORS = 4
@@ -94,6 +94,7 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
             "install gcc or clang (apt install gcc)"
         )
     program = render(
+        "sb3_quad.export",
         "run.c.j2",
         name=name,
         stateful=f"}} {name}_state;".encode() in content,

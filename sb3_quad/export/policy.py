@@ -11,6 +11,7 @@ from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model, saved_algorithm
@@ -18,7 +19,6 @@ from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare, make_reference
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
-from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
@@ -114,6 +114,7 @@ def _describe(
 ) -> StrDict:
     """Return what users of the file must know; ASCII but for names."""
     text = render(
+        "sb3_quad.export",
         "metadata.j2",
         version=__version__,
         network=network,

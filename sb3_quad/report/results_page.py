@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import (
@@ -22,7 +23,7 @@ from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Reference, Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
-from sb3_quad.report.page import PAGE, Section, render, write_page
+from sb3_quad.report.page import PAGE, TEMPLATES, Section, write_page
 from sb3_quad.report.scenario_plots import (
     ControllerFlights,
     arrivals_plot,
@@ -60,7 +61,7 @@ def write_report(folder: StrPath, overwrite: bool = False) -> Path:
 
 def facts(results: Results) -> str:
     """Return how many flights there are, when and by which version, and how to read numbers."""
-    return " ".join(render("facts.txt.j2", results=results).split())
+    return " ".join(render(TEMPLATES, "facts.txt.j2", results=results).split())
 
 
 def sections(results: Results, folder: StrPath) -> list[Section]:
