@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image as Pillow
 
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
@@ -134,7 +135,7 @@ def following_cameras(
 
 def _panel(
     recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens
-) -> Iterator[Image]:
+) -> Iterator[Pillow.Image]:
     """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
     font_size = max(12, round(lens.height / 26))
     with closing(Scene(recording.vehicle)) as scene:
@@ -144,9 +145,8 @@ def _panel(
             # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
             flown = recording.state.position[: step + 1 : 2]
-            pixels = scene.picture(camera, [Trail(flown, recording.colour)])
-            lines = [_caption(recording, step)]
-            yield with_header(pixels, recording.name, lines, recording.colour, font_size)
+            picture = Pillow.fromarray(scene.picture(camera, [Trail(flown, recording.colour)]))
+            yield with_header(picture, recording, [_caption(recording, step)], font_size)
 
 
 def _caption(recording: Recording, step: int) -> str:
