@@ -168,9 +168,9 @@ def fly(
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
         control step and the actions (n, 4); its sums are ``Flights.own_reward``. A class is
         instantiated for these episodes and may remember.
-    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller of
-        another kind.
-    :raises ControllerError: a controller or reward that fails in flight.
+    :raises ConfigError: an unknown backend or keyword, or fewer than one episode.
+    :raises ControllerError: a controller of another kind, or a controller or reward that fails in
+        flight.
     """
     if n_flights < 1:
         raise ConfigError(f"n_flights {n_flights}: must be at least 1")

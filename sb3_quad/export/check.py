@@ -2,7 +2,7 @@
 difference.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -13,10 +13,7 @@ from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.observation import (
-    DEFAULT_MEAN,
-    DEFAULT_STD,
     GROUPS,
     OBSERVATION_SIZE,
     turn_features,
@@ -24,7 +21,6 @@ from sb3_quad.simulation.observation import (
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import Task
-from sb3_quad.vehicles.layout import Turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
@@ -38,23 +34,38 @@ NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
 ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
 
 
-class Reference(NamedTuple):
+class Reference:
     """A trained policy in its own environment: an exported file must agree with it.
 
-    :param mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise.
-    :param vehicle: in the layout that the policy knows.
+    :ivar vehicle: in the layout that the policy knows.
+    :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise.
+    :ivar observation: the frames that the policy sees.
+    :ivar turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
+
+    :param settings: how the policy flies.
+    :param vehicle: that it flies; its layout may be another.
     :param output: ``thrusts`` (N) or ``speeds`` (rad/s).
-    :param observation: the frames that the policy sees.
-    :param turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
+    :raises ConfigError: settings that the environment refuses, a layout that does not fit.
     """
 
-    model: BaseAlgorithm
-    vehicle: Vehicle
-    mean: FloatArray = DEFAULT_MEAN
-    std: FloatArray = DEFAULT_STD
-    output: str = "thrusts"
-    observation: ObservationSettings = ObservationSettings()
-    turn: Turn = Turn()
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        settings: FlightSettings,
+        vehicle: Vehicle,
+        output: str = "thrusts",
+    ) -> None:
+        layout = settings.layout
+        # A batch of one row checks the settings and resolves vehicle and scaling.
+        settings = settings.with_changes(vehicle=vehicle, rotor_layout=layout)
+        row = QuadcopterBatch(1, settings, n_threads=1)
+        self.model = model
+        self.output = output
+        self.vehicle = row.vehicle_list[0]
+        self.mean = row.mean[:, 0]
+        self.std = row.std[:, 0]
+        self.observation = row.observation
+        self.turn = vehicle.turn_to(layout)
 
     @property
     def own_mean(self) -> FloatArray:
@@ -69,29 +80,6 @@ class Reference(NamedTuple):
         if self.output == "thrusts":
             return thrusts
         return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
-
-
-def make_reference(
-    model: BaseAlgorithm, settings: FlightSettings, vehicle: Vehicle, output: str = "thrusts"
-) -> Reference:
-    """Return a policy in its own environment, on a vehicle whose layout may be another.
-
-    :raises ConfigError: settings that the environment refuses, a layout that does not fit.
-    """
-    # A batch of one row checks the settings and resolves vehicle and scaling.
-    layout = settings.layout
-    row = QuadcopterBatch(
-        1, settings.with_changes(vehicle=vehicle, rotor_layout=layout), n_threads=1
-    )
-    return Reference(
-        model=model,
-        vehicle=row.vehicle_list[0],
-        mean=row.mean[:, 0],
-        std=row.std[:, 0],
-        output=output,
-        observation=row.observation,
-        turn=vehicle.turn_to(layout),
-    )
 
 
 class Comparison(Hook):

@@ -21,7 +21,6 @@ from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
-from sb3_quad.vehicles.layout import Turn
 
 ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
@@ -185,8 +184,6 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
     turn = reference.turn
     linear = [layer for layer in layers if isinstance(layer, th.nn.Linear)]
-    if turn == Turn() or not linear:
-        return layers
     # One frame: the scaled features, then the last action if the policy sees it.
     observation = reference.observation
     std = reference.std

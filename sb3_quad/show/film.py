@@ -189,20 +189,21 @@ def show_in_window(
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
     forward = broadside(landmarks(recordings))
-    cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
-    # The number of the frame follows the clock, so that flights are shown in real time.
+    cameras = following_cameras(recordings, times, scene.scale, forward, lens)
     begun = time.perf_counter()
-    number = 0
-    while number < len(times):
+    for number, (seconds, camera) in enumerate(zip(times, cameras, strict=True)):
+        # The frames follow the clock, so that flights are shown in real time: each waits for its
+        # time, and those that would come too late are skipped.
+        early = begun + number / FPS - time.perf_counter()
+        if early < -1.0 / FPS:
+            continue
+        time.sleep(max(0.0, early))
         poses = []
         both = []
         for recording in recordings:
-            step = recording.at(times[number])
+            step = recording.at(seconds)
             poses.append(recording.pose(step))
             both.append(recording.vehicle_and_target(step))
         vehicles, targets = np.stack(both, axis=1)
         scene.place(poses, targets)
-        point_window(scene.client, cameras[number], vehicles.mean(axis=0))
-        # Skip the frames that would come too late.
-        number = max(number + 1, int((time.perf_counter() - begun) * FPS))
-        time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))
+        point_window(scene.client, camera, vehicles.mean(axis=0))

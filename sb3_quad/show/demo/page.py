@@ -23,7 +23,7 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.results import COLOURS, colours_of
-from sb3_quad.export.check import make_reference
+from sb3_quad.export.check import Reference
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
 from sb3_quad.simulation.state import STATE, STATE_SIZE, X
@@ -147,7 +147,7 @@ def describe(spec: ControllerSpec) -> StrDict:
         raise ConfigError(f"controller {spec.spec}: the page does not compute {further}")
     settings = agent_settings(spec.spec)[0]
     layout = settings.layout
-    reference = make_reference(load_model(spec.spec), settings, layout)
+    reference = Reference(load_model(spec.spec), settings, layout)
     network = build_network(reference, f"model {spec.spec}")
     return {
         "kind": "network",
