@@ -2,15 +2,13 @@
 difference.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ExportError
-from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict
-from sb3_quad.evaluation.flights import Hook, fly_settings
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import (
@@ -18,8 +16,7 @@ from sb3_quad.simulation.observation import (
     OBSERVATION_SIZE,
     turn_features,
 )
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -82,52 +79,13 @@ class Reference:
         return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
 
 
-class Comparison(Hook):
-    """Runs a file at each control step of the policy's flights. It keeps the file's state from a
-    flight's start to its end.
+class Comparison(NamedTuple):
+    """How much a file differs from its policy."""
 
-    :ivar error: the largest difference of any rotor so far, N or rad/s.
-    :ivar count: how many observations the file has seen.
-    """
-
-    def __init__(self, reference: Reference, call: Call) -> None:
-        self._reference = reference
-        self._call = call
-        self._turned = turn_features(reference.turn).astype(np.float32)
-        self._state = None
-        self._sure = np.True_
-        self.count = 0
-        self.error = 0.0
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        # The present frame comes first in an observation. Unscaled, it is the file's input.
-        scaled = observation[:, :OBSERVATION_SIZE]
-        features = (scaled * self._reference.std + self._reference.mean).astype(np.float32)
-        integral = self._reference.observation.position_integral
-        if integral is not None:
-            # The position integral is a part of the observed position, and the file has its own.
-            features[:, GROUPS["position"]] = state.position - state.target
-            # So close to a limit, rounding may begin to integrate one step earlier or later.
-            for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
-                norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
-                self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
-        # The file flies the vehicle in its own axes and order of rotors.
-        results, self._state = self._call(features @ self._turned, self._state)
-        self._results = results[:, self._reference.turn.order]
-        self._compared = flying & self._sure
-
-    def after_step(
-        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
-    ) -> None:
-        difference = np.abs(self._results - self._reference.results(actions))[self._compared]
-        self.error = float(np.max(difference, initial=self.error))  # NaN stays
-        self.count += len(difference)
+    error: float
+    """the largest difference of any rotor, N or rad/s"""
+    count: int
+    """how many observations the file has seen"""
 
 
 def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) -> Comparison:
@@ -156,15 +114,45 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
         observation_mean=reference.mean,
         observation_std=reference.std,
         vehicle=reference.vehicle,
-        max_episode_steps=steps,
+        max_episode_steps=ENDLESS,
     )
-    comparison = Comparison(reference, call)
-    fly_settings(reference.model, settings, row_seeds(0, max(n // steps, 1)), hooks=[comparison])
+    batch = QuadcopterBatch(max(n // steps, 1), settings, seed=0, autoreset=False)
+    observation = batch.reset()
+    flying = np.ones(batch.n, bool)
+    compared = flying.copy()
+    # The file flies the vehicle in its own axes and order of rotors.
+    turned = turn_features(reference.turn).astype(np.float32)
+    integral = reference.observation.position_integral
+    file_state = None
+    error = 0.0
+    count = 0
+    for _ in range(steps):
+        # The present frame comes first in an observation. Unscaled, it is the file's input.
+        scaled = observation[:, :OBSERVATION_SIZE]
+        features = (scaled * reference.std + reference.mean).astype(np.float32)
+        compared &= flying
+        if integral is not None:
+            # The position integral is a part of the observed position, and the file has its own.
+            state = batch.true_state()
+            features[:, GROUPS["position"]] = state.position - state.target
+            # So close to a limit, rounding may begin to integrate one step earlier or later.
+            for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
+                norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
+                compared &= np.abs(norm / limit - 1.0) > ROUNDING
+        results, file_state = call(features @ turned, file_state)
+        actions, _ = reference.model.predict(observation, deterministic=True)
+        difference = np.abs(results[:, reference.turn.order] - reference.results(actions))
+        error = float(np.max(difference[compared], initial=error))  # NaN stays
+        count += int(compared.sum())
+        # A flight that is lost ends; what follows of it is not compared.
+        actions[~flying] = 0.0
+        observation, _, lost = batch.step(actions)
+        flying &= ~lost
     allowed = TOLERANCE * float(np.ptp(reference.results([-1.0, 1.0])))
     # Negated, so that NaN fails as well.
-    if not comparison.error <= allowed:
+    if not error <= allowed:
         raise ExportError(
-            f"the exported policy differs from the trained one by {comparison.error:.3g}, "
+            f"the exported policy differs from the trained one by {error:.3g}, "
             f"{allowed:.3g} is allowed ({by}); nothing was written"
         )
-    return comparison
+    return Comparison(error, count)

@@ -109,7 +109,7 @@ def _flights_section(
         flown += f" in each of {len(scenarios)} cells"
         # A grid of several quantities has too many cells for a table.
         if len(first.cell) == 1:
-            ((key, _),) = first.cell.items()
+            (key,) = first.cell
             cells = [(f"{scenario.cell[key]:g}", [scenario]) for scenario in scenarios]
             corner = f"{axis_label(key, first)}: success (%)"
             tables.append(_share_table(SUCCESS, results, cells, corner))
@@ -160,15 +160,13 @@ def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Tab
 
 def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
     """The share of a controller in some scenarios; of several, the least and the greatest."""
-    shares = []
-    cell = Cell(words="failed")
-    for scenario in scenarios:
-        cells = measured_cells(results, label, scenario)
-        if cells is not None:
-            cell = cells[row]
-            shares.append(cell.value or 0.0)
-    if len(scenarios) == 1 or not shares:
-        return cell
+    measured = [measured_cells(results, label, scenario) for scenario in scenarios]
+    cells = [cells[row] for cells in measured if cells is not None]
+    if not cells:
+        return Cell(words="failed")
+    if len(scenarios) == 1:
+        return cells[0]
+    shares = [cell.value or 0.0 for cell in cells]
     return Cell(words=f"{min(shares):.0f} to {max(shares):.0f}")
 
 

@@ -40,7 +40,7 @@ class Recording:
     @cached_property
     def times(self) -> FloatArray:
         """Seconds since the start, (T + 1,)."""
-        return np.arange(self.state.n) * self.vehicle.control_step
+        return np.arange(self.state.n, dtype=np.float64) * self.vehicle.control_step
 
     @cached_property
     def rotor_angles(self) -> FloatArray:
