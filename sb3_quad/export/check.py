@@ -84,7 +84,7 @@ class Comparison(NamedTuple):
 
     error: float
     """the largest difference of any rotor, N or rad/s"""
-    count: int
+    n: int
     """how many observations the file has seen"""
 
 

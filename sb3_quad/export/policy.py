@@ -103,7 +103,7 @@ def export_policy(
         checked = compare(reference, call, by, n_observations)
         metadata["check"] = (
             f"largest error {checked.error:.2g} {network.unit} "
-            f"in {checked.count} observations of flights ({by})"
+            f"in {checked.n} observations of flights ({by})"
         )
         content = write(network, metadata)
     return Export(content, metadata, checked.error, network.unit, source)

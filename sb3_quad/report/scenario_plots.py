@@ -113,7 +113,7 @@ def errors_plot(
     for wrench in scenario.wrenches:
         end = wrench.start + (wrench.duration or np.inf)
         if end < scenario.duration:
-            axes.axvspan(wrench.start, end, facecolor=FORCE, edgecolor=FORCE, alpha=0.16)
+            axes.axvspan(wrench.start, end, color=FORCE, alpha=0.16)
     axes.set_ylim(bottom=0.0)
     legend(figure)
     # As many flights of each controller are recorded.
