@@ -47,7 +47,7 @@ class FromState:
 def test_the_true_state_is_collected_from_single_environments():
     env = VecMonitor(DummyVecEnv([lambda n=n: Stateful(n) for n in (0.25, 0.75)]))
     labeller = Controller.for_env(FromState(), env)
-    assert labeller.needs_state
+    assert labeller._true_state is not None
     np.testing.assert_array_equal(
         labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1)
     )
@@ -92,7 +92,7 @@ def test_the_true_state_of_the_batched_environment(wrap):
 
 def test_without_a_true_state_predict_is_asked():
     labeller = Controller.for_env(FromState(), make_vec_env(lambda: Blind(), 3))
-    assert not labeller.needs_state
+    assert labeller._true_state is None
     np.testing.assert_array_equal(labeller.labels(np.zeros((3, 18))), np.full((3, 4), -0.5))
 
 

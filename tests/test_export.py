@@ -2,6 +2,7 @@
 package.
 """
 
+import copy
 import json
 import os
 import re
@@ -29,6 +30,7 @@ from sb3_quad.export.check import Reference
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
+from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -128,15 +130,16 @@ def extended(tmp_path_factory):
     return folder
 
 
-def load(file_format, content, name):
+def load(file_format, exported, name):
     """The file as a function of observations and states, by what its users run it with."""
     if file_format == "onnx":
         pytest.importorskip("onnxruntime")
-    return {
-        "torchscript": load_torchscript,
-        "onnx": load_onnx,
-        "c": lambda it: load_header(it, name),
-    }[file_format](content)[0]
+    size = int(exported.metadata.get("state_size", 0))
+    if file_format == "c":
+        return load_header(exported.content, size, name)[0]
+    return {"torchscript": load_torchscript, "onnx": load_onnx}[file_format](
+        exported.content, size
+    )[0]
 
 
 compiled = [needs_compiler, pytest.mark.slow]
@@ -155,7 +158,7 @@ def test_it_sees_the_frames_of_the_environment_in_whole_flights(
     exported = export_policy(path, file_format, output, n_observations=3000)
     assert 0 < exported.max_error < (1e-4 if output == "thrusts" else 1e-2)
     assert "3000 observations of flights" in exported.metadata["check"]
-    file, policy = load(file_format, exported.content, kind), PPO.load(path, device="cpu")
+    file, policy = load(file_format, exported, kind), PPO.load(path, device="cpu")
     near = {"target_distance": 1.5, "nearest_target": 0.3}
     env = QuadcopterVecEnv(
         4, "target_tracking", near, noise=0.0, seed=5, max_episode_steps=1000, **sees
@@ -206,7 +209,7 @@ def test_a_file_with_another_state_is_refused(extended, monkeypatch, wrong):
             super().__init__(layers, wrong(reference, torch.zeros(1, 200))[0])
 
         def forward(self, observation, state):
-            return super().forward(observation, wrong(Reference(None, ITM), state)[1])
+            return super().forward(observation, wrong(None, state)[1])
 
     monkeypatch.setattr(network, "Network", Wrong)
     with pytest.raises(ExportError, match="differs from the trained one"):
@@ -214,9 +217,11 @@ def test_a_file_with_another_state_is_refused(extended, monkeypatch, wrong):
 
 
 def sees(reference, **changes):
-    return reference._replace(
-        observation=type(reference.observation)(**{**dict(reference.observation), **changes})
-    )
+    if reference is None:
+        return None
+    other = copy.copy(reference)
+    other.observation = ObservationSettings(**{**dict(reference.observation), **changes})
+    return other
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -237,7 +242,7 @@ def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
     expected = ITM.hover_thrust * (1.0 + 0.5 * actions)  # Eq. 3.18
     assert expected.std(axis=0).min() > 0.3  # all rotors at work
     np.testing.assert_allclose(
-        load(file_format, exported.content, kind)(physical, None)[0], expected, atol=1e-4
+        load(file_format, exported, kind)(physical, None)[0], expected, atol=1e-4
     )
     assert 0 <= exported.max_error < 1e-4
     assert f"{exported.max_error:.2g} N in " in exported.metadata["check"]
@@ -252,7 +257,7 @@ def test_speeds_give_the_thrusts_and_a_rotor_may_stand_still(zips, flight, file_
         for kind in ("thrusts", "speeds")
     ]
     thrusts, speeds = (
-        load(file_format, exported.content, "tanh")(flight[1], None)[0] for exported in contents
+        load(file_format, exported, "tanh")(flight[1], None)[0] for exported in contents
     )
     assert contents[1].unit == "rad/s" and thrusts.min() == 0.0
     np.testing.assert_allclose(vehicle.thrust_coefficient * speeds**2, thrusts, atol=1e-5)
@@ -458,7 +463,7 @@ SEEN, DONE = spaces.Box(-np.inf, np.inf, (18,), np.float32), spaces.Box(-1.0, 1.
 )
 def test_a_policy_that_cannot_fly_so_is_refused(make, message):
     with pytest.raises(ConfigError, match=message):
-        build_network(Reference(make(), ITM))
+        build_network(Reference(make(), FlightSettings(), ITM))
 
 
 @pytest.mark.parametrize(

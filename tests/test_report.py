@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from sb3_quad.base.templates import render
 from sb3_quad.cli import main
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
@@ -21,7 +22,6 @@ from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, time_row
 from sb3_quad.evaluation.results import Failure, load_results
 from sb3_quad.evaluation.scenarios.load import parse_suite
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
-from sb3_quad.report.page import render
 from sb3_quad.report.results_page import facts, sections, write_report
 
 SUITE = """
@@ -182,7 +182,7 @@ def test_the_page_is_small_and_says_what_was_flown_when_and_by_which_version(fol
         update={"controllers": [agent, *results.controllers[1:]], "failures": [failure]}
     )
     content = {"title": "title", "facts": facts(flown), "sections": sections(flown, folder)}
-    text = render("page.html.j2", **content, pictures="figures")
+    text = render("sb3_quad.report.templates", "page.html.j2", **content, pictures="figures")
     (day,) = {datetime.date.fromisoformat(entry.date) for entry in results.entries}
     assert (
         f"flown {day} by sb3_quad {results.package_version}" in text and agent.content[:12] in text

@@ -28,7 +28,6 @@ from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.show import sequence
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, HOLD, film_frames, following_cameras, frame_times, write_film
-from sb3_quad.show.labels import tag_size
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.config import load_config
 from sb3_quad.training.runs import claim_run
@@ -221,23 +220,39 @@ def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
     assert picture.shape[0] > 100 and picture.shape[1] >= 240 and picture.std() > 20
 
 
+class Plates:
+    """Notes what is drawn on a picture: texts, and the boxes around them."""
+
+    def __init__(self):
+        self.boxes, self.texts = [], []
+
+    def rounded_rectangle(self, box, radius, fill):
+        self.boxes.append(box)
+
+    def text(self, centre, text, **look):
+        self.texts.append(text)
+
+
 @pytest.mark.parametrize("size", [(300, 400), (600, 200)])
 def test_texts_of_a_sequence_are_inside_the_picture_beside_their_poses(fall, size):
     view = sequence.view_of([fall], Lens(*size))
     steps = sequence.pose_steps(fall, view)
     places, breadth = view.project(fall.state.position[steps])
-    tags = sequence.time_tags(fall, steps, view, 12)
-    assert [text for text, _ in tags] == [f"{fall.times[step]:.2f} s" for step in steps]
-    for (text, centre), own in zip(tags, places, strict=True):
-        half = 0.5 * np.array(tag_size(text, 12))
-        assert (centre >= half).all() and (centre <= np.array(size) - half).all()
-        assert 0.3 * breadth.min() < np.linalg.norm(own - centre) < 1.5 * breadth.max() + half[0]
+    drawn = Plates()
+    sequence.draw_times(drawn, fall, steps, view, 12)
+    assert drawn.texts == [f"{fall.times[step]:.2f} s" for step in steps]
+    for (left, top, right, bottom), own in zip(drawn.boxes, places, strict=True):
+        assert 0 <= left < right <= size[0] and 0 <= top < bottom <= size[1]
+        away = np.linalg.norm(own - [(left + right) / 2, (top + bottom) / 2])
+        assert 0.3 * breadth.min() < away < 1.5 * breadth.max() + (right - left) / 2
 
 
 def test_a_sequence_explains_its_signs(fall, hit, monkeypatch):
     headers = []
     monkeypatch.setattr(
-        sequence, "with_header", lambda pixels, name, lines, *look: headers.append(lines) or pixels
+        sequence,
+        "with_header",
+        lambda picture, flight, lines, size: headers.append(lines) or picture,
     )
     sequence.sequence([fall, hit], 60, 60)
     assert [header[-1] for header in headers] == [

@@ -5,7 +5,8 @@ with code 2.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 
@@ -43,6 +44,21 @@ class WorkerDied(SB3QuadError, RuntimeError):
 
 class ExportError(SB3QuadError, RuntimeError):
     """An exported policy that computes other actions than the trained one, or cannot be checked."""
+
+
+@contextmanager
+def raised_as(error: type[SB3QuadError], what: str) -> Iterator[None]:
+    """Turn whatever the code of others raises in this block into an ``error`` of one line.
+
+    :param what: Whose code it is and what it does, such as "reward energy: fails".
+    """
+    try:
+        yield
+    except SB3QuadError:
+        raise
+    except (Exception, SystemExit) as failure:
+        reason = " ".join(str(failure).split())[:200]
+        raise error(f"{what} ({type(failure).__name__}: {reason})") from failure
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:

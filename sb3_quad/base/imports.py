@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, MissingExtra
+from sb3_quad.base.errors import ConfigError, MissingExtra, raised_as
 
 
 def lazy_names(
@@ -55,14 +55,10 @@ def import_packages(packages: Iterable[str], where: str) -> None:
     :raises ConfigError: A module cannot be imported.
     """
     for package in packages:
-        try:
+        # The module's own code may raise anything.
+        with raised_as(ConfigError, f"{where} {package}: cannot be imported"):
             search_present_folder(package)
             importlib.import_module(package)
-        except (Exception, SystemExit) as error:
-            # The module's own code may raise anything.
-            raise ConfigError(
-                f"{where} {package}: cannot be imported ({type(error).__name__}: {error})"
-            ) from None
 
 
 def require(module: str, extra: str, what: str) -> Any:

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
+from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, StrDict
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
@@ -36,7 +36,7 @@ class Controller:
     :param true_state: returns the current true state; None: not available.
     :param kind: what messages call the controller. With ``"expert"``, errors are ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
-    :raises ConfigError: the source is of no kind above, or its spaces do not fit (of an expert:
+    :raises ControllerError: the source is of no kind above, or its spaces do not fit (of an expert:
         ``ExpertError``).
     """
 
@@ -50,42 +50,37 @@ class Controller:
         deterministic: bool = True,
     ) -> None:
         self.source = source
-        self.kind = kind
-        self.name = getattr(source, "__name__", type(source).__name__)
         # The ``expert=`` argument and the environment that :meth:`for_env` compares.
         self.made_for: tuple[Any, Any] = (None, None)
         self._deterministic = deterministic
-        self._true_state = true_state
+        self._true_state = true_state if hasattr(source, "actions") else None
         self._predict_state: Any = None
-        error: type[SB3QuadError] = ExpertError if kind == "expert" else ConfigError
-        who = f"{kind} {self.name}"
+        self._error: type[SB3QuadError] = ExpertError if kind == "expert" else ControllerError
+        name = getattr(source, "__name__", type(source).__name__)
+        self._who = f"{kind} {name}"
 
         # Refuse a controller that cannot work at once, not in the first step of a training.
         if isinstance(source, type):
-            raise error(f"{who}: is a class; give an instance, such as {self.name}()")
+            raise self._error(f"{self._who}: is a class; give an instance, such as {name}()")
         if not isinstance(action_space, spaces.Box):
-            raise error(f"action space {action_space}: a {kind} gives Box actions only")
-        sees_state = hasattr(source, "actions")
+            raise self._error(f"action space {action_space}: a {kind} gives Box actions only")
         sees_observation = hasattr(source, "predict") or callable(source)
-        if not (sees_state or sees_observation):
-            raise error(
-                f"{kind} {source!r}: needs actions(state) or predict(observation), "
-                "or must be a function of observations"
+        if self._true_state is None and not sees_observation:
+            raise self._error(
+                f"{kind} {source!r}: must be a function of observations or have "
+                "predict(observation), or actions(state) if the environment has true_state()"
             )
         # SB3's models and policies have spaces. Other controllers need none.
-        for name, ours in (
+        for space, ours in (
             ("observation_space", observation_space),
             ("action_space", action_space),
         ):
-            theirs = getattr(source, name, None)
+            theirs = getattr(source, space, None)
             if isinstance(theirs, spaces.Space) and theirs.shape != ours.shape:
-                raise error(
-                    f"{who}: its {name.replace('_', ' ')} has shape {theirs.shape}, "
+                raise self._error(
+                    f"{self._who}: its {space.replace('_', ' ')} has shape {theirs.shape}, "
                     f"the environment's {ours.shape}"
                 )
-        self.needs_state = sees_state and true_state is not None
-        if not (self.needs_state or sees_observation):
-            raise error(f"{who}: needs the true state, and this environment has no true_state()")
 
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
@@ -138,18 +133,15 @@ class Controller:
         :raises ControllerError: the controller fails, or its actions are not finite or not of this
             shape (of an expert: ``ExpertError``).
         """
-        error = ExpertError if self.kind == "expert" else ControllerError
-        who = f"{self.kind} {self.name}"
-        try:
+        # A user's controller may raise anything.
+        with raised_as(self._error, f"{self._who}: fails"):
             raw = np.asarray(self._ask(observation, episode_start))
-        except SB3QuadError:
-            raise
-        except (Exception, SystemExit) as failure:  # a user's controller may raise anything
-            raise error(f"{who}: fails with {type(failure).__name__}: {failure}") from failure
 
         # Floats, integers and booleans.
         if raw.dtype.kind not in "fiub":
-            raise error(f"{who}: gives actions of type {raw.dtype}, must be real numbers")
+            raise self._error(
+                f"{self._who}: gives actions of type {raw.dtype}, must be real numbers"
+            )
         # Dictionary observations have a batch axis in each entry.
         batch = observation
         if isinstance(observation, dict):
@@ -157,7 +149,7 @@ class Controller:
         shape = (len(batch), *self._action_shape)
         flat_shape = (len(batch), len(self._low))
         if raw.shape not in (shape, flat_shape):
-            raise error(f"{who}: gives actions of shape {raw.shape}, must be {shape}")
+            raise self._error(f"{self._who}: gives actions of shape {raw.shape}, must be {shape}")
         actions = raw.reshape(flat_shape).astype(np.float32)
 
         # Rows that do not matter may hold anything, such as labels of a finished flight.
@@ -166,8 +158,9 @@ class Controller:
         finite = np.isfinite(actions).all(axis=1)
         if not finite.all():
             row = int(finite.argmin())
-            raise error(
-                f"{who}: gives {actions[row].tolist()} in row {row}; every number must be finite"
+            raise self._error(
+                f"{self._who}: gives {actions[row].tolist()} in row {row}; "
+                "every number must be finite"
             )
         return actions
 
@@ -178,7 +171,7 @@ class Controller:
 
     def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
         """Return the controller's own answer, unchecked."""
-        if self.needs_state and self._true_state is not None:
+        if self._true_state is not None:
             return self.source.actions(self._true_state())
         if not hasattr(self.source, "predict"):
             return self.source(observation)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, ExpertError, raised_as, unknown
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrPath
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
@@ -50,14 +50,8 @@ def resolve_expert(
     if path.endswith(".zip"):
         return load_model(path)
     factory = import_factory(text, kind)
-    try:
+    with raised_as(ExpertError, f"{kind} {text}: the factory failed"):
         return factory(first_vehicle(vehicle, layout))
-    except SB3QuadError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise ExpertError(
-            f"{kind} {text}: the factory failed with {type(error).__name__}: {error}"
-        ) from error
 
 
 def import_factory(text: str, kind: str = "expert") -> Any:
@@ -72,11 +66,6 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         raise ConfigError(
             unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory"
         )
-    try:
+    # The module may do anything when it is imported.
+    with raised_as(ConfigError, f"{kind} {text}: cannot be imported"):
         return import_name(location)
-    except SB3QuadError:
-        raise
-    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-        raise ConfigError(
-            f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})"
-        ) from error

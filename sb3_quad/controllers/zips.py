@@ -12,8 +12,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError
-from sb3_quad.base.files import one_line
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.process import trusted
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.unpickle import unpickle
@@ -39,6 +38,7 @@ _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")
 _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}
 # SB3 and this package never save these, and loading them would import what they name.
 _NEVER_READ = ("env", "expert", "_labeller")
+DAMAGED = "not a complete SB3 zip"
 # What SB3 saves apart from policies and optimisers. Loading another one would set any attribute.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 
@@ -57,15 +57,9 @@ def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
             raise ConfigError(f"{where}: no run with an agent in this folder")
         if not Path(path).is_file():
             raise ConfigError(f"{where}: no such file")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return dict(json.loads(archive.read("data")))
-    except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise _incomplete(where, error) from None
-
-
-def _incomplete(where: str, error: Exception) -> ConfigError:
-    return ConfigError(f"{where}: not a complete SB3 zip ({type(error).__name__}: {error})")
+    # What a damaged archive raises depends on where the damage is.
+    with raised_as(ConfigError, f"{where}: {DAMAGED}"), zipfile.ZipFile(path) as archive:
+        return dict(json.loads(archive.read("data")))
 
 
 def saved_algorithm(path: StrPath) -> str:
@@ -78,10 +72,8 @@ def saved_algorithm(path: StrPath) -> str:
         unknown family.
     """
     data = saved_data(path)
-    try:
+    with raised_as(ConfigError, f"model {path}: {DAMAGED}"):
         module = str(data["policy_class"]["__module__"])
-    except (KeyError, TypeError) as error:
-        raise _incomplete(f"model {path}", error) from None
     if module not in _FAMILIES:
         raise ConfigError(
             f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}"
@@ -127,25 +119,19 @@ def load_zip(
                 objects[key] = _STAND_INS.get(key)
             else:
                 objects[key] = unpickle(entry[":serialized:"], f"{where}: its {key}")
-    # SB3 sets variables by their names, on any part of the model.
-    try:
+    # A zip whose parts do not fit raises whatever its parts raise.
+    with raised_as(ConfigError, f"{where}: cannot be loaded"), warnings.catch_warnings():
+        # SB3 takes the buffer of n-step returns, its own choice, for the user's.
+        warnings.filterwarnings("ignore", "`n_steps=")
         if data:
+            # SB3 sets variables by their names, on any part of the model.
             variables = load_from_zip_file(path, load_data=False, device="cpu")[2] or {}
             if variables.keys() - _VARIABLES:
                 raise ConfigError(
                     f"{where}: holds variables that no algorithm has; "
                     f"known are {', '.join(sorted(_VARIABLES))}"
                 )
-        with warnings.catch_warnings():
-            # SB3 takes the buffer of n-step returns, its own choice, for the user's.
-            warnings.filterwarnings("ignore", "`n_steps=")
-            return algorithm.load(path, custom_objects=objects, **kwargs)
-    except SB3QuadError:
-        raise
-    except Exception as error:  # a zip whose parts do not fit raises whatever its parts raise
-        raise ConfigError(
-            f"{where}: cannot be loaded ({type(error).__name__}: {one_line(error)})"
-        ) from error
+        return algorithm.load(path, custom_objects=objects, **kwargs)
 
 
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:

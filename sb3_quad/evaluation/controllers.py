@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
@@ -132,13 +132,9 @@ def load_reward(reward: OwnReward) -> Reward | None:
     """
     if not isinstance(reward, str):
         return reward
-    try:
+    # The module may do anything when it is imported.
+    with raised_as(ConfigError, f"reward {reward}: cannot be imported as package.module:function"):
         function = import_name(reward)
-    except (Exception, SystemExit) as error:  # the module may do anything when it is imported
-        raise ConfigError(
-            f"reward {reward}: cannot be imported as package.module:function"
-            f" ({type(error).__name__}: {error})"
-        ) from error
     if not callable(function):
         raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
     return function  # type: ignore[no-any-return]

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ConfigError, ControllerError, unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict
 from sb3_quad.controllers.controller import Controller
@@ -168,9 +168,9 @@ def fly(
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
         control step and the actions (n, 4); its sums are ``Flights.own_reward``. A class is
         instantiated for these episodes and may remember.
-    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller of
-        another kind.
-    :raises ControllerError: a controller or reward that fails in flight.
+    :raises ConfigError: an unknown backend or keyword, or fewer than one episode.
+    :raises ControllerError: a controller of another kind, or a controller or reward that fails in
+        flight.
     """
     if n_flights < 1:
         raise ConfigError(f"n_flights {n_flights}: must be at least 1")
@@ -326,10 +326,8 @@ def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -
     """Return the rewards of a function of the user's, which may do anything, as (n,) numbers."""
     # Instances of a class have no name of their own.
     name = f"reward {getattr(reward, '__name__', type(reward).__name__)}"
-    try:
+    with raised_as(ControllerError, f"{name}: fails"):
         values = np.asarray(reward(state, actions), dtype=np.float64)
-    except (Exception, SystemExit) as error:
-        raise ControllerError(f"{name}: fails with {type(error).__name__}: {error}") from error
     if values.shape != (state.n,):
         raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
     wrong = np.flatnonzero(~np.isfinite(values))

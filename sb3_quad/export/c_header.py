@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict
 from sb3_quad.export.network import Network
-from sb3_quad.export.templates import c_number, render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 WIDTH = 110  # columns
@@ -32,10 +32,12 @@ def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
     text = render(
+        "sb3_quad.export",
         "policy.h.j2",
         name=name,
         comment=_comment(metadata),
         table=_table,
+        c_number=_number,
         network=network,
         features=OBSERVATION_SIZE,
         F=F,
@@ -53,12 +55,15 @@ def _comment(metadata: StrDict) -> list[str]:
     return lines
 
 
+def _number(value: Any) -> str:
+    """The fewest digits that tell a float32 from any other."""
+    return f"{np.float32(value)!s}f"
+
+
 def _table(name: str, tensor: Any) -> str:
     values = tensor.numpy()
     size = "".join(f"[{length}]" for length in values.shape)
     # NumPy's brackets become C's braces.
-    with np.printoptions(
-        threshold=values.size, linewidth=WIDTH, formatter={"float_kind": c_number}
-    ):
+    with np.printoptions(threshold=values.size, linewidth=WIDTH, formatter={"float_kind": _number}):
         rows = np.array2string(values, separator=", ").translate(str.maketrans("[]", "{}"))
     return f"{name}{size} =\n{rows}"

@@ -8,23 +8,17 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ExportError
-from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict
-from sb3_quad.evaluation.flights import Hook, fly_settings
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.observation import (
-    DEFAULT_MEAN,
-    DEFAULT_STD,
     GROUPS,
     OBSERVATION_SIZE,
     turn_features,
 )
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.tasks import Task
-from sb3_quad.vehicles.layout import Turn, find_turn
+from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
@@ -38,23 +32,38 @@ NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
 ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
 
 
-class Reference(NamedTuple):
+class Reference:
     """A trained policy in its own environment: an exported file must agree with it.
 
-    :param mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise.
-    :param vehicle: in the layout that the policy knows.
+    :ivar vehicle: in the layout that the policy knows.
+    :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise.
+    :ivar observation: the frames that the policy sees.
+    :ivar turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
+
+    :param settings: how the policy flies.
+    :param vehicle: that it flies; its layout may be another.
     :param output: ``thrusts`` (N) or ``speeds`` (rad/s).
-    :param observation: the frames that the policy sees.
-    :param turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
+    :raises ConfigError: settings that the environment refuses, a layout that does not fit.
     """
 
-    model: BaseAlgorithm
-    vehicle: Vehicle
-    mean: FloatArray = DEFAULT_MEAN
-    std: FloatArray = DEFAULT_STD
-    output: str = "thrusts"
-    observation: ObservationSettings = ObservationSettings()
-    turn: Turn = Turn()
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        settings: FlightSettings,
+        vehicle: Vehicle,
+        output: str = "thrusts",
+    ) -> None:
+        layout = settings.layout
+        # A batch of one row checks the settings and resolves vehicle and scaling.
+        settings = settings.with_changes(vehicle=vehicle, rotor_layout=layout)
+        row = QuadcopterBatch(1, settings, n_threads=1)
+        self.model = model
+        self.output = output
+        self.vehicle = row.vehicle_list[0]
+        self.mean = row.mean[:, 0]
+        self.std = row.std[:, 0]
+        self.observation = row.observation
+        self.turn = find_turn(vehicle, layout)
 
     @property
     def own_mean(self) -> FloatArray:
@@ -71,75 +80,13 @@ class Reference(NamedTuple):
         return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
 
 
-def make_reference(
-    model: BaseAlgorithm, settings: FlightSettings, vehicle: Vehicle, output: str = "thrusts"
-) -> Reference:
-    """Return a policy in its own environment, on a vehicle whose layout may be another.
+class Comparison(NamedTuple):
+    """How much a file differs from its policy."""
 
-    :raises ConfigError: settings that the environment refuses, a layout that does not fit.
-    """
-    # A batch of one row checks the settings and resolves vehicle and scaling.
-    layout = settings.layout
-    row = QuadcopterBatch(
-        1, settings.with_changes(vehicle=vehicle, rotor_layout=layout), n_threads=1
-    )
-    return Reference(
-        model=model,
-        vehicle=row.vehicle_list[0],
-        mean=row.mean[:, 0],
-        std=row.std[:, 0],
-        output=output,
-        observation=row.observation,
-        turn=find_turn(vehicle, layout),
-    )
-
-
-class Comparison(Hook):
-    """Runs a file at each control step of the policy's flights. It keeps the file's state from a
-    flight's start to its end.
-
-    :ivar error: the largest difference of any rotor so far, N or rad/s.
-    :ivar count: how many observations the file has seen.
-    """
-
-    def __init__(self, reference: Reference, call: Call) -> None:
-        self._reference = reference
-        self._call = call
-        self._turned = turn_features(reference.turn).astype(np.float32)
-        self._state = None
-        self._sure = np.True_
-        self.count = 0
-        self.error = 0.0
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        # The present frame comes first in an observation. Unscaled, it is the file's input.
-        scaled = observation[:, :OBSERVATION_SIZE]
-        features = (scaled * self._reference.std + self._reference.mean).astype(np.float32)
-        integral = self._reference.observation.position_integral
-        if integral is not None:
-            # The position integral is a part of the observed position, and the file has its own.
-            features[:, GROUPS["position"]] = state.position - state.target
-            # So close to a limit, rounding may begin to integrate one step earlier or later.
-            for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
-                norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
-                self._sure = self._sure & (np.abs(norm / limit - 1.0) > ROUNDING)
-        # The file flies the vehicle in its own axes and order of rotors.
-        results, self._state = self._call(features @ self._turned, self._state)
-        self._results = results[:, self._reference.turn.order]
-        self._compared = flying & self._sure
-
-    def after_step(
-        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
-    ) -> None:
-        difference = np.abs(self._results - self._reference.results(actions))[self._compared]
-        self.error = float(np.max(difference, initial=self.error))  # NaN stays
-        self.count += len(difference)
+    error: float
+    """the largest difference of any rotor, N or rad/s"""
+    n: int
+    """how many observations the file has seen"""
 
 
 def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) -> Comparison:
@@ -168,15 +115,45 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
         observation_mean=reference.mean,
         observation_std=reference.std,
         vehicle=reference.vehicle,
-        max_episode_steps=steps,
+        max_episode_steps=ENDLESS,
     )
-    comparison = Comparison(reference, call)
-    fly_settings(reference.model, settings, row_seeds(0, max(n // steps, 1)), hooks=[comparison])
+    batch = QuadcopterBatch(max(n // steps, 1), settings, seed=0, autoreset=False)
+    observation = batch.reset()
+    flying = np.ones(batch.n, bool)
+    compared = flying.copy()
+    # The file flies the vehicle in its own axes and order of rotors.
+    turned = turn_features(reference.turn).astype(np.float32)
+    integral = reference.observation.position_integral
+    file_state = None
+    error = 0.0
+    count = 0
+    for _ in range(steps):
+        # The present frame comes first in an observation. Unscaled, it is the file's input.
+        scaled = observation[:, :OBSERVATION_SIZE]
+        features = (scaled * reference.std + reference.mean).astype(np.float32)
+        compared &= flying
+        if integral is not None:
+            # The position integral is a part of the observed position, and the file has its own.
+            state = batch.true_state()
+            features[:, GROUPS["position"]] = state.position - state.target
+            # So close to a limit, rounding may begin to integrate one step earlier or later.
+            for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
+                norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
+                compared &= np.abs(norm / limit - 1.0) > ROUNDING
+        results, file_state = call(features @ turned, file_state)
+        actions, _ = reference.model.predict(observation, deterministic=True)
+        difference = np.abs(results[:, reference.turn.order] - reference.results(actions))
+        error = float(np.max(difference[compared], initial=error))  # NaN stays
+        count += int(compared.sum())
+        # A flight that is lost ends; what follows of it is not compared.
+        actions[~flying] = 0.0
+        observation, _, lost = batch.step(actions)
+        flying &= ~lost
     allowed = TOLERANCE * float(np.ptp(reference.results([-1.0, 1.0])))
     # Negated, so that NaN fails as well.
-    if not comparison.error <= allowed:
+    if not error <= allowed:
         raise ExportError(
-            f"the exported policy differs from the trained one by {comparison.error:.3g}, "
+            f"the exported policy differs from the trained one by {error:.3g}, "
             f"{allowed:.3g} is allowed ({by}); nothing was written"
         )
-    return comparison
+    return Comparison(error, count)

@@ -2,7 +2,6 @@
 
 import ctypes
 import io
-import json
 import shutil
 import subprocess
 import tempfile
@@ -13,11 +12,10 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_quad.base.errors import ConfigError, ExportError
-from sb3_quad.base.files import one_line
+from sb3_quad.base.errors import ConfigError, ExportError, raised_as
 from sb3_quad.base.imports import require
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import Float32Array
-from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 N_ROTORS = 4
@@ -29,24 +27,24 @@ the next states. The state None begins flights.
 """
 
 
-def load_torchscript(content: bytes) -> tuple[Call, str]:
-    """Load the file by torch on the CPU. Return its call and torch's version."""
-    # torch fills in the files that it is asked for.
-    extra = {"metadata.json": ""}
-    module = th.jit.load(io.BytesIO(content), "cpu", extra)  # type: ignore[no-untyped-call]
-    size = int(json.loads(extra["metadata.json"]).get("state_size", 0))
+def load_torchscript(content: bytes, state_size: int) -> tuple[Call, str]:
+    """Load the file by torch on the CPU. Return its call and torch's version.
+
+    :param state_size: numbers in a state; 0: the file takes and gives none.
+    """
+    module = th.jit.load(io.BytesIO(content), "cpu")  # type: ignore[no-untyped-call]
 
     @th.no_grad()
     def run(*inputs: Float32Array) -> list[Any]:
         outputs = module(*map(th.from_numpy, inputs))
-        if not size:
+        if not state_size:
             outputs = [outputs]
         return [output.numpy() for output in outputs]
 
-    return _call(run, size), f"torch {th.__version__}"
+    return _call(run, state_size), f"torch {th.__version__}"
 
 
-def load_onnx(content: bytes) -> tuple[Call, str]:
+def load_onnx(content: bytes, state_size: int) -> tuple[Call, str]:
     """Load the file by onnxruntime on one thread of the CPU, see :func:`load_torchscript`.
 
     :raises ConfigError: it is not installed.
@@ -55,32 +53,27 @@ def load_onnx(content: bytes) -> tuple[Call, str]:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
     session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    # The second input is the state, if there is one.
-    ports = session.get_inputs()
-    size = ports[1].shape[1] if len(ports) > 1 else 0
 
     def run(*inputs: Float32Array) -> Any:
-        named = zip(ports, inputs, strict=True)
-        return session.run(None, {port.name: rows for port, rows in named})
+        names = ["observation", "state"][: len(inputs)]
+        return session.run(None, dict(zip(names, inputs, strict=True)))
 
-    return _call(run, size), f"onnxruntime {runtime.__version__}"
+    return _call(run, state_size), f"onnxruntime {runtime.__version__}"
 
 
-def _call(run: Callable[..., Any], size: int) -> Call:
-    """:param size: numbers in a state of ``run``; 0: it takes and gives none."""
-
+def _call(run: Callable[..., Any], state_size: int) -> Call:
     def call(rows: Float32Array, state: Any = None) -> Any:
-        if not size:
+        if not state_size:
             return run(rows)[0], None
         # Zeros begin a flight.
         if state is None:
-            state = np.zeros((len(rows), size), dtype=np.float32)
+            state = np.zeros((len(rows), state_size), dtype=np.float32)
         return tuple(run(rows, state))
 
     return call
 
 
-def load_header(content: bytes, name: str) -> tuple[Call, str]:
+def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
     """Load a C header by the machine's compiler, see :func:`load_torchscript`.
 
     :param name: the beginning of the header's identifiers.
@@ -94,9 +87,10 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
             "install gcc or clang (apt install gcc)"
         )
     program = render(
+        "sb3_quad.export",
         "run.c.j2",
         name=name,
-        stateful=f"}} {name}_state;".encode() in content,
+        stateful=state_size > 0,
         features=OBSERVATION_SIZE,
         rotors=N_ROTORS,
     )
@@ -104,14 +98,13 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
         Path(folder, "policy.h").write_bytes(content)
         Path(folder, "run.c").write_text(program, encoding="ascii")
         command = (compiler, *FLAGS, "-shared", "-fPIC", "-o", "run.so", "run.c", "-lm")
-        try:
-            subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+        failed = "the C header cannot be checked"
+        with raised_as(ExportError, failed):
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+            if done.returncode:
+                reason = " ".join(done.stderr.split())[:200]
+                raise ExportError(f"{failed}: {compiler} failed ({reason})")
             library = ctypes.CDLL(f"{folder}/run.so")
-        except (subprocess.CalledProcessError, OSError) as error:
-            reason = one_line(error)
-            if isinstance(error, subprocess.CalledProcessError):
-                reason = f"{compiler} failed ({' '.join(error.stderr.split())[:200]})"
-            raise ExportError(f"the C header cannot be checked: {reason}") from None
 
     def call(rows: Float32Array, state: Any = None) -> Any:
         begins = state is None

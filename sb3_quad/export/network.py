@@ -21,7 +21,6 @@ from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
-from sb3_quad.vehicles.layout import Turn
 
 ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
@@ -81,13 +80,9 @@ class Network(th.nn.Module):
         self.state_size = self.newest + observation.ages[-1] * observation.frame_size
         # From the integral to what it adds to the scaled features.
         self.shift = th.diag(self.inverse_std)[GROUPS["position"]]
-        # What the files take and give, and an example of it.
-        self.inputs = ["observation"]
-        self.outputs = [self.result]
+        # An example of what the files take.
         self.examples = [th.zeros(2, OBSERVATION_SIZE)]
         if observation.is_extended:
-            self.inputs.append("state")
-            self.outputs.append("next_state")
             self.examples.append(th.zeros(2, self.state_size))
         self.eval()
 
@@ -185,8 +180,6 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
     turn = reference.turn
     linear = [layer for layer in layers if isinstance(layer, th.nn.Linear)]
-    if turn == Turn() or not linear:
-        return layers
     # One frame: the scaled features, then the last action if the policy sees it.
     observation = reference.observation
     std = reference.std
@@ -260,14 +253,17 @@ def write_onnx(network: Network, metadata: StrDict) -> bytes:
     :raises ConfigError: onnx is not installed.
     """
     onnx = require("onnx", "export", "--format onnx")
+    # A policy without a state takes and gives one thing only.
+    inputs = ["observation", "state"][: len(network.examples)]
+    outputs = [network.result, "next_state"][: len(network.examples)]
     buffer: Any = io.BytesIO()
     th.onnx.export(
         network,
         tuple(network.examples),
         buffer,
-        input_names=network.inputs,
-        output_names=network.outputs,
-        dynamic_axes={name: {0: "batch"} for name in (*network.inputs, *network.outputs)},
+        input_names=inputs,
+        output_names=outputs,
+        dynamic_axes={name: {0: "batch"} for name in (*inputs, *outputs)},
         # Any ONNX runtime since 2020 reads opset 13. The newer exporter (dynamo) needs onnxscript,
         # and writes opset 18 or later.
         opset_version=13,

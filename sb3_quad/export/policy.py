@@ -11,14 +11,14 @@ from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
-from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare, make_reference
+from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
-from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
@@ -91,7 +91,7 @@ def export_policy(
             "say with --vehicle which one's thrusts the file is to give"
         )
     flown = first_vehicle(given.vehicle)
-    reference = make_reference(model, settings, flown, output)
+    reference = Reference(model, settings, flown, output)
     network = build_network(reference, f"model {path}")
     metadata = _describe(Path(path), algorithm, network, reference, flown)
     with warnings.catch_warnings():
@@ -99,11 +99,11 @@ def export_policy(
         # files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
         # The file is checked, then written again with the result of the check in it.
-        call, by = read(write(network, metadata))
+        call, by = read(write(network, metadata), network.state_size)
         checked = compare(reference, call, by, n_observations)
         metadata["check"] = (
             f"largest error {checked.error:.2g} {network.unit} "
-            f"in {checked.count} observations of flights ({by})"
+            f"in {checked.n} observations of flights ({by})"
         )
         content = write(network, metadata)
     return Export(content, metadata, checked.error, network.unit, source)
@@ -114,6 +114,7 @@ def _describe(
 ) -> StrDict:
     """Return what users of the file must know; ASCII but for names."""
     text = render(
+        "sb3_quad.export",
         "metadata.j2",
         version=__version__,
         network=network,

@@ -60,8 +60,8 @@ def plot_curves(
                 points = _mean_and_range(runs, axis, measure) * factor
                 seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
                 if len(points):
-                    times = points.index / unit
-                    band(panel, colours[name], name + seeds, times, points.to_numpy().T, **POINTS)
+                    points.index /= unit
+                    band(panel, colours[name], name + seeds, points, **POINTS)
             for style, (name, heights) in zip(cycle(("--", ":", "-.")), lines.items()):
                 if measure in heights:
                     height = heights[measure] * factor

@@ -5,11 +5,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import jinja2
 
 from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.report.plots import Plot
@@ -17,6 +15,7 @@ from sb3_quad.report.plots import Plot
 PAGE = "report.html"
 MARKDOWN = "report.md"
 PICTURES = "figures"
+TEMPLATES = "sb3_quad.report.templates"
 
 
 @dataclass(frozen=True)
@@ -47,22 +46,9 @@ def write_page(folder: StrPath, title: str, facts: str, sections: Sequence[Secti
     """
     folder = Path(folder)
     content = {"title": title, "facts": facts, "sections": sections, "pictures": PICTURES}
-    write_text(folder / MARKDOWN, render("page.md.j2", **content))
+    write_text(folder / MARKDOWN, render(TEMPLATES, "page.md.j2", **content))
     for section in sections:
         for plot in section.plots:
             write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
-    write_text(folder / PAGE, render("page.html.j2", **content))
+    write_text(folder / PAGE, render(TEMPLATES, "page.html.j2", **content))
     return folder / PAGE
-
-
-def render(template: str, **content: Any) -> str:
-    """Return the text that a template of this package makes of its content."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sb3_quad.report", "templates"),
-        autoescape=jinja2.select_autoescape(["html.j2"]),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template(template).render(content)

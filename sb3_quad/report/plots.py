@@ -2,18 +2,16 @@
 
 import io
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_quad.base.types import FloatArray, StrDict
-from sb3_quad.evaluation.statistics import Estimate
+from sb3_quad.base.types import StrDict
 
 INK = "#1c2430"
 # The colours of the style, by their names in the page's own, which may be dark.
@@ -90,18 +88,8 @@ def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def interval_ends(estimates: Sequence[Estimate | None], factor: float = 1.0) -> FloatArray:
-    """Return values and both ends of their intervals, (3, n); NaN for None."""
-    ends = np.full((3, len(estimates)), np.nan)
-    for column, estimate in enumerate(estimates):
-        if estimate is not None:
-            ends[:, column] = estimate.value, estimate.low, estimate.high
-    return factor * ends
-
-
-def band(
-    axes: Axes, colour: str, label: str, x: FloatArray, ends: FloatArray, **style: Any
-) -> None:
-    """Draw a line and the band around it; ``ends`` are values, low and high, (3, n)."""
-    axes.plot(x, ends[0], color=colour, label=label, **{"linewidth": 1.6, **style})
-    axes.fill_between(x, ends[1], ends[2], color=colour, alpha=0.16, linewidth=0)
+def band(axes: Axes, colour: str, label: str, table: pd.DataFrame, **style: Any) -> None:
+    """Draw a line and the band around it over the index of a table: value, low and high."""
+    middle, low, high = table.to_numpy().T
+    axes.plot(table.index, middle, color=colour, label=label, **{"linewidth": 1.6, **style})
+    axes.fill_between(table.index, low, high, color=colour, alpha=0.16, linewidth=0)

@@ -7,11 +7,13 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import (
     SUCCESS,
     SURVIVAL,
+    cells_of,
     mark_best,
     measured_cells,
     reference_cells,
@@ -22,9 +24,9 @@ from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Reference, Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
-from sb3_quad.report.page import PAGE, Section, render, write_page
+from sb3_quad.report.page import PAGE, TEMPLATES, Section, write_page
+from sb3_quad.report.plots import Plot
 from sb3_quad.report.scenario_plots import (
-    ControllerFlights,
     arrivals_plot,
     errors_plot,
     group_plots,
@@ -60,7 +62,7 @@ def write_report(folder: StrPath, overwrite: bool = False) -> Path:
 
 def facts(results: Results) -> str:
     """Return how many flights there are, when and by which version, and how to read numbers."""
-    return " ".join(render("facts.txt.j2", results=results).split())
+    return " ".join(render(TEMPLATES, "facts.txt.j2", results=results).split())
 
 
 def sections(results: Results, folder: StrPath) -> list[Section]:
@@ -72,10 +74,7 @@ def sections(results: Results, folder: StrPath) -> list[Section]:
     shares = [_share_table(row, results, groups, row.heading) for row in (SUCCESS, SURVIVAL)]
     parts = [Section("overview", "Success and survival", OVERVIEW, shares)]
     for heading, scenarios in groups:
-        if scenarios[0].group is None:
-            parts.append(_scenario_section(results, heading, scenarios[0], folder))
-        else:
-            parts.append(_group_section(results, heading, scenarios))
+        parts.append(_flights_section(results, heading, scenarios, Path(folder)))
     rows = []
     for record in results.controllers:
         content = record.content or ""
@@ -95,51 +94,49 @@ def _words_section(heading: str, heads: Sequence[str], rows: Iterable[Sequence[s
     return Section(heading.lower(), heading, tables=[table])
 
 
-def _scenario_section(
-    results: Results, heading: str, scenario: Scenario, folder: StrPath
+def _flights_section(
+    results: Results, heading: str, scenarios: Sequence[Scenario], folder: Path
 ) -> Section:
-    columns = _columns(results, scenario.reference)
-    table = Table(columns, scenario_rows(results, results.colours, scenario))
-    plots = []
+    """The section of a scenario, or of the cells that ``vary`` makes of one."""
+    first = scenarios[0]
+    flown = f"{first.episodes} flights of each controller"
+    tables = []
+    if first.group is None:
+        columns = _columns(results, first.reference)
+        tables.append(Table(columns, scenario_rows(results, results.colours, first)))
+        plots = _scenario_plots(results, first, folder)
+    else:
+        flown += f" in each of {len(scenarios)} cells"
+        # A grid of several quantities has too many cells for a table.
+        if len(first.cell) == 1:
+            (key,) = first.cell
+            cells = [(f"{scenario.cell[key]:g}", [scenario]) for scenario in scenarios]
+            corner = f"{axis_label(key, first)}: success (%)"
+            tables.append(_share_table(SUCCESS, results, cells, corner))
+        plots = group_plots(results, scenarios)
+    facts = (
+        f"{flown}, {first.duration:g} s; observation noise {in_words(first.noise)};"
+        f" seed {first.seed}."
+    )
+    return Section(first.group or first.name, heading, first.description, tables, plots, facts)
+
+
+def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[Plot]:
     metrics = {}
-    recorded = []
-    for label, colour in results.colours.items():
+    flights = {}
+    for label in results.colours:
         entry = results.entry(label, scenario.name)
         if entry is not None:
             metrics[label] = entry.metrics
-            recorded.append(
-                ControllerFlights(label, colour, read_tracks(Path(folder) / entry.flights))
-            )
+            flights[label] = read_tracks(folder / entry.flights)
     # A scenario that all controllers failed in has no flights to draw.
-    if recorded:
-        plots = [paths_plot(scenario, recorded), errors_plot(scenario, recorded)]
-        has_way = scenario.target.waypoints is None and scenario.target.distance != 0.0
-        if has_way and len(scenario.tolerances) > 2:
-            plots.insert(1, arrivals_plot(scenario, metrics, results.colours))
-    how = f"{scenario.episodes} flights of each controller, {_conditions(scenario)}"
-    return Section(scenario.name, heading, scenario.description, [table], plots, how)
-
-
-def _group_section(results: Results, heading: str, scenarios: Sequence[Scenario]) -> Section:
-    first = scenarios[0]
-    tables = []
-    # A grid of several quantities has too many cells for a table.
-    if len(first.cell) == 1:
-        ((key, _),) = first.cell.items()
-        cells = [(f"{scenario.cell[key]:g}", [scenario]) for scenario in scenarios]
-        corner = f"{axis_label(key, first)}: success (%)"
-        tables.append(_share_table(SUCCESS, results, cells, corner))
-    how = (
-        f"{first.episodes} flights of each controller in each of {len(scenarios)} cells,"
-        f" {_conditions(first)}"
-    )
-    plots = group_plots(results, scenarios)
-    return Section(first.group or first.name, heading, first.description, tables, plots, how)
-
-
-def _conditions(scenario: Scenario) -> str:
-    noise = in_words(scenario.noise)
-    return f"{scenario.duration:g} s; observation noise {noise}; seed {scenario.seed}."
+    if not flights:
+        return []
+    plots = [paths_plot(scenario, flights, results.colours)]
+    has_way = scenario.target.waypoints is None and scenario.target.distance != 0.0
+    if has_way and len(scenario.tolerances) > 2:
+        plots.append(arrivals_plot(scenario, metrics, results.colours))
+    return [*plots, errors_plot(scenario, flights, results.colours)]
 
 
 def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Table:
@@ -155,24 +152,21 @@ def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Tab
             row, [_share(row, results, label, scenarios) for label in results.colours]
         )
         # A scenario may lack the reference of another one.
-        for name in others:
-            reference = scenarios[0].reference.get(name, Reference())
-            cells.append(reference_cells(reference).get(row, Cell()))
+        references = [scenarios[0].reference.get(name, Reference()) for name in others]
+        cells += cells_of(row, map(reference_cells, references))
         rows.append(Row(heading, "", cells))
     return Table(_columns(results, others), rows, corner)
 
 
 def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
     """The share of a controller in some scenarios; of several, the least and the greatest."""
-    shares = []
-    cell = Cell(words="failed")
-    for scenario in scenarios:
-        cells = measured_cells(results, label, scenario)
-        if cells is not None:
-            cell = cells[row]
-            shares.append(cell.value or 0.0)
-    if len(scenarios) == 1 or not shares:
-        return cell
+    measured = [measured_cells(results, label, scenario) for scenario in scenarios]
+    cells = [cells[row] for cells in measured if cells is not None]
+    if not cells:
+        return Cell(words="failed")
+    if len(scenarios) == 1:
+        return cells[0]
+    shares = [cell.value or 0.0 for cell in cells]
     return Cell(words=f"{min(shares):.0f} to {max(shares):.0f}")
 
 

@@ -1,46 +1,24 @@
 """The plots of a scenario: paths, times to its target, distances from it, what ``vary`` changes."""
 
 from collections.abc import Mapping, Sequence
-from operator import attrgetter
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_quad.base.types import FloatArray
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.report.plots import (
-    HEIGHT,
-    INK,
-    POINTS,
-    WIDTH,
-    Plot,
-    band,
-    interval_ends,
-    legend,
-    new_axes,
-    styled,
-)
+from sb3_quad.report.plots import HEIGHT, INK, POINTS, WIDTH, Plot, band, legend, new_axes, styled
 
 FORCE = "#db1a24"
 TARGET = "#1a9a45"
 LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
 LINE_POINTS = 200  # of a flight, at most
 SHOWN_FLIGHTS = 4  # of a controller, where episodes differ
-
-
-class ControllerFlights(NamedTuple):
-    """One controller in one scenario: its colour, its recorded flights."""
-
-    label: str
-    colour: str
-    tracks: Sequence[Track]
 
 
 @styled
@@ -56,14 +34,16 @@ def arrivals_plot(
     width = 0.75 / len(metrics)
     # A group of bars at each tolerance, one for each controller.
     for number, (label, measured) in enumerate(metrics.items()):
-        value, low, high = interval_ends([*map(attrgetter("time"), measured.arrivals)])
+        # There is no bar where no flight arrives.
+        means = [dict(arrival.time or {}) for arrival in measured.arrivals]
+        times = pd.DataFrame(means, columns=["value", "low", "high"], dtype=np.float64)
         axes.bar(
             places + (number - 0.5 * (len(metrics) - 1)) * width,
-            value,
+            times.value,
             0.92 * width,
             color=colours[label],
             label=label,
-            yerr=np.stack([value - low, high - value]),
+            yerr=[times.value - times.low, times.high - times.value],
             error_kw={"ecolor": INK, "elinewidth": 0.9, "capsize": 2},
         )
     axes.set_xticks(places, [*map("{:g}".format, scenario.tolerances)])
@@ -77,16 +57,21 @@ def arrivals_plot(
 
 
 @styled
-def paths_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot:
-    """Draw recorded flights from above and from the side, with targets and disturbances."""
+def paths_plot(
+    scenario: Scenario, flights: Mapping[str, Sequence[Track]], colours: Mapping[str, str]
+) -> Plot:
+    """Draw recorded flights from above and from the side, with targets and disturbances.
+
+    :param flights: by the controllers' labels, as are ``colours``.
+    """
     count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
     figure = Figure(figsize=(2.0 * WIDTH, 1.2 * HEIGHT), layout="constrained")
     for axes, (i, j) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
         axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal")
         axes.set_adjustable("datalim")
-        for flown in flights:
-            for track in flown.tracks[:count]:
-                _draw_path(axes, track, flown, [i, j])
+        for label, tracks in flights.items():
+            for track in tracks[:count]:
+                _draw_path(axes, track, label, colours[label], [i, j])
     legend(figure)
     flights_shown = "flight" if count == 1 else f"{count} flights"
     caption = (
@@ -96,51 +81,48 @@ def paths_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot
     return Plot(f"{scenario.name}_paths", caption, figure)
 
 
-def _draw_path(axes: Axes, track: Track, flown: ControllerFlights, plane: list[int]) -> None:
+def _draw_path(axes: Axes, track: Track, label: str, colour: str, plane: list[int]) -> None:
     stride = -(-len(track.position) // LINE_POINTS)
-    path = track.position[::stride, plane].T
-    axes.plot(*path, color=flown.colour, label=flown.label, linewidth=1.2)
+    path = track.position[:, plane]
+    axes.plot(*path[::stride].T, color=colour, label=label, linewidth=1.2)
     axes.plot(*track.targets[:, plane].T, "D", color=TARGET, markersize=4, label="target")
     if track.lost:
-        axes.plot(*track.position[-1, plane], "x", color=flown.colour)
+        axes.plot(*path[-1], "x", color=colour)
     # An arrow where a force begins.
     acts = track.wrench[:, :3].any(axis=1)
     begins = acts & ~np.roll(acts, 1)
     force = track.wrench[begins, :3]
     direction = force / np.linalg.norm(force, axis=1, keepdims=True)
-    places = track.position[begins][:, plane].T
-    axes.quiver(*places, *direction[:, plane].T, color=FORCE, scale=12, width=0.006)
+    axes.quiver(*path[begins].T, *direction[:, plane].T, color=FORCE, scale=12, width=0.006)
 
 
 @styled
-def errors_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot:
-    """Draw distances from the target over time, of controllers with recorded flights."""
+def errors_plot(
+    scenario: Scenario, flights: Mapping[str, Sequence[Track]], colours: Mapping[str, str]
+) -> Plot:
+    """Draw distances from the target over time, of :func:`paths_plot`'s flights."""
     figure, axes = new_axes("time (s)", "distance from target (m)")
-    for flown in flights:
-        band(axes, flown.colour, flown.label, *_quantiles(flown.tracks))
+    for label, tracks in flights.items():
+        lines = [pd.Series(track.error, track.times) for track in tracks]
+        # A flight that has ended early is lost, infinitely far away.
+        errors = pd.concat(lines, axis="columns").fillna(np.inf)
+        errors = errors[:: -(-len(errors) // LINE_POINTS)]
+        ends = errors.quantile([0.5, 0.0, 1.0], axis="columns", interpolation="higher").T
+        band(axes, colours[label], label, ends.replace(np.inf, np.nan))
     # A disturbance that lasts to the end would colour the whole plot.
     for wrench in scenario.wrenches:
         end = wrench.start + (wrench.duration or np.inf)
         if end < scenario.duration:
-            axes.axvspan(wrench.start, end, facecolor=FORCE, edgecolor=FORCE, alpha=0.16)
+            axes.axvspan(wrench.start, end, color=FORCE, alpha=0.16)
     axes.set_ylim(bottom=0.0)
     legend(figure)
+    # As many flights of each controller are recorded.
     caption = (
-        f"Median of {len(flights[0].tracks)} flights, in a band from the least to the greatest"
+        f"Median of {len(tracks)} flights, in a band from the least to the greatest"
         " distance; red: a disturbance. A lost flight counts as infinitely far away, so that a"
         " median ends where half of the flights are lost."
     )
     return Plot(f"{scenario.name}_error", caption, figure)
-
-
-def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
-    """Times, (k,), and the median, least and greatest error, (3, k); NaN where it is infinite."""
-    longest = max(tracks, key=lambda track: len(track.times))
-    # A flight that has ended early is lost, infinitely far away.
-    errors = pd.DataFrame(map(attrgetter("error"), tracks)).fillna(np.inf)
-    stride = -(-errors.shape[1] // LINE_POINTS)
-    ends = np.quantile(errors, (0.5, 0.0, 1.0), axis=0, method="higher")[:, ::stride]
-    return longest.times[::stride], np.where(np.isinf(ends), np.nan, ends)
 
 
 @styled
@@ -149,28 +131,30 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
     over a single one.
     """
     group = scenarios[0].group
-    table = _cells(results, scenarios)
     keys = [*scenarios[0].cell]
-    spread = "with 95 % intervals"
-    if len(keys) > 1:
-        spread = "mean, least and greatest over the other quantities"
+    table = _cells(results, scenarios)
+    controllers = table.groupby("label", sort=False)
     plots = []
     for number, key in enumerate(keys):
-        name = f"{group}_success"
-        if len(keys) > 1:
-            name = f"{group}_{number}_success"
         figure, axes = new_axes(axis_label(key, scenarios[0]), "success (%)")
-        for label, flown in table.groupby("label", sort=False):
-            shares = flown.groupby(key).agg({"success": "mean", "low": "min", "high": "max"})
-            ends = 100.0 * shares.to_numpy().T
-            band(axes, results.colours[label], label, shares.index, ends, **POINTS)
+        for label, flown in controllers:
+            cells = flown.groupby(key)
+            if len(keys) == 1:
+                shares = cells[["value", "low", "high"]].first()
+            else:
+                shares = cells["value"].agg(["mean", "min", "max"])
+            band(axes, results.colours[label], label, 100.0 * shares, **POINTS)
         axes.set_ylim(-3.0, 103.0)
         legend(figure)
-        plots.append(Plot(name, f"Success, {spread}.", figure))
+        if len(keys) == 1:
+            plots.append(Plot(f"{group}_success", "Success, with 95 % intervals.", figure))
+        else:
+            caption = "Success, mean, least and greatest over the other quantities."
+            plots.append(Plot(f"{group}_{number}_success", caption, figure))
     if len(keys) == 1:
         figure, axes = new_axes(axis_label(keys[0], scenarios[0]), "final error (m)")
-        for label, flown in table.dropna(subset="error").groupby("label", sort=False):
-            errors = flown.set_index(keys[0])["error"].sort_index().clip(lower=LEAST_ERROR)
+        for label, flown in controllers:
+            errors = flown.set_index(keys[0])["error"].dropna().sort_index().clip(lower=LEAST_ERROR)
             axes.plot(errors, color=results.colours[label], label=label, **POINTS)
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
@@ -184,24 +168,18 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
 
 
 def _cells(results: Results, scenarios: Sequence[Scenario]) -> pd.DataFrame:
-    """A line for each controller in each cell that it did not fail in.
-
-    Of several quantities, the ends are the share itself, so that they become the least and the
-    greatest over the others. There is no error where most flights are lost.
+    """A line for each controller in each cell that it did not fail in: its success, and its final
+    error where at least half of the flights survive.
     """
-    keys = scenarios[0].cell
     rows = []
     for label in results.colours:
         for scenario in scenarios:
             entry = results.entry(label, scenario.name)
             if entry is not None:
-                success = entry.metrics.success
-                ends = (success.low, success.high)
-                if len(keys) > 1:
-                    ends = (success.value, success.value)
-                error = entry.metrics.final_error_median
-                if entry.metrics.survival.value < 0.5:
-                    error = None
-                rows.append((*scenario.cell.values(), label, success.value, *ends, error))
-    columns = [*keys, "label", "success", "low", "high", "error"]
-    return pd.DataFrame(rows, columns=columns).astype({"error": np.float64})
+                metrics = entry.metrics
+                row = {**scenario.cell, "label": label, **dict(metrics.success)}
+                if metrics.survival.value >= 0.5:
+                    row["error"] = metrics.final_error_median
+                rows.append(row)
+    columns = [*scenarios[0].cell, "label", "value", "low", "high", "error"]
+    return pd.DataFrame(rows, columns=columns)

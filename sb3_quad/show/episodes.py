@@ -30,13 +30,17 @@ class Recording:
     name: str
     colour: str  # of its trail and its heading, #rrggbb
     vehicle: Vehicle
-    times: FloatArray  # (T + 1,), s since the start
-    state: QuadcopterState  # the true state at each of them
+    state: QuadcopterState  # the true state before the first step and after each one, T + 1
     # (T + 1, 12), of the step before: force in the world and in the body frame, N; torques
     # likewise, N m
     wrench: FloatArray
     reward: float  # sum of the rewards
     lost: str  # how it was lost: "collision", "out of range", or empty
+
+    @cached_property
+    def times(self) -> FloatArray:
+        """Seconds since the start, (T + 1,)."""
+        return np.arange(self.state.n, dtype=np.float64) * self.vehicle.control_step
 
     @cached_property
     def rotor_angles(self) -> FloatArray:
@@ -209,7 +213,6 @@ class _Log(Hook):
             name=name,
             colour=colour,
             vehicle=self.vehicle,
-            times=np.arange(len(self.states), dtype=np.float64) * self.vehicle.control_step,
             state=QuadcopterState.concatenate(self.states),
             wrench=np.stack(self.wrenches),
             reward=float(flights.reward[0]),

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image as Pillow
 
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
@@ -134,7 +135,7 @@ def following_cameras(
 
 def _panel(
     recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens
-) -> Iterator[Image]:
+) -> Iterator[Pillow.Image]:
     """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
     font_size = max(12, round(lens.height / 26))
     with closing(Scene(recording.vehicle)) as scene:
@@ -144,9 +145,8 @@ def _panel(
             # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
             flown = recording.state.position[: step + 1 : 2]
-            pixels = scene.picture(camera, [Trail(flown, recording.colour)])
-            lines = [_caption(recording, step)]
-            yield with_header(pixels, recording.name, lines, recording.colour, font_size)
+            picture = Pillow.fromarray(scene.picture(camera, [Trail(flown, recording.colour)]))
+            yield with_header(picture, recording, [_caption(recording, step)], font_size)
 
 
 def _caption(recording: Recording, step: int) -> str:
@@ -189,20 +189,21 @@ def show_in_window(
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
     forward = broadside(landmarks(recordings))
-    cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
-    # The number of the frame follows the clock, so that flights are shown in real time.
+    cameras = following_cameras(recordings, times, scene.scale, forward, lens)
     begun = time.perf_counter()
-    number = 0
-    while number < len(times):
+    for number, (seconds, camera) in enumerate(zip(times, cameras, strict=True)):
+        # The frames follow the clock, so that flights are shown in real time: each waits for its
+        # time, and those that would come too late are skipped.
+        early = begun + number / FPS - time.perf_counter()
+        if early < -1.0 / FPS:
+            continue
+        time.sleep(max(0.0, early))
         poses = []
         both = []
         for recording in recordings:
-            step = recording.at(times[number])
+            step = recording.at(seconds)
             poses.append(recording.pose(step))
             both.append(recording.vehicle_and_target(step))
         vehicles, targets = np.stack(both, axis=1)
         scene.place(poses, targets)
-        point_window(scene.client, cameras[number], vehicles.mean(axis=0))
-        # Skip the frames that would come too late.
-        number = max(number + 1, int((time.perf_counter() - begun) * FPS))
-        time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))
+        point_window(scene.client, camera, vehicles.mean(axis=0))

@@ -8,6 +8,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image as Pillow
+from PIL import ImageDraw
 
 from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
@@ -15,7 +17,7 @@ from sb3_quad.envs.rendering.models import span
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.show.episodes import Recording, landmarks
-from sb3_quad.show.labels import side_by_side, tag_size, with_header, with_tags
+from sb3_quad.show.labels import INK, PLATE, font, side_by_side, with_header
 from sb3_quad.simulation.state import QuadcopterState
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays within that of its target
@@ -61,7 +63,6 @@ def until_settled(recording: Recording) -> Recording:
         return recording
     return replace(
         recording,
-        times=recording.times[:n],
         state=QuadcopterState(recording.state.array[:, :n]),
         wrench=recording.wrench[:n],
     )
@@ -96,19 +97,17 @@ def pose_steps(recording: Recording, view: View) -> list[int]:
     return sorted(set(shown))
 
 
-def _panel(recording: Recording, view: View) -> Image:
+def _panel(recording: Recording, view: View) -> Pillow.Image:
     steps = pose_steps(recording, view)
     trail = Trail(recording.state.position, recording.colour)
     targets = recording.targets
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
-        pixels = scene.picture(view.camera, [trail])
+        picture = Pillow.fromarray(scene.picture(view.camera, [trail]))
     # The texts grow with the picture, but stay legible in a small one.
     size = max(12, round(view.camera.lens.height / 34))
-    tag = round(0.92 * size)
-    pixels = with_tags(pixels, time_tags(recording, steps, view, tag), tag)
-    lines = _explanation(recording, steps, view)
-    return with_header(pixels, recording.name, lines, recording.colour, size)
+    draw_times(ImageDraw.Draw(picture, "RGBA"), recording, steps, view, round(0.92 * size))
+    return with_header(picture, recording, _explanation(recording, steps, view), size)
 
 
 def _explanation(recording: Recording, steps: list[int], view: View) -> list[str]:
@@ -131,17 +130,19 @@ def _explanation(recording: Recording, steps: list[int], view: View) -> list[str
     return [*lines, signs]
 
 
-def time_tags(
-    recording: Recording, steps: list[int], view: View, size: int
-) -> list[tuple[str, tuple[float, float]]]:
-    """The time of each pose and the place of its text: above the pose, inside the picture."""
+def draw_times(
+    draw: ImageDraw.ImageDraw, recording: Recording, steps: list[int], view: View, size: int
+) -> None:
+    """Write the time of each pose on a small plate above it, inside the picture.
+
+    :param size: of the font, pixels.
+    """
     places, breadths = view.project(recording.state.position[steps])
-    tags = []
     for step, place, breadth in zip(steps, places, breadths, strict=True):
         text = f"{recording.times[step]:.2f} s"
-        # Its centre is clipped so that the whole text is inside the picture.
-        half = 0.5 * np.array(tag_size(text, size))
+        half = 0.5 * np.array([font(size).getlength(text) + 0.7 * size, 1.5 * size])
+        # The centre is clipped so that the whole plate is inside the picture.
         above = place - (0.0, 0.4 * breadth + half[1])
-        column, row = np.clip(above, half, view.camera.lens[:2] - half).tolist()
-        tags.append((text, (column, row)))
-    return tags
+        centre = np.clip(above, half, view.camera.lens[:2] - half)
+        draw.rounded_rectangle((*(centre - half), *(centre + half)), 0.3 * size, fill=PLATE)
+        draw.text((centre[0], centre[1]), text, font=font(size), fill=INK, anchor="mm")

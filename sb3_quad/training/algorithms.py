@@ -18,7 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, raised_as, unknown
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.base.types import StrDict
@@ -214,11 +214,9 @@ def import_class(path: str, where: str) -> Any:
     :raises ConfigError: a module or a name that does not exist, or anything but a class of the kind
         that the key is for.
     """
-    try:
+    # The module may do anything when it is imported.
+    with raised_as(ConfigError, f"{where}: {path} cannot be imported"):
         named = import_name(path)
-    except (Exception, SystemExit) as error:  # the module may do anything when it is imported
-        reason = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{where}: {path} cannot be imported ({reason})") from None
     base = BASES[where]
     if not (isinstance(named, type) and issubclass(named, base)):
         raise ConfigError(
@@ -233,11 +231,6 @@ def instance(path: str, where: str, *arguments: Any, **keywords: Any) -> Any:
 
     :raises ConfigError: as :func:`import_class`; or the class does not take these keywords.
     """
-    try:
+    # A user's class may raise anything.
+    with raised_as(ConfigError, f"{where}: {path} cannot be made with {keywords}"):
         return import_class(path, where)(*arguments, **keywords)
-    except SB3QuadError:
-        raise
-    except Exception as error:  # a user's class may raise anything
-        raise ConfigError(
-            f"{where}: {path} cannot be made with {keywords} ({type(error).__name__}: {error})"
-        ) from error

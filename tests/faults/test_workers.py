@@ -145,7 +145,7 @@ def test_a_controller_that_ends_its_process_is_a_failure_and_the_others_fly(
 ):
     monkeypatch.chdir(tmp_path)
     Path("suite.yaml").write_text(SUITE)
-    bad = {"exits": "failed with SystemExit: 0"} | (
+    bad = {"exits": "failed (SystemExit: 0"} | (
         {"crashes": "worker process ended"} if workers > 1 else {}
     )
     names = [f"{name}=test_workers:{name}" for name in (*bad, "hover")]

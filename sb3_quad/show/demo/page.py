@@ -17,14 +17,14 @@ from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import Float32Array, StrDict
+from sb3_quad.base.templates import render
+from sb3_quad.base.types import StrDict
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.results import COLOURS, colours_of
-from sb3_quad.export.check import make_reference
+from sb3_quad.export.check import Reference
 from sb3_quad.export.network import Network, build_network
-from sb3_quad.export.templates import render
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
 from sb3_quad.simulation.state import STATE, STATE_SIZE, X
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
@@ -36,7 +36,7 @@ DEFAULT_AGENTS = (
     "any-quadcopter",
     "imitation agent=itm-imitation",
 )
-LIMIT = 500_000  # bytes of a page, above which the largest networks are rounded to half precision
+EXACT = 50_000  # numbers of a network, above which they are rounded to half precision
 # The modules of the page in the order of their imports: those that need no browser, and the others.
 MODEL = ["tables", "vehicle", "dynamics", "observation", "network", "experts", "flight", "weights"]
 VIEW = [
@@ -91,32 +91,30 @@ def make_page(
     colours = colours_of([spec.label for spec in specs])
     vehicles = {name: load_vehicle(name) for name in VEHICLES.names()}
     first = vehicle and _add(vehicles, vehicle)
-    agents: StrDict = {}
-    networks: dict[str, Network] = {}
+    agents = []
     for spec in specs:
-        described, network = describe(spec)
-        agents[spec.label] = {"label": spec.label, "colour": colours[spec.label], **described}
-        if network is not None:
-            networks[spec.label] = network
+        agents.append({"label": spec.label, "colour": colours[spec.label], **describe(spec)})
         if spec.own and not spec.own.vehicles:
             own = _add(vehicles, first_vehicle(spec.own.vehicle))
             first = first or own
     first = first or vehicles["itm"]
-    # Round one network after the other, the largest first, until the page is small enough.
-    by_size = sorted(networks, key=lambda label: -numbers(networks[label]).size)
-    for count in range(len(by_size) + 1):
-        rounded = by_size[:count]
-        for label, network in networks.items():
-            agents[label].update(pack(network, label in rounded))
-        data = {
-            "vehicles": [known.model_dump(mode="json") for known in vehicles.values()],
-            "vehicle": first.name,
-            "colours": COLOURS,
-            "agents": list(agents.values()),
-        }
-        page = _render(data, rounded)
-        if len(page.encode()) <= LIMIT:
-            break
+    rounded = [agent["label"] for agent in agents if agent.get("bits") == 16]
+    data = {
+        "vehicles": [known.model_dump(mode="json") for known in vehicles.values()],
+        "vehicle": first.name,
+        "colours": COLOURS,
+        "agents": agents,
+    }
+    # Without "<", no text in the data can end the script element.
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    page = render(
+        __package__,
+        "page.html.j2",
+        data=text,
+        script=script(),
+        rounded=rounded,
+        version=__version__,
+    )
     return page, first, rounded
 
 
@@ -132,14 +130,14 @@ def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
     return vehicles.setdefault(vehicle.name, vehicle)
 
 
-def describe(spec: ControllerSpec) -> tuple[StrDict, Network | None]:
-    """Return a controller as the page knows it, but for its weights; and its network.
+def describe(spec: ControllerSpec) -> StrDict:
+    """Return a controller as the page knows it.
 
     :raises ConfigError: neither an expert of the page nor an agent in a zip that exports, or an
         observation with a feature that the page does not compute.
     """
     if spec.spec in EXPERTS:
-        return {"kind": spec.spec}, None
+        return {"kind": spec.spec}
     if not spec.is_zip:
         raise ConfigError(
             f"controller {spec.spec}: the page flies {', '.join(EXPERTS)}, and agents in zips"
@@ -149,9 +147,9 @@ def describe(spec: ControllerSpec) -> tuple[StrDict, Network | None]:
         raise ConfigError(f"controller {spec.spec}: the page does not compute {further}")
     settings = agent_settings(spec.spec)[0]
     layout = settings.layout
-    reference = make_reference(load_model(spec.spec), settings, layout)
+    reference = Reference(load_model(spec.spec), settings, layout)
     network = build_network(reference, f"model {spec.spec}")
-    described = {
+    return {
         "kind": "network",
         "vehicle": "" if settings.vehicles is not None else first_vehicle(settings.vehicle).name,
         "layout": layout.model_dump(mode="json", include={"rotor_positions", "rotor_directions"}),
@@ -159,24 +157,19 @@ def describe(spec: ControllerSpec) -> tuple[StrDict, Network | None]:
         "mean": reference.mean.tolist(),
         "std": reference.std.tolist(),
         "shapes": network.shapes,
+        **pack(network),
     }
-    return described, network
 
 
-def numbers(network: Network) -> Float32Array:
-    """Weights and biases, layer by layer."""
-    return parameters_to_vector(network.parameters()).numpy()
-
-
-def pack(network: Network, rounded: bool) -> StrDict:
-    """Return a network's numbers as text: planes, each of one byte of every number, deflated, in
-    base64.
-
-    :param rounded: whether to half precision.
+def pack(network: Network) -> StrDict:
+    """Return a network's numbers, layer by layer, as text: planes, each of one byte of every
+    number, deflated, in base64.
     """
+    # The page stays small because large networks are rounded.
+    values = parameters_to_vector(network.parameters()).numpy()
+    values = values.astype("<f2" if values.size > EXACT else "<f4")
     # Sorted by byte, the signs and exponents stand together and deflate better.
-    values = numbers(network).astype("<f2" if rounded else "<f4")
-    planes = np.frombuffer(values.tobytes(), np.uint8).reshape(values.size, -1).T.tobytes()
+    planes = values.view(np.uint8).reshape(values.size, -1).T.tobytes()
     return {
         "bits": 8 * values.itemsize,
         "weights": base64.b64encode(zlib.compress(planes, 9)).decode(),
@@ -195,16 +188,3 @@ def join_modules(text: str) -> str:
     and indentation; strings and template literals stay as they are.
     """
     return PARTS.sub(lambda match: match["kept"] or "", text)
-
-
-def _render(data: StrDict, rounded: Sequence[str]) -> str:
-    # Without "<", no text in the data can end the script element.
-    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    return render(
-        "page.html.j2",
-        "sb3_quad.show.demo",
-        data=text,
-        script=script(),
-        rounded=rounded,
-        version=__version__,
-    )
