@@ -14,7 +14,7 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.sweep.folder import SweepFolder
+from sb3_quad.sweep.folder import read_results
 
 pytest.importorskip("ray")
 
@@ -61,8 +61,7 @@ def cluster(monkeypatch):
 
 
 def weights(folder):
-    place = SweepFolder(folder)
-    return {name: record.weights for name, record in place.results().items()}
+    return {name: record.weights for name, record in read_results(Path(folder)).items()}
 
 
 def test_an_address_that_nobody_answers_is_refused_in_one_line():

@@ -7,16 +7,19 @@ seeds give intervals that are too narrow (Agarwal et al., Deep Reinforcement Lea
 the Statistical Precipice, NeurIPS 2021): with one seed they cover the choice of episodes alone.
 """
 
-import itertools
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from itertools import combinations, groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from pydantic import computed_field
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
@@ -31,7 +34,7 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.sweep.folder import MEASURES, RunResult, Sweep, SweepFolder
+from sb3_quad.sweep.folder import MEASURES, RunResult, Sweep
 
 # By measure: its row, the factor from values to cells, and their decimals.
 ROWS = {
@@ -78,18 +81,21 @@ class SweepResults(Frozen):
     sweep: str | None
     package_version: str = __version__
     runs: int
-    finished: int
-    failed: dict[str, str]
+    failed: dict[str, str] = {}
     """by the name of a run, why it failed"""
-    configurations: dict[str, list[int]]
+    configurations: dict[str, list[int]] = {}
     """by the name of a configuration, the seeds of its finished runs, if it has any"""
     estimates: list[MeanOverSeeds] = []
     comparisons: list[Comparison] = []
 
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def finished(self) -> int:
+        """Number of finished runs."""
+        return sum(map(len, self.configurations.values()))
 
-def write_results(
-    place: SweepFolder, sweep: Sweep, results: Mapping[str, RunResult]
-) -> SweepResults:
+
+def write_results(folder: Path, sweep: Sweep, results: Mapping[str, RunResult]) -> SweepResults:
     """Write ``results.csv``, a line for each run and scenario, and ``results.json``.
 
     :param results: of all runs that ended, by name.
@@ -98,39 +104,31 @@ def write_results(
     """
     lines: list[StrDict] = []
     parts = {}
+    summary = SweepResults(sweep=sweep.spec.name, runs=len(sweep.runs))
     # In the order of the plan, not in that in which runs ended.
-    ended = [results[run.name] for run in sweep.runs if run.name in results]
-    for result in ended:
-        line = {"run": result.name, **result.model_dump(exclude={"flights"})}
+    for run in sweep.runs:
+        if run.name not in results:
+            continue
+        result = results[run.name]
+        line = {"run": run.name, **dict(run), **dict(result)}
+        # The table holds every run that ended, also those that failed.
+        if result.state == "failed":
+            summary.failed[run.name] = result.message
+            lines.append(line)
+            continue
+        summary.configurations.setdefault(run.configuration, []).append(run.seed)
         for scenario, measures in result.flights.items():
             # A row for each episode, NaN where there is no number.
             part = pd.DataFrame(measures, columns=MEASURES, dtype=np.float64)
-            parts[result.configuration, result.seed, scenario] = part
+            parts[run.configuration, run.seed, scenario] = part
             # All are means but for the final error, which is a median.
             statistics = {**part.mean(), "final_error": part["final_error"].quantile()}
             lines.append({**line, "scenario": scenario, "episodes": len(part), **statistics})
-        # The table holds every run that ended, also those that failed.
-        if not result.flights:
-            lines.append(line)
     table = pd.DataFrame(lines, columns=COLUMNS)
-    write_text(place.path / "results.csv", table.to_csv(index=False, float_format="%.9g"))
-    seeds: dict[str, list[int]] = {}
-    failed = {}
-    for result in ended:
-        if result.state == "failed":
-            failed[result.name] = result.message
-        else:
-            seeds.setdefault(result.configuration, []).append(result.seed)
-    summary = SweepResults(
-        sweep=sweep.spec.name,
-        runs=len(sweep.runs),
-        finished=len(ended) - len(failed),
-        failed=failed,
-        configurations=seeds,
-    )
+    write_text(folder / "results.csv", table.to_csv(index=False, float_format="%.9g"))
     if parts:
         _estimate(summary, pd.concat(parts, names=LEVELS))
-    write_text(place.path / "results.json", summary.model_dump_json(indent=1) + "\n")
+    write_text(folder / "results.json", summary.model_dump_json(indent=1) + "\n")
     return summary
 
 
@@ -147,20 +145,18 @@ def _estimate(summary: SweepResults, flights: Any) -> None:
             # A row for each run, a column for each episode.
             values = group[measure].unstack()
             for name in names:
-                estimate = over_seeds(values.loc[name].to_numpy(), statistic)
-                if estimate is not None:
-                    fields = {**dict(estimate), **key, "configuration": name}
-                    summary.estimates.append(MeanOverSeeds(**fields))
+                mean = over_seeds(values.loc[name].to_numpy(), statistic)
+                if mean is not None:
+                    summary.estimates.append(MeanOverSeeds(**dict(mean), **key, configuration=name))
             if measure not in COMPARED:
                 continue
-            for first, second in itertools.combinations(names, 2):
+            for first, second in combinations(names, 2):
                 # Differences are paired: only the seeds that both have, and the same episodes.
                 paired = (values.loc[first] - values.loc[second]).dropna(how="all")
                 difference = over_seeds(paired.to_numpy())
                 if difference is not None:
-                    fields = {**dict(difference), **key, "first": first, "second": second}
-                    comparison = Comparison(**fields, verdict=verdict(difference))
-                    summary.comparisons.append(comparison)
+                    key |= {"first": first, "second": second, "verdict": verdict(difference)}
+                    summary.comparisons.append(Comparison(**dict(difference), **key))
 
 
 def over_seeds(
@@ -210,13 +206,12 @@ def tables(summary: SweepResults) -> list[Table]:
         seeds = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
         columns.append(Column(f"{name} ({seeds})"))
     made = []
-    for scenario, group in itertools.groupby(summary.estimates, lambda item: item.scenario):
-        known = {(item.measure, item.configuration): _cell(item) for item in group}
+    for scenario, of_scenario in groupby(summary.estimates, attrgetter("scenario")):
         rows = []
-        for measure in dict.fromkeys(measure for measure, _ in known):
-            row = ROWS[measure][0]
-            cells = [known.get((measure, name), Cell()) for name in summary.configurations]
-            rows.append(Row(row.name, row.unit, cells))
+        for measure, estimates in groupby(of_scenario, attrgetter("measure")):
+            known = {estimate.configuration: _cell(estimate) for estimate in estimates}
+            cells = [known.get(name, Cell()) for name in summary.configurations]
+            rows.append(replace(ROWS[measure][0], cells=cells))
         made.append(Table(columns, rows, title=scenario, caption=CAPTION))
     # The comparisons, if there are several configurations.
     rows = []
@@ -234,27 +229,26 @@ def _cell(estimate: MeanOverSeeds | Comparison) -> Cell:
     return estimate_cell(estimate, factor, decimals)
 
 
-def write_report(place: SweepFolder, summary: SweepResults, shown: Sequence[Table]) -> Path:
+def write_report(folder: Path, summary: SweepResults, shown: Sequence[Table]) -> None:
     """Write the report of a sweep's finished runs: a section for each table, and the learning
     curves.
 
     :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`.
-    :return: the page.
     :raises ConfigError: a folder that cannot be written.
     """
     parts: list[Section] = []
     for table in shown:
         anchor = f"table-{len(parts)}"
         parts.append(Section(anchor, table.title, tables=[table], facts=table.caption))
-    plots = _curves(place, summary)
+    plots = _curves(folder, summary)
     if plots:
         description = "Mean over seeds, with their range."
         parts.append(Section("curves", "Learning curves", description, plots=plots))
     facts = f"{summary.finished} of {summary.runs} runs are finished."
-    return write_page(place.path, f"Sweep: {summary.sweep}", facts, parts)
+    write_page(folder, f"Sweep: {summary.sweep}", facts, parts)
 
 
-def _curves(place: SweepFolder, summary: SweepResults) -> list[Plot]:
+def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
     """Plot the evaluations along the way; of pipelines, one plot for each algorithm and environment
     of a stage.
     """
@@ -262,8 +256,8 @@ def _curves(place: SweepFolder, summary: SweepResults) -> list[Plot]:
     for name, seeds in summary.configurations.items():
         for seed in seeds:
             # Below it, a run folder is <algo>/<Env>_<number>; its stages have their own.
-            folder = place.path / "runs" / name / f"seed_{seed}"
-            for path in sorted(folder.glob("*/*/evaluations.npz")):
+            place = folder / "runs" / name / f"seed_{seed}"
+            for path in sorted(place.glob("*/*/evaluations.npz")):
                 *_, algo, run, _ = path.parts
                 kind = f"{algo} {run.rpartition('_')[0]}"
                 curves[kind][name].append(read_curve(path.parent))
