@@ -11,7 +11,9 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +53,17 @@ PRUNERS: Factories = {
     "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
     "none": lambda n, evaluations: NopPruner(),
 }
-ENDED = ("COMPLETE", "PRUNED", "FAIL")  # states of trials
+# The states of trials that ended, in words.
+STATES = {
+    TrialState.COMPLETE: "finished",
+    TrialState.PRUNED: "pruned",
+    TrialState.FAIL: "failed",
+}
+# Those of trials that count.
+COUNTED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
 BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials share
 # User attributes of a trial. The owner is the machine and the process that trains it.
 OWNER = "owner"
-SETTINGS = "settings"
 SUCCESS = "success_rate"
 REWARD = "mean_reward"
 RUN = "run"
@@ -64,6 +72,7 @@ INTERRUPTED = "interrupted"  # the error of trials that are tried again
 AGAIN = {"again": True}  # user attributes of the trials that do so
 
 
+@dataclass
 class Search:
     """Trains with one choice of settings after the other.
 
@@ -85,41 +94,31 @@ class Search:
         study of this name of another kind.
     """
 
-    def __init__(
-        self,
-        job: TrainingJob,
-        space: SearchSpace,
-        name: str,
-        storage: StrPath,
-        sampler: str,
-        pruner: str,
-        n_startup_trials: int,
-        n_evaluations: int,
-    ) -> None:
-        if sampler not in SAMPLERS:
-            raise ConfigError(unknown("sampler", sampler, SAMPLERS))
-        if pruner not in PRUNERS:
-            raise ConfigError(unknown("pruner", pruner, PRUNERS))
-        if min(n_evaluations, job.eval_episodes) < 1 or n_startup_trials < 0:
-            raise ConfigError(
-                "n_evaluations and eval_episodes must be at least 1, n_startup_trials at least 0"
-            )
-        self.job = job
-        self.space = space
-        self.name = name
-        self.storage = storage
-        self.n_evaluations = n_evaluations
+    job: TrainingJob
+    space: SearchSpace
+    name: str
+    storage: StrPath
+    sampler: str
+    pruner: str
+    n_startup_trials: int
+    n_evaluations: int
+
+    def __post_init__(self) -> None:
+        if self.sampler not in SAMPLERS:
+            raise ConfigError(unknown("sampler", self.sampler, SAMPLERS))
+        if self.pruner not in PRUNERS:
+            raise ConfigError(unknown("pruner", self.pruner, PRUNERS))
         # Only trials of one kind compare. This is the kind, as a storage gives it back.
         wanted = json.loads(json.dumps(self._shared(), default=str))
-        self.study = open_study(name, storage)
+        self.study = open_study(self.name, self.storage)
         if BEGUN_WITH not in self.study.user_attrs and not self.study.trials:
             self.study.set_user_attr(BEGUN_WITH, wanted)
             # The first trial has the settings as they are, if the space holds them.
-            first = space.start()
+            first = self.space.start()
             if first is not None:
                 self.study.enqueue_trial(first)
         known = self.study.user_attrs.get(BEGUN_WITH)
-        where = f"study {name} in {storage}"
+        where = f"study {self.name} in {self.storage}"
         if known is None:
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
@@ -129,8 +128,8 @@ class Search:
                 "give the same again, or another --study-name"
             )
         # Sampler and pruner may differ from one session to the next.
-        self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
-        self.study.sampler = NumberedSampler(sampler, job.seed, n_startup_trials)
+        self.study.pruner = PRUNERS[self.pruner](self.n_startup_trials, self.n_evaluations)
+        self.study.sampler = NumberedSampler(self.sampler, self.job.seed, self.n_startup_trials)
 
     def try_one(self, most: int | None) -> FrozenTrial | None:
         """Train once.
@@ -143,7 +142,7 @@ class Search:
         try:
             # A trial that another process left behind counts no longer, but is tried again.
             retry_dead_trials(self.study)
-            if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
+            if most is not None and len(self.trials(COUNTED)) >= most:
                 return None
             trial = self.study.ask(self.space.dimensions)
             trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
@@ -153,15 +152,20 @@ class Search:
                 f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})"
             ) from error
 
-    def trials(self, *states: str) -> list[FrozenTrial]:
-        """The trials in these states, such as ``COMPLETE``; all that ended by default."""
-        trials = self.study.get_trials(deepcopy=False)
-        return [trial for trial in trials if trial.state.name in (states or ENDED)]
+    def trials(self, states: Iterable[TrialState] = tuple(STATES)) -> list[FrozenTrial]:
+        """The trials in these states; all that ended by default."""
+        return self.study.get_trials(deepcopy=False, states=states)
 
     @property
     def best(self) -> FrozenTrial | None:
         """The best trial that was finished, of any process; None before the first one."""
-        return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
+        with suppress(ValueError):
+            return self.study.best_trial
+        return None
+
+    def settings(self, trial: FrozenTrial | optuna.Trial) -> StrDict:
+        """All settings of a trial, as YAML holds them."""
+        return self.space.settings(trial.params)
 
     def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
         """Train as a trial says; return its value and state. Whatever happens to a choice of
@@ -181,9 +185,8 @@ class Search:
     def _value(self, trial: optuna.Trial) -> float | None:
         """Train as a trial says; return the value of its last evaluation, None if it was pruned."""
         known = self.job.config
-        settings = self.space.settings(trial.params)
-        trial.set_user_attr(SETTINGS, json.dumps(settings))
-        config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
+        where = f"trial {trial.number}"
+        config = build_config(known.algo, known.env_id, self.settings(trial), where)
         # A training ends with a whole rollout.
         rollout = config.rollout_steps * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout
