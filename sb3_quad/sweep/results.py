@@ -12,10 +12,8 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import combinations, groupby
-from operator import attrgetter
+from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -95,11 +93,13 @@ class SweepResults(Frozen):
         return sum(map(len, self.configurations.values()))
 
 
-def write_results(folder: Path, sweep: Sweep, results: Mapping[str, RunResult]) -> SweepResults:
-    """Write ``results.csv``, a line for each run and scenario, and ``results.json``.
+def write_results(
+    folder: Path, sweep: Sweep, results: Mapping[str, RunResult]
+) -> tuple[SweepResults, list[Table]]:
+    """Write ``results.csv``, a line for each run and scenario, ``results.json``, and the report.
 
     :param results: of all runs that ended, by name.
-    :return: means, intervals and comparisons of all runs that are finished.
+    :return: means, intervals and comparisons of all runs that are finished, and their tables.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     lines: list[StrDict] = []
@@ -126,37 +126,66 @@ def write_results(folder: Path, sweep: Sweep, results: Mapping[str, RunResult]) 
             lines.append({**line, "scenario": scenario, "episodes": len(part), **statistics})
     table = pd.DataFrame(lines, columns=COLUMNS)
     write_text(folder / "results.csv", table.to_csv(index=False, float_format="%.9g"))
+    tables = []
     if parts:
-        _estimate(summary, pd.concat(parts, names=LEVELS))
+        tables = _compare(summary, pd.concat(parts, names=LEVELS))
+        _write_report(folder, summary, tables)
     write_text(folder / "results.json", summary.model_dump_json(indent=1) + "\n")
-    return summary
+    return summary, tables
 
 
-def _estimate(summary: SweepResults, flights: Any) -> None:
+def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     """Add the means over seeds of all configurations, and compare all pairs of them.
 
     :param flights: a table of episodes by ``LEVELS``.
+    :return: for each scenario a table with a column for each configuration, and a last one that
+        compares them.
     """
+    columns = []
+    for name, seeds in summary.configurations.items():
+        columns.append(
+            Column(f"{name} (1 seed)" if len(seeds) == 1 else f"{name} ({len(seeds)} seeds)")
+        )
+    tables = []
+    comparisons = []
     for scenario, group in flights.groupby(level="scenario", sort=False):
-        names = group.index.unique("configuration")
-        for measure in MEASURES:
+        rows = []
+        for measure, (row, factor, decimals) in ROWS.items():
             key = {"scenario": scenario, "measure": measure}
             statistic = np.nanmedian if measure == "final_error" else np.nanmean
-            # A row for each run, a column for each episode.
+            # Of each configuration a row for each run, a column for each episode.
             values = group[measure].unstack()
-            for name in names:
-                mean = over_seeds(values.loc[name].to_numpy(), statistic)
+            runs = {name: values.query("configuration == @name") for name in summary.configurations}
+            means = {name: over_seeds(runs[name].to_numpy(), statistic) for name in runs}
+            for name, mean in means.items():
                 if mean is not None:
                     summary.estimates.append(MeanOverSeeds(**dict(mean), **key, configuration=name))
+            # No row for what the environment does not report.
+            if any(means.values()):
+                cells = [estimate_cell(mean, factor, decimals) for mean in means.values()]
+                rows.append(replace(row, cells=cells))
             if measure not in COMPARED:
                 continue
-            for first, second in combinations(names, 2):
+            for first, second in combinations(runs, 2):
                 # Differences are paired: only the seeds that both have, and the same episodes.
-                paired = (values.loc[first] - values.loc[second]).dropna(how="all")
-                difference = over_seeds(paired.to_numpy())
+                paired = runs[first].droplevel(0) - runs[second].droplevel(0)
+                difference = over_seeds(paired.dropna(how="all").to_numpy())
                 if difference is not None:
                     key |= {"first": first, "second": second, "verdict": verdict(difference)}
                     summary.comparisons.append(Comparison(**dict(difference), **key))
+                    name = f"{scenario}, {row.heading}: {first} than {second}"
+                    cells = [
+                        Cell(words=key["verdict"]),
+                        estimate_cell(difference, factor, decimals),
+                    ]
+                    comparisons.append(Row(name, cells=cells))
+        tables.append(Table(columns, rows, title=scenario, caption=CAPTION))
+    # There are comparisons if there are several configurations.
+    if comparisons:
+        columns = [Column("is", align="left"), Column("difference")]
+        title = "better, worse, cannot tell"
+        tables.append(Table(columns, comparisons, title=title, caption=PAIRED))
+    return tables
 
 
 def over_seeds(
@@ -197,47 +226,10 @@ def verdict(difference: Estimate) -> str:
     return "cannot tell"
 
 
-def tables(summary: SweepResults) -> list[Table]:
-    """Return for each scenario a table with a column for each configuration, and a last one that
-    compares them.
-    """
-    columns = []
-    for name, runs in summary.configurations.items():
-        seeds = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
-        columns.append(Column(f"{name} ({seeds})"))
-    made = []
-    for scenario, of_scenario in groupby(summary.estimates, attrgetter("scenario")):
-        rows = []
-        for measure, estimates in groupby(of_scenario, attrgetter("measure")):
-            known = {estimate.configuration: _cell(estimate) for estimate in estimates}
-            cells = [known.get(name, Cell()) for name in summary.configurations]
-            rows.append(replace(ROWS[measure][0], cells=cells))
-        made.append(Table(columns, rows, title=scenario, caption=CAPTION))
-    # The comparisons, if there are several configurations.
-    rows = []
-    for item in summary.comparisons:
-        name = f"{item.scenario}, {ROWS[item.measure][0].heading}: {item.first} than {item.second}"
-        rows.append(Row(name, cells=[Cell(words=item.verdict), _cell(item)]))
-    if rows:
-        columns = [Column("is", align="left"), Column("difference")]
-        made.append(Table(columns, rows, title="better, worse, cannot tell", caption=PAIRED))
-    return made
-
-
-def _cell(estimate: MeanOverSeeds | Comparison) -> Cell:
-    _, factor, decimals = ROWS[estimate.measure]
-    return estimate_cell(estimate, factor, decimals)
-
-
-def write_report(folder: Path, summary: SweepResults, shown: Sequence[Table]) -> None:
-    """Write the report of a sweep's finished runs: a section for each table, and the learning
-    curves.
-
-    :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`.
-    :raises ConfigError: a folder that cannot be written.
-    """
+def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) -> None:
+    """Write the report of the finished runs: a section for each table, and the learning curves."""
     parts: list[Section] = []
-    for table in shown:
+    for table in tables:
         anchor = f"table-{len(parts)}"
         parts.append(Section(anchor, table.title, tables=[table], facts=table.caption))
     plots = _curves(folder, summary)

@@ -3,11 +3,9 @@ agent.
 """
 
 import hashlib
-from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -19,10 +17,10 @@ from sb3_quad.base.files import one_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.base.types import Report, StrDict
+from sb3_quad.base.types import Report
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
-from sb3_quad.evaluation.evaluate import fly_scenario
+from sb3_quad.evaluation.evaluate import Progress, fly_scenario
 from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
@@ -42,8 +40,6 @@ from sb3_quad.training.pipeline import (
 
 EPISODES = 240  # of each task, where no suite is named
 TASKS = ("state_recovery", "target_tracking")
-# Receives the number of runs that ended, that of all runs, and their name.
-Show = Callable[[int, int, str], None]
 LOG = "log.txt"  # the reports of the training, in the run's folder
 
 
@@ -52,7 +48,7 @@ def execute(
     sweep: Sweep,
     executor: Executor,
     signals: StopSignals,
-    show: Show,
+    show: Progress,
     report: Report,
 ) -> dict[str, RunResult]:
     """Execute all runs of a sweep's folder that are not finished.

@@ -150,7 +150,7 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
     from sb3_quad.cli.output import console, progress_bar
     from sb3_quad.executors import start_executor
     from sb3_quad.sweep.folder import write_sweep
-    from sb3_quad.sweep.results import tables, write_report, write_results
+    from sb3_quad.sweep.results import write_results
     from sb3_quad.sweep.run import execute
     from sb3_quad.training.runs import claim_folder
 
@@ -176,12 +176,9 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
             ended = execute(folder, sweep, executor, signals, show, print)
             # Nothing interrupts the results.
             signals.hold()
-            results = write_results(folder, sweep, ended)
-            if results.finished:
-                shown = tables(results)
-                for table in shown:
-                    console().print(table)
-                write_report(folder, results, shown)
+            results, tables = write_results(folder, sweep, ended)
+            for table in tables:
+                console().print(table)
     seconds = time.perf_counter() - start
     print(f"{results.finished} of {runs} finished, {len(results.failed)} failed; {seconds:.1f} s")
     report = ", report.md, report.html" if results.finished else ""
