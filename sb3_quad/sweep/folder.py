@@ -40,8 +40,6 @@ class RunResult(Frozen):
     """why it failed, in one line"""
     agent: str = ""
     """the zip that flew, relative to the run's folder"""
-    weights: str = ""
-    """SHA-256 of that agent's parameters"""
     timesteps: int = 0
     seconds: float = 0.0
     """wall-clock time of the training; of a run that was resumed, since then"""

@@ -50,7 +50,7 @@ LEVELS = ("configuration", "seed", "scenario", "episode")
 COLUMNS = (
     *("run", "configuration", "seed", "state", "scenario", "episodes"),
     *MEASURES,
-    *("timesteps", "agent", "weights", "message"),
+    *("timesteps", "agent", "message"),
 )
 
 

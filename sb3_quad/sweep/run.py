@@ -2,7 +2,6 @@
 agent.
 """
 
-import hashlib
 from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
-from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
 from sb3_quad.base.files import one_line, write_text
@@ -116,7 +114,6 @@ def work(run: Run, place: Path, suite: Suite | None, evaluation: Evaluation) -> 
             name=run.name,
             state="finished",
             agent=agent.relative_to(place).as_posix(),
-            weights=digest(agent),
             timesteps=sum(stage.timesteps for stage in stages),
             seconds=round(sum(stage.seconds for stage in stages), 1),
             flights=_fly(agent, trained.job, suite, evaluation),
@@ -129,12 +126,6 @@ def work(run: Run, place: Path, suite: Suite | None, evaluation: Evaluation) -> 
         if not isinstance(error, SB3QuadError):
             message = f"{type(error).__name__}: {message}"
         return RunResult(name=run.name, state="failed", message=message)
-
-
-def digest(agent: Path) -> str:
-    """The SHA-256 of the parameters in an agent's zip."""
-    parameters = parameters_to_vector(load_model(agent).policy.parameters())
-    return hashlib.sha256(parameters.detach().numpy().tobytes()).hexdigest()
 
 
 def pipeline_folder(place: Path) -> Path | None:

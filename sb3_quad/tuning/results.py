@@ -27,8 +27,9 @@ def write_results(search: Search) -> None:
     best = search.best
     if best is None:
         return
+    config = search.config(best)
     # The best settings say where they come from, in comments that train skips.
-    settings = yaml.safe_dump({search.job.config.env_id: search.settings(best)}, sort_keys=False)
+    settings = yaml.safe_dump({config.env_id: config.settings}, sort_keys=False)
     origin = (
         f"# Found by sb3-quad tune: trial {best.number} of study {search.name}, "
         f"{in_words(search, best)}.\n# {train_command(search)}\n"

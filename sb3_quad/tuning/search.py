@@ -11,9 +11,10 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,26 +31,20 @@ from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.training.config import TrainingJob, build_config
+from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 
 Factories = dict[str, Callable[..., Any]]
-# From a seed and n_startup_trials.
+# From n_startup_trials and a seed.
 SAMPLERS: Factories = {
-    "tpe": lambda seed, n: TPESampler(
-        seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True
-    ),
-    "random": lambda seed, n: RandomSampler(seed=seed),
-    "cmaes": lambda seed, n: CmaEsSampler(
-        seed=seed, n_startup_trials=n, warn_independent_sampling=False
-    ),
+    "tpe": partial(TPESampler, multivariate=True, constant_liar=True),
+    "random": lambda n_startup_trials, seed: RandomSampler(seed),
+    "cmaes": partial(CmaEsSampler, warn_independent_sampling=False),
 }
 # From n_startup_trials and n_evaluations.
 PRUNERS: Factories = {
-    "median": lambda n, evaluations: MedianPruner(
-        n_startup_trials=n, n_warmup_steps=evaluations // 3
-    ),
+    "median": lambda n, evaluations: MedianPruner(n, n_warmup_steps=evaluations // 3),
     "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
     "none": lambda n, evaluations: NopPruner(),
 }
@@ -152,7 +147,7 @@ class Search:
                 f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})"
             ) from error
 
-    def trials(self, states: Iterable[TrialState] = tuple(STATES)) -> list[FrozenTrial]:
+    def trials(self, states: Container[TrialState] = STATES) -> list[FrozenTrial]:
         """The trials in these states; all that ended by default."""
         return self.study.get_trials(deepcopy=False, states=states)
 
@@ -163,9 +158,14 @@ class Search:
             return self.study.best_trial
         return None
 
-    def settings(self, trial: FrozenTrial | optuna.Trial) -> StrDict:
-        """All settings of a trial, as YAML holds them."""
-        return self.space.settings(trial.params)
+    def config(self, trial: FrozenTrial | optuna.Trial) -> TrainingConfig:
+        """The settings of a trial.
+
+        :raises ConfigError: they do not go together.
+        """
+        known = self.job.config
+        settings = self.space.settings(trial.params)
+        return build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
 
     def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
         """Train as a trial says; return its value and state. Whatever happens to a choice of
@@ -184,18 +184,15 @@ class Search:
 
     def _value(self, trial: optuna.Trial) -> float | None:
         """Train as a trial says; return the value of its last evaluation, None if it was pruned."""
-        known = self.job.config
-        where = f"trial {trial.number}"
-        config = build_config(known.algo, known.env_id, self.settings(trial), where)
+        config = self.config(trial)
         # A training ends with a whole rollout.
-        rollout = config.rollout_steps * config.n_envs
-        total = math.ceil(config.n_timesteps / rollout) * rollout
+        total = math.ceil(config.n_timesteps / config.rollout) * config.rollout
         eval_freq = math.ceil(total / self.n_evaluations)
         changes = {"config": config, "eval_freq": eval_freq, "snapshot_every": 0}
         values: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
-            if known.task is None:
+            if config.task is None:
                 values.append(reward)
             else:
                 values.append(score(success, reward, self.job.eval_episodes))
@@ -259,7 +256,7 @@ class NumberedSampler(BaseSampler):
         before = study.get_trials(deepcopy=False)[: trial.number]
         number = sum("again" not in earlier.user_attrs for earlier in before)
         seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
-        self._sampler = SAMPLERS[self._kind](seed, self._startup)
+        self._sampler = SAMPLERS[self._kind](n_startup_trials=self._startup, seed=seed)
         return self._sampler.infer_relative_search_space(study, trial)
 
     def sample_relative(self, *arguments: Any) -> Any:

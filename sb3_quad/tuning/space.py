@@ -98,7 +98,7 @@ class SearchSpace:
             # All of the same size, but for the last, which may be smaller.
             count = changed.pop(MINIBATCHES)
             config = build_config(self.config.algo, self.config.env_id, changed)
-            changed["batch_size"] = math.ceil(config.rollout_steps * config.n_envs / count)
+            changed["batch_size"] = math.ceil(config.rollout / count)
         return changed
 
     def start(self) -> StrDict | None:
@@ -155,8 +155,7 @@ def _current(config: TrainingConfig, name: str) -> Any:
     if inner:
         return _entries(config.settings.get(outer)).get(inner)
     if name == MINIBATCHES:
-        rollout = config.rollout_steps * config.n_envs
-        return round(rollout / (config.keyword("batch_size") or 1))
+        return round(config.rollout / (config.keyword("batch_size") or 1))
     if name in config.settings:
         return config.settings[name]
     if name in JOB_SETTINGS:

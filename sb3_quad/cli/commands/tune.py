@@ -149,21 +149,18 @@ def _print_results(search: Any) -> None:
     from sb3_quad.cli.closing import agent_and_expert
     from sb3_quad.cli.output import console
     from sb3_quad.controllers.zips import load_model
-    from sb3_quad.training.config import build_config
     from sb3_quad.training.runs import open_run
     from sb3_quad.tuning.results import count_trials, train_command, trial_line
     from sb3_quad.tuning.search import RUN
 
-    config = search.job.config
     best = search.best
     if best is not None:
         print(f"the best: {trial_line(search, best)}")
         path = Path(best.user_attrs[RUN])
         # A process on another machine may have trained it.
-        if config.task and path.is_dir():
+        if search.job.config.task and path.is_dir():
             model = open_run(path).model
-            flown = build_config(config.algo, config.env_id, search.settings(best))
-            job = search.job.model_copy(update={"config": flown})
+            job = search.job.model_copy(update={"config": search.config(best)})
             console().print(agent_and_expert(job, load_model(model)))
             print(f"agent: {model}")
         print(f"to train: {train_command(search)}")
