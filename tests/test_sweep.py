@@ -219,7 +219,7 @@ class Inline:
 
     workers = 1
 
-    def __init__(self, *arguments):
+    def __init__(self, *arguments, **resources):
         self.stop = lambda: None
 
     def submit(self, function, *arguments):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import yaml
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
@@ -27,12 +27,15 @@ PLAN = "plan.json"
 RECORDS = "records"
 Numbers: TypeAlias = tuple[float | None, ...]
 MEASURES = ("success", "survival", "reward", "final_error", "time")
-"""The numbers of an episode: 0 or 1, 0 or 1, sum, m (None: crashed or out of range), s to the
-tightest tolerance, or, where it starts at its target, until stable (None: never)."""
+"""The numbers of an episode: 0 or 1, 0 or 1, sum, m (NaN: crashed or out of range), s to the
+tightest tolerance, or, where it starts at its target, until stable (NaN: never)."""
 
 
 class RunResult(Frozen):
     """The end of a run."""
+
+    # A file has null for NaN.
+    model_config = ConfigDict(allow_inf_nan=True)
 
     name: str
     state: Literal["finished", "failed", "interrupted"]

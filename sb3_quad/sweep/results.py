@@ -54,25 +54,6 @@ COLUMNS = (
 )
 
 
-class MeanOverSeeds(Estimate):
-    """The mean of a measure over the finished runs of a configuration."""
-
-    configuration: str
-    scenario: str
-    measure: str
-
-
-class Comparison(Estimate):
-    """The difference of two configurations, the first less the second."""
-
-    scenario: str
-    measure: str
-    first: str
-    second: str
-    verdict: str
-    """whether the first is better or worse"""
-
-
 class SweepResults(Frozen):
     """The content of ``results.json``."""
 
@@ -83,8 +64,13 @@ class SweepResults(Frozen):
     """by the name of a run, why it failed"""
     configurations: dict[str, list[int]] = {}
     """by the name of a configuration, the seeds of its finished runs, if it has any"""
-    estimates: list[MeanOverSeeds] = []
-    comparisons: list[Comparison] = []
+    estimates: list[StrDict] = []
+    """means over the finished runs of a configuration, by scenario and measure: fields of Estimate
+    """
+    comparisons: list[StrDict] = []
+    """differences of two configurations, the first less the second: fields of Estimate, and as
+    verdict whether the first is better or worse
+    """
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -159,7 +145,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
             means = {name: over_seeds(runs[name].to_numpy(), statistic) for name in runs}
             for name, mean in means.items():
                 if mean is not None:
-                    summary.estimates.append(MeanOverSeeds(**dict(mean), **key, configuration=name))
+                    summary.estimates.append({**dict(mean), **key, "configuration": name})
             # No row for what the environment does not report.
             if any(means.values()):
                 cells = [estimate_cell(mean, factor, decimals) for mean in means.values()]
@@ -172,7 +158,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
                 difference = over_seeds(paired.dropna(how="all").to_numpy())
                 if difference is not None:
                     key |= {"first": first, "second": second, "verdict": verdict(difference)}
-                    summary.comparisons.append(Comparison(**dict(difference), **key))
+                    summary.comparisons.append({**dict(difference), **key})
                     name = f"{scenario}, {row.heading}: {first} than {second}"
                     cells = [
                         Cell(words=key["verdict"]),

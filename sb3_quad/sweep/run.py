@@ -25,7 +25,7 @@ from sb3_quad.executors import Executor, as_they_end
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.sweep.folder import Numbers, RunResult, Sweep, read_results, write_result
 from sb3_quad.sweep.runs import Run
-from sb3_quad.sweep.spec import Evaluation
+from sb3_quad.sweep.spec import Evaluation, SweepSpec
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.pipeline import (
@@ -72,7 +72,7 @@ def execute(
             report(f"{run.name}: failed before ({message}); is tried again")
         elif pipeline_folder(place) is not None:
             report(f"{run.name}: resumes where it stopped")
-        calls[executor.submit(work, run, place, sweep.suite, sweep.spec.evaluation)] = run
+        calls[executor.submit(work, run, place, sweep.spec, sweep.suite)] = run
     show(len(results), len(sweep.runs), "runs")
     for run, future in as_they_end(executor, calls, signals, report):
         try:
@@ -93,18 +93,18 @@ def execute(
     return results
 
 
-def work(run: Run, place: Path, suite: Suite | None, evaluation: Evaluation) -> RunResult:
+def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResult:
     """Train a run in its folder, or the rest of it, and fly its agent. The result of a run that
     fails says why.
 
     :param suite: the scenarios of the agent; None: fresh episodes of both tasks, as many as
-        ``evaluation`` says.
+        ``spec.evaluation`` says.
     """
     # One core for each run: so the same weights come out on any machine.
     use_cpus(1)
     try:
         place.mkdir(parents=True, exist_ok=True)
-        import_packages(run.gym_packages, "gym_packages:")
+        import_packages(spec.gym_packages, "gym_packages:")
         trained = _train(run, place)
         if trained.exit_code != 0:
             raise KeyboardInterrupt
@@ -116,7 +116,7 @@ def work(run: Run, place: Path, suite: Suite | None, evaluation: Evaluation) -> 
             agent=agent.relative_to(place).as_posix(),
             timesteps=sum(stage.timesteps for stage in stages),
             seconds=round(sum(stage.seconds for stage in stages), 1),
-            flights=_fly(agent, trained.job, suite, evaluation),
+            flights=_fly(agent, trained.job, suite, spec.evaluation),
         )
     except KeyboardInterrupt:
         return RunResult(name=run.name, state="interrupted")
@@ -187,7 +187,7 @@ def _fly(
 
 
 def _numbers(flights: Flights) -> dict[str, Numbers]:
-    """Return the measures of all episodes, None where there is no number."""
+    """Return the measures of all episodes, NaN where there is no number."""
     # The time to the tightest tolerance.
     arrival = flights.time_to[min(flights.time_to)]
     # An episode that starts at its target has no way to it, and so no cross-track error.
@@ -199,7 +199,4 @@ def _numbers(flights: Flights) -> dict[str, Numbers]:
         "final_error": np.where(flights.survival, flights.final_error, np.nan),
         "time": np.where(has_way, arrival, flights.recovery_time),
     }
-    numbers = {}
-    for name, values in measures.items():
-        numbers[name] = np.where(np.isfinite(values), values, np.array(None)).tolist()
-    return numbers
+    return {name: values.tolist() for name, values in measures.items()}

@@ -47,7 +47,6 @@ class Run(Frozen):
     """arguments of TrainingJob, less config, seed and log_folder"""
     stages: tuple[Stage, ...]
     """of its pipeline, with all their settings; a single run is one of one stage"""
-    gym_packages: tuple[str, ...] = ()
 
 
 def make_runs(spec: SweepSpec) -> list[Run]:
@@ -75,7 +74,6 @@ def make_runs(spec: SweepSpec) -> list[Run]:
                 seed=seed,
                 job=job,
                 stages=tuple(stages),
-                gym_packages=spec.gym_packages,
             )
             if run.name in runs:
                 raise ConfigError(

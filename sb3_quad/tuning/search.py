@@ -6,7 +6,6 @@ samplers are seeded once for a process. A study here may be a journal file, on a
 repeats by its seed however often it was interrupted; so retries and seeds of trials are our own.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -31,6 +30,7 @@ from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
 from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.evaluation.controllers import ControllerSpec, controller_record
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
@@ -222,10 +222,7 @@ class Search:
         # The agent counts by its content, since its file may move.
         agent = None
         if job.trained_agent is not None:
-            try:
-                agent = hashlib.sha256(Path(job.trained_agent).read_bytes()).hexdigest()
-            except OSError as error:
-                raise ConfigError(f"{job.trained_agent}: cannot be read ({error})") from None
+            agent = controller_record(ControllerSpec("agent", job.trained_agent)).content
         return {
             "algo": job.config.algo,
             "env": job.config.env_id,
@@ -238,6 +235,7 @@ class Search:
         }
 
 
+@dataclass
 class NumberedSampler(BaseSampler):
     """One of :data:`SAMPLERS`, made again for each trial, from a seed, the known trials and its
     number, retries not counted.
@@ -246,17 +244,17 @@ class NumberedSampler(BaseSampler):
     as if it had never been interrupted.
     """
 
-    def __init__(self, kind: str, seed: int, n_startup_trials: int) -> None:
-        self._kind = kind
-        self._seed = seed
-        self._startup = n_startup_trials
+    kind: str
+    seed: int
+    n_startup_trials: int
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> Any:
         # A retry has the parameters of an earlier trial, and no number of its own.
         before = study.get_trials(deepcopy=False)[: trial.number]
         number = sum("again" not in earlier.user_attrs for earlier in before)
-        seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
-        self._sampler = SAMPLERS[self._kind](n_startup_trials=self._startup, seed=seed)
+        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
+        make = SAMPLERS[self.kind]
+        self._sampler = make(n_startup_trials=self.n_startup_trials, seed=seed)
         return self._sampler.infer_relative_search_space(study, trial)
 
     def sample_relative(self, *arguments: Any) -> Any:

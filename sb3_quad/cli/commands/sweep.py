@@ -156,11 +156,9 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
 
     start = time.perf_counter()
     workers = min(options.workers or available_cpus(), len(sweep.runs))
-    needs = sweep.spec.resources
     runs = _count(len(sweep.runs), "run")
-    with start_executor(
-        options.executor, workers, options.address, needs.num_cpus, needs.num_gpus
-    ) as executor:
+    resources = dict(sweep.spec.resources)
+    with start_executor(options.executor, workers, options.address, **resources) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
             parent = Path(options.log_folder or "logs") / "sweep"
