@@ -26,9 +26,6 @@ from sb3_quad.sweep.spec import SweepSpec
 PLAN = "plan.json"
 RECORDS = "records"
 Numbers: TypeAlias = tuple[float | None, ...]
-MEASURES = ("success", "survival", "reward", "final_error", "time")
-"""The numbers of an episode: 0 or 1, 0 or 1, sum, m (NaN: crashed or out of range), s to the
-tightest tolerance, or, where it starts at its target, until stable (NaN: never)."""
 
 
 class RunResult(Frozen):
@@ -47,7 +44,9 @@ class RunResult(Frozen):
     seconds: float = 0.0
     """wall-clock time of the training; of a run that was resumed, since then"""
     flights: dict[str, dict[str, Numbers]] = {}
-    """by scenario and measure, a number for each episode, the same episodes in every run"""
+    """by scenario and measure, a number for each episode, the same episodes in every run: success
+    and survival 0 or 1; reward the sum; final_error in m (NaN: crashed or out of range); time in s
+    to the tightest tolerance, or, where it starts at its target, until stable (NaN: never)"""
 
 
 class Sweep(Frozen):

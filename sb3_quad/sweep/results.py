@@ -32,7 +32,7 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.sweep.folder import MEASURES, RunResult, Sweep
+from sb3_quad.sweep.folder import RunResult, Sweep
 
 # By measure: its row, the factor from values to cells, and their decimals.
 ROWS = {
@@ -49,7 +49,7 @@ PAIRED = "paired bootstrap over the seeds and episodes that both have"
 LEVELS = ("configuration", "seed", "scenario", "episode")
 COLUMNS = (
     *("run", "configuration", "seed", "state", "scenario", "episodes"),
-    *MEASURES,
+    *ROWS,
     *("timesteps", "agent", "message"),
 )
 
@@ -105,7 +105,7 @@ def write_results(
         summary.configurations.setdefault(run.configuration, []).append(run.seed)
         for scenario, measures in result.flights.items():
             # A row for each episode, NaN where there is no number.
-            part = pd.DataFrame(measures, columns=MEASURES, dtype=np.float64)
+            part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
             parts[run.configuration, run.seed, scenario] = part
             # All are means but for the final error, which is a median.
             statistics = {**part.mean(), "final_error": part["final_error"].quantile()}

@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
-from sb3_quad.base.files import one_line, write_text
+from sb3_quad.base.errors import ConfigError, WorkerDied
+from sb3_quad.base.files import kind_and_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
@@ -122,10 +122,7 @@ def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResu
         return RunResult(name=run.name, state="interrupted")
     # Also the errors of a user's callback or environment: the other runs continue.
     except (Exception, SystemExit) as error:
-        message = one_line(error)
-        if not isinstance(error, SB3QuadError):
-            message = f"{type(error).__name__}: {message}"
-        return RunResult(name=run.name, state="failed", message=message)
+        return RunResult(name=run.name, state="failed", message=kind_and_line(error))
 
 
 def pipeline_folder(place: Path) -> Path | None:

@@ -26,7 +26,7 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
-from sb3_quad.base.files import one_line
+from sb3_quad.base.files import kind_and_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
 from sb3_quad.base.types import StrDict, StrPath
@@ -54,8 +54,6 @@ STATES = {
     TrialState.PRUNED: "pruned",
     TrialState.FAIL: "failed",
 }
-# Those of trials that count.
-COUNTED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
 BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials share
 # User attributes of a trial. The owner is the machine and the process that trains it.
 OWNER = "owner"
@@ -137,15 +135,14 @@ class Search:
         try:
             # A trial that another process left behind counts no longer, but is tried again.
             retry_dead_trials(self.study)
-            if most is not None and len(self.trials(COUNTED)) >= most:
+            counted = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
+            if most is not None and len(self.trials(counted)) >= most:
                 return None
             trial = self.study.ask(self.space.dimensions)
             trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
             return self.study.tell(trial, *self._outcome(trial))
         except (OSError, optuna.exceptions.OptunaError) as error:
-            raise ConfigError(
-                f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})"
-            ) from error
+            raise ConfigError(f"storage {self.storage}: fails ({kind_and_line(error)})") from error
 
     def trials(self, states: Container[TrialState] = STATES) -> list[FrozenTrial]:
         """The trials in these states; all that ended by default."""
@@ -174,7 +171,7 @@ class Search:
         try:
             value = self._value(trial)
         except Exception as error:
-            trial.set_user_attr(ERROR, f"{type(error).__name__}: {one_line(error)}")
+            trial.set_user_attr(ERROR, kind_and_line(error))
             return None, TrialState.FAIL
         except KeyboardInterrupt:
             trial.set_user_attr(ERROR, INTERRUPTED)
@@ -279,8 +276,7 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
             study_name=name, storage=backend, direction="maximize", load_if_exists=True
         )
     except Exception as error:  # databases and damaged journals raise anything
-        reason = f"{type(error).__name__}: {one_line(error)}"
-        raise ConfigError(f"storage {storage}: cannot be used ({reason})") from None
+        raise ConfigError(f"storage {storage}: cannot be used ({kind_and_line(error)})") from None
 
 
 def _open_journal(path: Path) -> JournalStorage:
