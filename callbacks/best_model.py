@@ -1,6 +1,7 @@
 """Evaluation during the training, and the best model kept."""
 
 import time
+from collections import ChainMap
 from collections.abc import Callable, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -23,8 +24,8 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "mean_ep_length": ("ep_lengths", np.mean),
     "final_error": ("final_errors", np.nanmedian),
 }
-# The array and the name in the log of each rate that may decide.
-RATES = {"success": ("successes", "success_rate"), "survival": ("survivals", "survival_rate")}
+# The array of each rate that may decide; "success_rate" is its name in the log.
+RATES = {"success": "successes", "survival": "survivals"}
 # The key in ``info`` of each array that environments may report.
 REPORTED = {"successes": "is_success", "survivals": "survival", "final_errors": "distance"}
 # Whether to continue after an evaluation with this rate that decides, and this mean reward.
@@ -110,7 +111,7 @@ class BestModel(EveryTimesteps):
         self._best_model = best_model
         self._report = report
         self._should_continue = should_continue
-        self._by = RATES[by][0]
+        self._by = RATES[by]
         path = Path(evaluations)
         self._own = _Evaluations(env, path)
         # By the prefix of their part of a report.
@@ -128,10 +129,11 @@ class BestModel(EveryTimesteps):
         for evaluations in self._evaluations.values():
             evaluations.read(self._n_episodes)
         # A resumed training continues the clock and knows the best model so far.
-        rows = self._own.rows
-        self._start = time.perf_counter() - rows.get("seconds", [0.0])[-1]
-        for number in range(len(rows.get("timesteps", []))):
-            self.best = max(self.best, self._own.score(self._by, number))
+        self._start = time.perf_counter()
+        for row in self._own.rows:
+            self.best = max(self.best, score(row, self._by))
+        if self._own.rows:
+            self._start -= self._own.rows[-1].get("seconds", 0.0)
         self._last = last_timestep(self.model)
 
     def _on_event(self) -> bool:
@@ -146,7 +148,8 @@ class BestModel(EveryTimesteps):
     @property
     def latest(self) -> int:
         """Timesteps of the latest evaluation; 0: there was none."""
-        return int(self._own.rows.get("timesteps", [0])[-1])
+        rows = self._own.rows
+        return int(rows[-1]["timesteps"]) if rows else 0
 
     def evaluate(self) -> None:
         """Evaluate the model as it is now, note the results, and keep it if it is the best."""
@@ -160,38 +163,40 @@ class BestModel(EveryTimesteps):
         for prefix, evaluations in self._evaluations.items():
             flown = _fly(self.model, evaluations.env, self._n_episodes, self._seed)
             evaluations.append({**values, **flown})
-            latest = evaluations.latest()
-            for name, value in latest.items():
-                self.logger.record(f"{evaluations.group}/{name}", value)
             text = prefix
-            for name, (_, rate) in RATES.items():
-                if rate in latest:
-                    text += f"{name} {100 * latest[rate]:.1f} %, "
-            texts.append(f"{text}mean reward {latest['mean_reward']:.2f}")
+            for name, (array, statistic) in LOGGED.items():
+                if array in flown:
+                    self.logger.record(
+                        f"{evaluations.group}/{name}", float(statistic(flown[array]))
+                    )
+            for name, array in RATES.items():
+                if array in flown:
+                    text += f"{name} {100 * np.mean(flown[array]):.1f} %, "
+            texts.append(f"{text}mean reward {np.mean(flown['results']):.2f}")
         line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: {'; '.join(texts)}"
         if getattr(self.model, "policy_is_idle", False):
             line += " (critic warm-up: the policy does not learn yet)"
-        score = self._own.score(self._by)
-        if score > self.best:
-            self.best = score
+        latest = score(self._own.rows[-1], self._by)
+        if latest > self.best:
+            self.best = latest
             save_model(self.model, self._best_model)
             line += " (best so far)"
         self._report(line)
         # As EvalCallback does; a later evaluation in the same rollout would replace these values.
         self.logger.dump(self.num_timesteps)
-        self.stopped = not self._should_continue(*score)
+        self.stopped = not self._should_continue(*latest)
 
 
 class _Evaluations:
-    """The evaluations in some environments: rows of arrays by name, their file, and their group in
-    the log.
+    """The evaluations in some environments: each a row of arrays by name, their file, and their
+    group in the log.
     """
 
     def __init__(self, env: VecEnv, path: Path, group: str = "eval") -> None:
         self.env = env
         self.path = path
         self.group = group
-        self.rows: StrDict = {}
+        self.rows: list[StrDict] = []
 
     def read(self, n_episodes: int) -> None:
         """Continue the file, if it exists.
@@ -200,48 +205,41 @@ class _Evaluations:
         """
         if not self.path.is_file():
             return
-        self.rows = {name: list(array) for name, array in read_arrays(self.path).items()}
-        if not self.rows.get("results"):
+        arrays = read_arrays(self.path)
+        results = arrays.get("results", ())
+        if len(results) == 0:
             raise ConfigError(f"{self.path}: cannot be read (results: no such array, or empty)")
-        flown = len(self.rows["results"][-1])
+        flown = len(results[-1])
         if flown != n_episodes:
             raise ConfigError(
                 f"{self.path}: evaluations of {flown} episodes; "
                 f"n_episodes (--eval-episodes) must be {flown}"
             )
+        rows = zip(*arrays.values(), strict=False)
+        self.rows = [dict(zip(arrays, row, strict=True)) for row in rows]
 
-    def append(self, values: StrDict) -> None:
+    def append(self, row: StrDict) -> None:
         """Add an evaluation and write the file.
 
         NaN stands for what one of the evaluations does not have, such as losses before the first
         update.
         """
-        n_before = len(self.rows.get("timesteps", []))
-        for name in {**self.rows, **values}:
-            example = values[name] if name in values else self.rows[name][-1]
-            # An array that is new has rows for the earlier evaluations, too.
-            nothing = np.full(np.shape(example), np.nan)
-            self.rows.setdefault(name, [nothing] * n_before).append(values.get(name, nothing))
-        write_arrays(self.path, **self.rows)
+        self.rows.append(row)
+        example = dict(ChainMap(*self.rows))
+        arrays: StrDict = {}
+        for name, value in example.items():
+            nothing = np.full(np.shape(value), np.nan)
+            arrays[name] = [row.get(name, nothing) for row in self.rows]
+        write_arrays(self.path, **arrays)
 
-    def latest(self) -> dict[str, float]:
-        """Return the statistics of the latest evaluation by their names in the log."""
-        statistics = {}
-        for name, (array, statistic) in LOGGED.items():
-            values = np.asarray(self.rows.get(array, [np.nan])[-1], dtype=np.float64)
-            if not np.isnan(values).all():
-                statistics[name] = float(statistic(values))
-        return statistics
 
-    def score(self, by: str, number: int = -1) -> Score:
-        """Return the score of an evaluation; without successes, the reward decides.
+def score(row: StrDict, by: str) -> Score:
+    """Return the score of an evaluation; without successes, the reward decides.
 
-        :param by: the array of the rate.
-        """
-        reward = float(np.mean(self.rows["results"][number]))
-        if by not in self.rows:
-            return 0.0, reward
-        return float(np.nan_to_num(np.mean(self.rows[by][number]))), reward
+    :param by: the array of the rate.
+    """
+    rate = np.nan_to_num(np.mean(row.get(by, 0.0)))
+    return float(rate), float(np.mean(row["results"]))
 
 
 def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:

@@ -14,7 +14,7 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.sweep.folder import SweepFolder
+from sb3_quad.sweep.folder import read_results
 
 pytest.importorskip("ray")
 
@@ -60,9 +60,9 @@ def cluster(monkeypatch):
     made.shutdown()
 
 
-def weights(folder):
-    place = SweepFolder(folder)
-    return {name: record.weights for name, record in place.results().items()}
+def flights(folder):
+    """What the agents of a sweep flew, by the names of their runs."""
+    return {name: result.flights for name, result in read_results(Path(folder)).items()}
 
 
 def test_an_address_that_nobody_answers_is_refused_in_one_line():
@@ -102,8 +102,8 @@ def test_a_cluster_that_loses_a_node_gives_the_table_of_one_machine(tmp_path, mo
     assert process.wait(600) == 0
     assert main(["sweep", file, "--workers", "2", "--no-progress"]) == 0
     assert (
-        weights("logs/sweep/s_1") == weights("logs/sweep/s_2")
-        and len(weights("logs/sweep/s_1")) == 3
+        flights("logs/sweep/s_1") == flights("logs/sweep/s_2")
+        and len(flights("logs/sweep/s_1")) == 3
     )
     results = [Path(f"logs/sweep/s_{k}/results.json").read_text() for k in (1, 2)]
     assert results[0] == results[1]

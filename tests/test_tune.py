@@ -308,9 +308,9 @@ def test_studies_of_others_are_refused_and_one_that_was_left_at_its_birth_is_beg
     [
         (["--sampler", "tpee"], "did you mean 'tpe'"),
         (["--pruner", "medain"], "did you mean 'median'"),
-        (["--n-evaluations", "0"], "n_evaluations"),
-        (["--n-startup-trials", "-1"], "n_startup_trials"),
-        (["--eval-episodes", "0"], "eval_episodes"),
+        (["--n-evaluations", "0"], "--n-evaluations"),
+        (["--n-startup-trials", "-1"], "--n-startup-trials"),
+        (["--eval-episodes", "0"], "--eval-episodes"),
         (["--storage", "broken.log"], "storage broken.log: cannot be used"),
         (
             ["--storage", "cut.log"],
@@ -350,7 +350,7 @@ def test_invalid_spaces_are_refused(tmp_path, space, message):
     path = tmp_path / "space.yml"
     path.write_text(yaml.safe_dump(space))
     with pytest.raises(ConfigError, match=message) as caught:
-        load_space("dagger", SMALL, path)
+        load_space(build_config("dagger", ENV, SMALL), path)
     assert "space.yml" in str(caught.value)
 
 
@@ -392,7 +392,7 @@ def test_without_optuna_it_names_the_extra_to_install(command, monkeypatch, caps
 )
 def test_the_shipped_spaces_fit_the_shipped_settings(algo, file):
     config = load_config(algo, "QuadStateRecovery-v0" if algo != "dagger" else ENV, file)
-    space = load_space(algo, config.settings)
+    space = load_space(config)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(20):
         settings = space.settings(study.ask(dict(space.dimensions)).params)

@@ -191,7 +191,7 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
     assert short.rollout_steps == 1 and short.keyword("n_steps") == config.keyword(
         "n_steps"
     )  # of the returns: it stays
-    space = load_space(algo, config.settings)
+    space = load_space(config)
     assert space.start() is not None and "n_minibatches" not in space.dimensions
 
 

@@ -166,3 +166,8 @@ def one_line(error: BaseException) -> str:
     """Return the message of an exception as one line of at most 200 characters."""
     text = " ".join(str(error).split())
     return (text or type(error).__name__)[:200]
+
+
+def kind_and_line(error: BaseException) -> str:
+    """Return the class of an exception and :func:`one_line`, for errors that may be any."""
+    return f"{type(error).__name__}: {one_line(error)}"

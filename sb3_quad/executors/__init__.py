@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.process import StopSignals
@@ -12,7 +12,6 @@ from sb3_quad.executors.local import LocalExecutor
 EXECUTORS = ("local", "ray")
 # Time between two checks for a signal, s.
 TICK = 1.0
-Key = TypeVar("Key")
 
 if TYPE_CHECKING:
     from sb3_quad.executors.ray import RayExecutor
@@ -55,15 +54,15 @@ def start_executor(
 
 def as_they_end(
     executor: Executor,
-    calls: "dict[Future[Any], Key]",
+    calls: "dict[Future[Any], Any]",
     signals: StopSignals,
     report: Report,
-) -> "Iterator[tuple[Key, Future[Any]]]":
+) -> "Iterator[tuple[Any, Future[Any]]]":
     """Yield the key and the future of each call when it ends.
 
     After a signal the executor is stopped. Calls that it cancels are not yielded.
 
-    :param calls: The key of each call. It is emptied, and you may add calls on the way.
+    :param calls: The key of each call. It is emptied.
     """
     stopped = False
     while calls:

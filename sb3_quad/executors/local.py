@@ -24,8 +24,9 @@ class LocalExecutor:
     """Up to ``workers`` processes, each started when it is first needed.
 
     A thread of this process waits for each worker. Each worker is a pool of its own, so that one
-    that dies does not take the calls of others with it. Workers end with the process that started
-    them, even if that is killed. They ignore Ctrl-C, which this process handles.
+    that dies does not take the calls of others with it; its own call is tried once more. Workers
+    end with the process that started them, even if that is killed. They ignore Ctrl-C, which this
+    process handles.
     """
 
     def __init__(self, workers: int) -> None:
@@ -63,19 +64,20 @@ class LocalExecutor:
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function in the worker of the present thread."""
         worker = self._worker
-        try:
-            if not hasattr(worker, "pool"):
-                worker.pool = ProcessPoolExecutor(1, _context(), _begin)
-                worker.process = worker.pool.submit(os.getpid).result()
-                self._processes.add(worker.process)
-            # A worker that was not known yet when the executor stopped has received no signal.
-            if self._stopped:
-                raise BrokenProcessPool
-            return worker.pool.submit(function, *arguments).result()
-        except BrokenProcessPool:
+        # A worker that dies is replaced once, as for want of memory that others have released.
+        for _ in range(2):
+            with suppress(BrokenProcessPool):
+                if not hasattr(worker, "pool") and not self._stopped:
+                    worker.pool = ProcessPoolExecutor(1, _context(), _begin)
+                    worker.process = worker.pool.submit(os.getpid).result()
+                    self._processes.add(worker.process)
+                # A worker that was not known yet when the executor stopped got no signal.
+                if self._stopped:
+                    break
+                return worker.pool.submit(function, *arguments).result()
             self._processes.discard(getattr(worker, "process", 0))
             worker.__dict__.clear()
-            raise WorkerDied("its worker process ended unexpectedly (out of memory?)") from None
+        raise WorkerDied("its worker process ended unexpectedly (out of memory?)")
 
 
 def _context() -> Any:

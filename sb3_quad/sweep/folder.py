@@ -14,41 +14,39 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import yaml
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
-from sb3_quad.base.types import StrPath
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import SweepSpec
 
 PLAN = "plan.json"
+RECORDS = "records"
 Numbers: TypeAlias = tuple[float | None, ...]
-MEASURES = ("success", "survival", "reward", "final_error", "time")
-"""The numbers of an episode: 0 or 1, 0 or 1, sum, m (None: crashed or out of range), s to the
-tightest tolerance, or, where it starts at its target, until stable (None: never)."""
 
 
 class RunResult(Frozen):
     """The end of a run."""
 
+    # A file has null for NaN.
+    model_config = ConfigDict(allow_inf_nan=True)
+
     name: str
-    configuration: str
-    seed: int
     state: Literal["finished", "failed", "interrupted"]
     message: str = ""
     """why it failed, in one line"""
     agent: str = ""
     """the zip that flew, relative to the run's folder"""
-    weights: str = ""
-    """SHA-256 of that agent's parameters"""
     timesteps: int = 0
     seconds: float = 0.0
     """wall-clock time of the training; of a run that was resumed, since then"""
     flights: dict[str, dict[str, Numbers]] = {}
-    """by scenario and measure, a number for each episode, the same episodes in every run"""
+    """by scenario and measure, a number for each episode, the same episodes in every run: success
+    and survival 0 or 1; reward the sum; final_error in m (NaN: crashed or out of range); time in s
+    to the tightest tolerance, or, where it starts at its target, until stable (NaN: never)"""
 
 
 class Sweep(Frozen):
@@ -59,45 +57,30 @@ class Sweep(Frozen):
     suite: Suite | None = None
 
 
-class SweepFolder:
-    """The files of a sweep.
+def write_sweep(folder: Path, sweep: Sweep) -> None:
+    """Write a sweep, before its first run."""
+    spec = sweep.spec.model_dump(mode="json", exclude_defaults=True)
+    write_text(folder / "sweep.yaml", yaml.safe_dump(spec, sort_keys=False))
+    write_text(folder / PLAN, sweep.model_dump_json(indent=1) + "\n")
 
-    :param path: the folder.
+
+def read_sweep(folder: Path) -> Sweep:
+    """Read the sweep in a folder.
+
+    :raises ConfigError: a folder that holds no sweep, or a damaged file.
     """
+    if not (folder / PLAN).is_file():
+        raise ConfigError(f"sweep folder {folder}: holds no sweep ({PLAN} is missing)")
+    return read_record(folder / PLAN, Sweep)
 
-    def __init__(self, path: StrPath) -> None:
-        self.path = Path(path)
 
-    def write(self, sweep: Sweep) -> None:
-        """Write the sweep, before its first run."""
-        spec = sweep.spec.model_dump(mode="json", exclude_defaults=True)
-        write_text(self.path / "sweep.yaml", yaml.safe_dump(spec, sort_keys=False))
-        write_text(self.path / PLAN, sweep.model_dump_json(indent=1) + "\n")
+def write_result(folder: Path, result: RunResult) -> None:
+    """Write the result of a run that ended."""
+    write_text(folder / RECORDS / f"{result.name}.json", result.model_dump_json() + "\n")
 
-    def read(self) -> Sweep:
-        """Read the sweep.
 
-        :raises ConfigError: a folder that holds no sweep, or a damaged file.
-        """
-        if not (self.path / PLAN).is_file():
-            raise ConfigError(f"sweep folder {self.path}: holds no sweep ({PLAN} is missing)")
-        return read_record(self.path / PLAN, Sweep)
-
-    def run(self, run: Run) -> Path:
-        """The folder of a run, absolute: files in it name others, which must be found from
-        anywhere.
-        """
-        return self.path.absolute() / "runs" / run.name
-
-    def add(self, result: RunResult) -> None:
-        """Write the result of a run that ended."""
-        path = self.path / "records" / f"{result.name}.json"
-        write_text(path, result.model_dump_json() + "\n")
-
-    def results(self) -> dict[str, RunResult]:
-        """Read the results of all runs that ended, by name."""
-        results = {}
-        for path in (self.path / "records").rglob("*.json"):
-            result = read_record(path, RunResult)
-            results[result.name] = result
-        return results
+def read_results(folder: Path) -> dict[str, RunResult]:
+    """Read the results of all runs that ended, by name."""
+    paths = (folder / RECORDS).rglob("*.json")
+    results = [read_record(path, RunResult) for path in paths]
+    return {result.name: result for result in results}

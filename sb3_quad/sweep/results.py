@@ -7,16 +7,17 @@ seeds give intervals that are too narrow (Agarwal et al., Deep Reinforcement Lea
 the Statistical Precipice, NeurIPS 2021): with one seed they cover the choice of episodes alone.
 """
 
-import itertools
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
+from pydantic import computed_field
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
@@ -31,7 +32,7 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.sweep.folder import MEASURES, RunResult, Sweep, SweepFolder
+from sb3_quad.sweep.folder import RunResult, Sweep
 
 # By measure: its row, the factor from values to cells, and their decimals.
 ROWS = {
@@ -48,28 +49,9 @@ PAIRED = "paired bootstrap over the seeds and episodes that both have"
 LEVELS = ("configuration", "seed", "scenario", "episode")
 COLUMNS = (
     *("run", "configuration", "seed", "state", "scenario", "episodes"),
-    *MEASURES,
-    *("timesteps", "agent", "weights", "message"),
+    *ROWS,
+    *("timesteps", "agent", "message"),
 )
-
-
-class MeanOverSeeds(Estimate):
-    """The mean of a measure over the finished runs of a configuration."""
-
-    configuration: str
-    scenario: str
-    measure: str
-
-
-class Comparison(Estimate):
-    """The difference of two configurations, the first less the second."""
-
-    scenario: str
-    measure: str
-    first: str
-    second: str
-    verdict: str
-    """whether the first is better or worse"""
 
 
 class SweepResults(Frozen):
@@ -78,89 +60,118 @@ class SweepResults(Frozen):
     sweep: str | None
     package_version: str = __version__
     runs: int
-    finished: int
-    failed: dict[str, str]
+    failed: dict[str, str] = {}
     """by the name of a run, why it failed"""
-    configurations: dict[str, list[int]]
+    configurations: dict[str, list[int]] = {}
     """by the name of a configuration, the seeds of its finished runs, if it has any"""
-    estimates: list[MeanOverSeeds] = []
-    comparisons: list[Comparison] = []
+    estimates: list[StrDict] = []
+    """means over the finished runs of a configuration, by scenario and measure: fields of Estimate
+    """
+    comparisons: list[StrDict] = []
+    """differences of two configurations, the first less the second: fields of Estimate, and as
+    verdict whether the first is better or worse
+    """
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def finished(self) -> int:
+        """Number of finished runs."""
+        return sum(map(len, self.configurations.values()))
 
 
 def write_results(
-    place: SweepFolder, sweep: Sweep, results: Mapping[str, RunResult]
-) -> SweepResults:
-    """Write ``results.csv``, a line for each run and scenario, and ``results.json``.
+    folder: Path, sweep: Sweep, results: Mapping[str, RunResult]
+) -> tuple[SweepResults, list[Table]]:
+    """Write ``results.csv``, a line for each run and scenario, ``results.json``, and the report.
 
     :param results: of all runs that ended, by name.
-    :return: means, intervals and comparisons of all runs that are finished.
+    :return: means, intervals and comparisons of all runs that are finished, and their tables.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     lines: list[StrDict] = []
     parts = {}
+    summary = SweepResults(sweep=sweep.spec.name, runs=len(sweep.runs))
     # In the order of the plan, not in that in which runs ended.
-    ended = [results[run.name] for run in sweep.runs if run.name in results]
-    for result in ended:
-        line = {"run": result.name, **result.model_dump(exclude={"flights"})}
+    for run in sweep.runs:
+        if run.name not in results:
+            continue
+        result = results[run.name]
+        line = {"run": run.name, **dict(run), **dict(result)}
+        # The table holds every run that ended, also those that failed.
+        if result.state == "failed":
+            summary.failed[run.name] = result.message
+            lines.append(line)
+            continue
+        summary.configurations.setdefault(run.configuration, []).append(run.seed)
         for scenario, measures in result.flights.items():
             # A row for each episode, NaN where there is no number.
-            part = pd.DataFrame(measures, columns=MEASURES, dtype=np.float64)
-            parts[result.configuration, result.seed, scenario] = part
+            part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
+            parts[run.configuration, run.seed, scenario] = part
             # All are means but for the final error, which is a median.
             statistics = {**part.mean(), "final_error": part["final_error"].quantile()}
             lines.append({**line, "scenario": scenario, "episodes": len(part), **statistics})
-        # The table holds every run that ended, also those that failed.
-        if not result.flights:
-            lines.append(line)
     table = pd.DataFrame(lines, columns=COLUMNS)
-    write_text(place.path / "results.csv", table.to_csv(index=False, float_format="%.9g"))
-    seeds: dict[str, list[int]] = {}
-    failed = {}
-    for result in ended:
-        if result.state == "failed":
-            failed[result.name] = result.message
-        else:
-            seeds.setdefault(result.configuration, []).append(result.seed)
-    summary = SweepResults(
-        sweep=sweep.spec.name,
-        runs=len(sweep.runs),
-        finished=len(ended) - len(failed),
-        failed=failed,
-        configurations=seeds,
-    )
+    write_text(folder / "results.csv", table.to_csv(index=False, float_format="%.9g"))
+    tables = []
     if parts:
-        _estimate(summary, pd.concat(parts, names=LEVELS))
-    write_text(place.path / "results.json", summary.model_dump_json(indent=1) + "\n")
-    return summary
+        tables = _compare(summary, pd.concat(parts, names=LEVELS))
+        _write_report(folder, summary, tables)
+    write_text(folder / "results.json", summary.model_dump_json(indent=1) + "\n")
+    return summary, tables
 
 
-def _estimate(summary: SweepResults, flights: Any) -> None:
+def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     """Add the means over seeds of all configurations, and compare all pairs of them.
 
     :param flights: a table of episodes by ``LEVELS``.
+    :return: for each scenario a table with a column for each configuration, and a last one that
+        compares them.
     """
+    columns = []
+    for name, seeds in summary.configurations.items():
+        columns.append(
+            Column(f"{name} (1 seed)" if len(seeds) == 1 else f"{name} ({len(seeds)} seeds)")
+        )
+    tables = []
+    comparisons = []
     for scenario, group in flights.groupby(level="scenario", sort=False):
-        names = group.index.unique("configuration")
-        for measure in MEASURES:
+        rows = []
+        for measure, (row, factor, decimals) in ROWS.items():
             key = {"scenario": scenario, "measure": measure}
             statistic = np.nanmedian if measure == "final_error" else np.nanmean
-            # A row for each run, a column for each episode.
+            # Of each configuration a row for each run, a column for each episode.
             values = group[measure].unstack()
-            for name in names:
-                estimate = over_seeds(values.loc[name].to_numpy(), statistic)
-                if estimate is not None:
-                    fields = {**dict(estimate), **key, "configuration": name}
-                    summary.estimates.append(MeanOverSeeds(**fields))
+            runs = {name: values.query("configuration == @name") for name in summary.configurations}
+            means = {name: over_seeds(runs[name].to_numpy(), statistic) for name in runs}
+            for name, mean in means.items():
+                if mean is not None:
+                    summary.estimates.append({**dict(mean), **key, "configuration": name})
+            # No row for what the environment does not report.
+            if any(means.values()):
+                cells = [estimate_cell(mean, factor, decimals) for mean in means.values()]
+                rows.append(replace(row, cells=cells))
             if measure not in COMPARED:
                 continue
-            for first, second in itertools.combinations(names, 2):
+            for first, second in combinations(runs, 2):
                 # Differences are paired: only the seeds that both have, and the same episodes.
-                paired = (values.loc[first] - values.loc[second]).dropna(how="all")
-                difference = over_seeds(paired.to_numpy())
+                paired = runs[first].droplevel(0) - runs[second].droplevel(0)
+                difference = over_seeds(paired.dropna(how="all").to_numpy())
                 if difference is not None:
-                    fields = {**dict(difference), **key, "first": first, "second": second}
-                    comparison = Comparison(**fields, verdict=verdict(difference))
-                    summary.comparisons.append(comparison)
+                    key |= {"first": first, "second": second, "verdict": verdict(difference)}
+                    summary.comparisons.append({**dict(difference), **key})
+                    name = f"{scenario}, {row.heading}: {first} than {second}"
+                    cells = [
+                        Cell(words=key["verdict"]),
+                        estimate_cell(difference, factor, decimals),
+                    ]
+                    comparisons.append(Row(name, cells=cells))
+        tables.append(Table(columns, rows, title=scenario, caption=CAPTION))
+    # There are comparisons if there are several configurations.
+    if comparisons:
+        columns = [Column("is", align="left"), Column("difference")]
+        title = "better, worse, cannot tell"
+        tables.append(Table(columns, comparisons, title=title, caption=PAIRED))
+    return tables
 
 
 def over_seeds(
@@ -201,60 +212,21 @@ def verdict(difference: Estimate) -> str:
     return "cannot tell"
 
 
-def tables(summary: SweepResults) -> list[Table]:
-    """Return for each scenario a table with a column for each configuration, and a last one that
-    compares them.
-    """
-    columns = []
-    for name, runs in summary.configurations.items():
-        seeds = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
-        columns.append(Column(f"{name} ({seeds})"))
-    made = []
-    for scenario, group in itertools.groupby(summary.estimates, lambda item: item.scenario):
-        known = {(item.measure, item.configuration): _cell(item) for item in group}
-        rows = []
-        for measure in dict.fromkeys(measure for measure, _ in known):
-            row = ROWS[measure][0]
-            cells = [known.get((measure, name), Cell()) for name in summary.configurations]
-            rows.append(Row(row.name, row.unit, cells))
-        made.append(Table(columns, rows, title=scenario, caption=CAPTION))
-    # The comparisons, if there are several configurations.
-    rows = []
-    for item in summary.comparisons:
-        name = f"{item.scenario}, {ROWS[item.measure][0].heading}: {item.first} than {item.second}"
-        rows.append(Row(name, cells=[Cell(words=item.verdict), _cell(item)]))
-    if rows:
-        columns = [Column("is", align="left"), Column("difference")]
-        made.append(Table(columns, rows, title="better, worse, cannot tell", caption=PAIRED))
-    return made
-
-
-def _cell(estimate: MeanOverSeeds | Comparison) -> Cell:
-    _, factor, decimals = ROWS[estimate.measure]
-    return estimate_cell(estimate, factor, decimals)
-
-
-def write_report(place: SweepFolder, summary: SweepResults, shown: Sequence[Table]) -> Path:
-    """Write the report of a sweep's finished runs: a section for each table, and the learning
-    curves.
-
-    :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`.
-    :return: the page.
-    :raises ConfigError: a folder that cannot be written.
-    """
+def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) -> None:
+    """Write the report of the finished runs: a section for each table, and the learning curves."""
     parts: list[Section] = []
-    for table in shown:
+    for table in tables:
         anchor = f"table-{len(parts)}"
         parts.append(Section(anchor, table.title, tables=[table], facts=table.caption))
-    plots = _curves(place, summary)
+    plots = _curves(folder, summary)
     if plots:
         description = "Mean over seeds, with their range."
         parts.append(Section("curves", "Learning curves", description, plots=plots))
     facts = f"{summary.finished} of {summary.runs} runs are finished."
-    return write_page(place.path, f"Sweep: {summary.sweep}", facts, parts)
+    write_page(folder, f"Sweep: {summary.sweep}", facts, parts)
 
 
-def _curves(place: SweepFolder, summary: SweepResults) -> list[Plot]:
+def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
     """Plot the evaluations along the way; of pipelines, one plot for each algorithm and environment
     of a stage.
     """
@@ -262,8 +234,8 @@ def _curves(place: SweepFolder, summary: SweepResults) -> list[Plot]:
     for name, seeds in summary.configurations.items():
         for seed in seeds:
             # Below it, a run folder is <algo>/<Env>_<number>; its stages have their own.
-            folder = place.path / "runs" / name / f"seed_{seed}"
-            for path in sorted(folder.glob("*/*/evaluations.npz")):
+            place = folder / "runs" / name / f"seed_{seed}"
+            for path in sorted(place.glob("*/*/evaluations.npz")):
                 *_, algo, run, _ = path.parts
                 kind = f"{algo} {run.rpartition('_')[0]}"
                 curves[kind][name].append(read_curve(path.parent))

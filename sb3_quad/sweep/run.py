@@ -2,34 +2,30 @@
 agent.
 """
 
-import hashlib
-from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
-from torch.nn.utils import parameters_to_vector
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
-from sb3_quad.base.files import one_line, write_text
+from sb3_quad.base.errors import ConfigError, WorkerDied
+from sb3_quad.base.files import kind_and_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.base.types import Report, StrDict
+from sb3_quad.base.types import Report
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
-from sb3_quad.evaluation.evaluate import fly_scenario
+from sb3_quad.evaluation.evaluate import Progress, fly_scenario
 from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.sweep.folder import Numbers, RunResult, Sweep, SweepFolder
+from sb3_quad.sweep.folder import Numbers, RunResult, Sweep, read_results, write_result
 from sb3_quad.sweep.runs import Run
-from sb3_quad.sweep.spec import Evaluation
+from sb3_quad.sweep.spec import Evaluation, SweepSpec
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.pipeline import (
@@ -42,48 +38,41 @@ from sb3_quad.training.pipeline import (
 
 EPISODES = 240  # of each task, where no suite is named
 TASKS = ("state_recovery", "target_tracking")
-# Receives the number of runs that ended, that of all runs, and their name.
-Show = Callable[[int, int, str], None]
 LOG = "log.txt"  # the reports of the training, in the run's folder
 
 
 def execute(
-    place: SweepFolder,
+    folder: Path,
     sweep: Sweep,
     executor: Executor,
     signals: StopSignals,
-    show: Show,
+    show: Progress,
     report: Report,
 ) -> dict[str, RunResult]:
-    """Execute all runs that are not finished.
+    """Execute all runs of a sweep's folder that are not finished.
 
-    A run whose worker process ends is tried once more, from its snapshot; one that fails is left,
-    and the others continue. After a signal, the runs under way save and end.
+    A run that fails is left, and the others continue. After a signal, the runs under way save and
+    end.
 
     :param report: receives each event in one line.
     :return: the results of all runs that ended, those of earlier calls included, by name.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    # Finished runs stay as they are; failed ones are tried again.
-    results = place.results()
+    results = read_results(folder)
     calls: dict[Future[RunResult], Run] = {}
-
-    def submit(run: Run, reason: str) -> None:
-        folder = place.run(run)
-        if pipeline_folder(folder) is not None:
-            report(f"{run.name}: {reason}resumes where it stopped")
-        elif reason:
-            report(f"{run.name}: {reason}begins again")
-        call = executor.submit(work, run, str(folder), sweep.suite, sweep.spec.evaluation)
-        calls[call] = run
-
     # All runs are submitted at once; the executor starts as many as it has workers.
     for run in sweep.runs:
-        if run.name not in results:
-            submit(run, "")
-        elif results[run.name].state == "failed":
-            submit(run, f"failed before ({results.pop(run.name).message}); ")
-    retried = set[str]()
+        # Files in the folder of a run name others, which must be found from anywhere.
+        place = folder.absolute() / "runs" / run.name
+        if run.name in results:
+            # Finished runs stay as they are; failed ones are tried again.
+            if results[run.name].state == "finished":
+                continue
+            message = results.pop(run.name).message
+            report(f"{run.name}: failed before ({message}); is tried again")
+        elif pipeline_folder(place) is not None:
+            report(f"{run.name}: resumes where it stopped")
+        calls[executor.submit(work, run, place, sweep.spec, sweep.suite)] = run
     show(len(results), len(sweep.runs), "runs")
     for run, future in as_they_end(executor, calls, signals, report):
         try:
@@ -92,15 +81,11 @@ def execute(
             # After a signal a worker may have been ended by it.
             if signals.received is not None:
                 continue
-            if run.name not in retried:
-                retried.add(run.name)
-                submit(run, f"{died}; ")
-                continue
-            result = _result(run, state="failed", message=str(died))
+            result = RunResult(name=run.name, state="failed", message=str(died))
         if result.state == "interrupted":
             report(f"{run.name}: interrupted; continues with --resume")
             continue
-        place.add(result)
+        write_result(folder, result)
         results[run.name] = result
         end = result.message or f"{result.seconds:.1f} s"
         report(f"{run.name}: {result.state}, {end} ({len(results)} of {len(sweep.runs)})")
@@ -108,51 +93,36 @@ def execute(
     return results
 
 
-def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> RunResult:
+def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResult:
     """Train a run in its folder, or the rest of it, and fly its agent. The result of a run that
     fails says why.
 
     :param suite: the scenarios of the agent; None: fresh episodes of both tasks, as many as
-        ``evaluation`` says.
+        ``spec.evaluation`` says.
     """
     # One core for each run: so the same weights come out on any machine.
     use_cpus(1)
-    place = Path(folder)
     try:
         place.mkdir(parents=True, exist_ok=True)
-        import_packages(run.gym_packages, "gym_packages:")
+        import_packages(spec.gym_packages, "gym_packages:")
         trained = _train(run, place)
         if trained.exit_code != 0:
-            return _result(run, state="interrupted")
+            raise KeyboardInterrupt
         stages = [*trained.stages.values()]
         agent = Path(stages[-1].agent)
-        return _result(
-            run,
+        return RunResult(
+            name=run.name,
             state="finished",
             agent=agent.relative_to(place).as_posix(),
-            weights=digest(agent),
             timesteps=sum(stage.timesteps for stage in stages),
             seconds=round(sum(stage.seconds for stage in stages), 1),
-            flights=_fly(agent, trained.job, suite, evaluation),
+            flights=_fly(agent, trained.job, suite, spec.evaluation),
         )
     except KeyboardInterrupt:
-        return _result(run, state="interrupted")
+        return RunResult(name=run.name, state="interrupted")
     # Also the errors of a user's callback or environment: the other runs continue.
     except (Exception, SystemExit) as error:
-        message = one_line(error)
-        if not isinstance(error, SB3QuadError):
-            message = f"{type(error).__name__}: {message}"
-        return _result(run, state="failed", message=message)
-
-
-def _result(run: Run, **fields: Any) -> RunResult:
-    return RunResult(name=run.name, configuration=run.configuration, seed=run.seed, **fields)
-
-
-def digest(agent: Path) -> str:
-    """The SHA-256 of the parameters in an agent's zip."""
-    parameters = parameters_to_vector(load_model(agent).policy.parameters())
-    return hashlib.sha256(parameters.detach().numpy().tobytes()).hexdigest()
+        return RunResult(name=run.name, state="failed", message=kind_and_line(error))
 
 
 def pipeline_folder(place: Path) -> Path | None:
@@ -214,21 +184,16 @@ def _fly(
 
 
 def _numbers(flights: Flights) -> dict[str, Numbers]:
-    """Return the measures of all episodes, None where there is no number."""
+    """Return the measures of all episodes, NaN where there is no number."""
     # The time to the tightest tolerance.
-    arrival = np.full(flights.n, np.nan)
-    if flights.time_to:
-        arrival = flights.time_to[min(flights.time_to)]
+    arrival = flights.time_to[min(flights.time_to)]
     # An episode that starts at its target has no way to it, and so no cross-track error.
     has_way = np.isfinite(flights.cross_track_error)
-    measures: StrDict = {
+    measures = {
         "success": flights.success,
         "survival": flights.survival,
         "reward": flights.reward,
         "final_error": np.where(flights.survival, flights.final_error, np.nan),
         "time": np.where(has_way, arrival, flights.recovery_time),
     }
-    none = np.array(None)
-    for name, values in measures.items():
-        measures[name] = np.where(np.isfinite(values), values, none).tolist()
-    return measures
+    return {name: values.tolist() for name, values in measures.items()}

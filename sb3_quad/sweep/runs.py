@@ -14,7 +14,14 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import Configuration, SweepSpec
-from sb3_quad.training.options import RunOptions, SettingsOptions
+from sb3_quad.training.options import (
+    DEFAULT_ALGO,
+    DEFAULT_ENV,
+    DEFAULT_PIPELINE,
+    KEPT_BY_STAGES,
+    RunOptions,
+    SettingsOptions,
+)
 from sb3_quad.training.pipeline import (
     Pipeline,
     Stage,
@@ -40,32 +47,26 @@ class Run(Frozen):
     """arguments of TrainingJob, less config, seed and log_folder"""
     stages: tuple[Stage, ...]
     """of its pipeline, with all their settings; a single run is one of one stage"""
-    gym_packages: tuple[str, ...] = ()
 
 
 def make_runs(spec: SweepSpec) -> list[Run]:
     """Return the runs of a sweep, the seeds of a configuration one after another.
 
     :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
-        two configurations of one name.
+        two runs of one name.
     """
     # Every configuration is checked before the first run starts.
-    runs: list[Run] = []
-    names = set[str]()
-    for varied, data in _cells(spec):
-        label = _name(varied)
-        where = f"configuration {label!r}" if varied else "sweep"
+    runs: dict[str, Run] = {}
+    for label, data in _cells(spec):
+        where = f"configuration {label!r}" if label else "sweep"
         configuration = validate(Configuration, data, where)
-        name = _folder_name(configuration, label)
-        if name in names:
-            raise ConfigError(
-                f"two configurations are called {name!r}; give them names, or values that differ"
-            )
+        words = [configuration.algo, Path(configuration.conf_file or "").stem]
+        label = label or "-".join(filter(None, words))
+        name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,")[:LONGEST] or "run"
         try:
             job, stages = _stages(configuration)
         except ConfigError as error:
             raise ConfigError(f"configuration {name!r}: {error}") from None
-        names.add(name)
         for seed in spec.seed:
             run = Run(
                 name=f"{name}/seed_{seed}",
@@ -73,10 +74,14 @@ def make_runs(spec: SweepSpec) -> list[Run]:
                 seed=seed,
                 job=job,
                 stages=tuple(stages),
-                gym_packages=spec.gym_packages,
             )
-            runs.append(run)
-    return runs
+            if run.name in runs:
+                raise ConfigError(
+                    f"two runs are called {run.name!r}; "
+                    "give configurations names, or values and seeds that differ"
+                )
+            runs[run.name] = run
+    return [*runs.values()]
 
 
 def suite_of(spec: SweepSpec) -> Suite | None:
@@ -90,14 +95,13 @@ def suite_of(spec: SweepSpec) -> Suite | None:
     return None
 
 
-def _cells(spec: SweepSpec) -> Iterator[tuple[StrDict, StrDict]]:
-    """Yield the keys in which a configuration differs, and all its keys."""
+def _cells(spec: SweepSpec) -> Iterator[tuple[str, StrDict]]:
+    """Yield each configuration: the keys in which it differs, in words, and all its keys."""
     for key, values in spec.grid.items():
         if not isinstance(values, list) or not values:
             raise ConfigError(f"grid: {key}: must be a list of at least one value, not {values!r}")
     # Without a list there is one configuration, that of the shared keys.
-    listed = spec.configurations or ({},)
-    for own in listed:
+    for own in spec.configurations or ({},):
         for values in itertools.product(*spec.grid.values()):
             cell = dict(zip(spec.grid, values, strict=True))
             data = spec.given
@@ -109,37 +113,18 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[StrDict, StrDict]]:
             for key, value in cell.items():
                 put_key(data, key, value, f"grid: {key}")
             # A named configuration keeps its name in each cell of the grid.
-            data["name"] = None
-            if own.get("name"):
-                data["name"] = ",".join(filter(None, [str(own["name"]), _name(cell)]))
-            yield {**own, **cell}, data
-
-
-def _folder_name(configuration: Configuration, label: str) -> str:
-    """Return the name of a configuration, or else one made of its settings."""
-    name = configuration.name or label
-    if not name:
-        words = (configuration.algo, Path(configuration.conf_file or "").stem)
-        name = "-".join(filter(None, words))
-    return re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", name).strip("-.,")[:LONGEST] or "run"
+            label = [str(own.get("name") or _in_words(own)), _in_words(cell)]
+            yield ",".join(filter(None, label)), data
 
 
 def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     """Return the job of a configuration's runs and their stages, with all settings."""
-    # A vehicle is a keyword of the environment.
-    changes: StrDict = {}
-    if configuration.vehicle is not None:
-        changes["env_kwargs"] = {
-            **(configuration.env_kwargs or {}),
-            "vehicle": configuration.vehicle,
-        }
+    job = configuration.model_dump(include={*RunOptions.model_fields}, exclude_defaults=True)
     # The agent that the training starts from, as a path that workers find.
     if configuration.trained_agent is not None:
-        changes["trained_agent"] = agent_path(configuration.trained_agent)
-        if not Path(changes["trained_agent"]).is_file():
+        job["trained_agent"] = agent_path(configuration.trained_agent)
+        if not Path(job["trained_agent"]).is_file():
             raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
-    configuration = configuration.model_copy(update=changes)
-    job = configuration.model_dump(include={*RunOptions.model_fields}, exclude_defaults=True)
     # Resolve all settings now, so that later changes of files do not matter.
     pipeline = _pipeline(configuration)
     stages = []
@@ -154,32 +139,32 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
 def _pipeline(configuration: Configuration) -> Pipeline:
     """Return the pipeline of a configuration; a single run is one of one stage."""
     given = configuration.given
-    # Options with flags of their own are settings, too.
-    options = configuration.model_dump(
-        include={*SettingsOptions.model_fields}, exclude_defaults=True
-    )
-    settings = {**configuration.hyperparams, **options}
+    settings = {**configuration.hyperparams}
+    for name in SettingsOptions.model_fields:
+        if name in given:
+            settings[name] = given[name]
+    # A vehicle is a keyword of the environment.
+    if configuration.vehicle is not None:
+        settings["env_kwargs"] = {**given.get("env_kwargs", {}), "vehicle": configuration.vehicle}
     file = configuration.conf_file
+    # As train does without any of these.
+    if not given.keys() & {"algo", "env", "conf_file"}:
+        file = DEFAULT_PIPELINE
     if file is not None and is_pipeline(file):
-        for key in ("algo", "env", "n_timesteps", "trained_agent"):
+        for key in KEPT_BY_STAGES:
             if key in given:
                 raise ConfigError(
                     f"{key} goes with a single run; "
                     f"the stages of a pipeline have their own in {file}"
                 )
         return with_settings(load_pipeline(file), settings)
-    for key in ("algo", "env"):
-        if key not in given:
-            raise ConfigError(
-                f"{key} is missing; give algo and env, or a conf_file with the stages of a pipeline"
-            )
-    stage = Stage(
-        name=given["algo"], algo=given["algo"], env=given["env"], conf_file=file, settings=settings
-    )
+    algo = configuration.algo or DEFAULT_ALGO
+    env = configuration.env or DEFAULT_ENV
+    stage = Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings)
     return Pipeline(stages=(stage,))
 
 
-def _name(varied: StrMapping) -> str:
+def _in_words(varied: StrMapping) -> str:
     """Return the keys in which a configuration differs as words: ``pid,learning_rate=0.001``."""
     # Some values say enough without their key.
     words = []

@@ -6,14 +6,11 @@ where they lie deeper, to lists of values. Every combination of them is a config
 ``grid: {hyperparams.learning_rate: [1e-3, 5e-3]}``; ``configurations`` lists some one by one.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, validate
@@ -40,17 +37,6 @@ class Configuration(SettingsOptions, RunOptions):
     """settings to change, such as n_steps: 500"""
     vehicle: str | None = None
     """env_kwargs' vehicle, by name or YAML file"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _parse_numbers(cls, data: Any) -> Any:
-        """``1e6`` is a text to YAML."""
-        if not isinstance(data, Mapping):
-            return data
-        options = {*SettingsOptions.model_fields, *RunOptions.model_fields}
-        return {
-            key: parse_number(value) if key in options else value for key, value in data.items()
-        }
 
     @property
     def given(self) -> StrDict:
@@ -103,7 +89,4 @@ def load_sweep(source: StrPath) -> SweepSpec:
     :raises ConfigError: an unreadable file, or a key that is unknown or does not fit.
     """
     data, where = SWEEPS.read(source)
-    spec = validate(SweepSpec, data, where)
-    if len(set(spec.seed)) < len(spec.seed):
-        raise ConfigError(f"{where}: seed: one is there twice")
-    return spec if spec.name else spec.model_copy(update={"name": Path(str(source)).stem})
+    return validate(SweepSpec, {"name": Path(source).stem, **data}, where)

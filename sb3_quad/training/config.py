@@ -158,6 +158,11 @@ class TrainingConfig(Frozen):
             return 1
         return int(number)
 
+    @property
+    def rollout(self) -> int:
+        """Timesteps between two updates, over all environments."""
+        return self.rollout_steps * self.n_envs
+
     def shorter_rollout(self) -> dict[str, int]:
         """Return the settings that fit a rollout to a budget of less than one.
 
@@ -258,8 +263,7 @@ class TrainingJob(JobOptions):
 def describe(job: TrainingJob) -> str:
     """Return one line about what is going to be trained, in whole rollouts as SB3 trains."""
     config = job.config
-    n_steps = config.rollout_steps
-    rollout = n_steps * config.n_envs
+    rollout = config.rollout
     # The last rollout is flown whole.
     n_updates = -(-config.n_timesteps // rollout)
     timesteps = n_updates * rollout
@@ -270,7 +274,8 @@ def describe(job: TrainingJob) -> str:
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
     if timesteps != config.n_timesteps:
         line += f" ({config.n_timesteps:,} were asked for)"
-    line += f", rollouts of {n_steps} steps, {config.n_envs} environments ({config.vec_env})"
+    line += f", rollouts of {config.rollout_steps} steps"
+    line += f", {config.n_envs} environments ({config.vec_env})"
     task = config.env_kwargs.get("task")
     if isinstance(task, Mapping):
         line += f", tasks {in_words(task)}"

@@ -5,13 +5,24 @@ Cheap to import, so that ``--help`` is quick.
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import AfterValidator, BeforeValidator, NonNegativeFloat, PositiveInt, model_validator
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import require
+from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen
+
+# What is trained where none of the three is given; the algorithm and the environment of a single
+# run.
+DEFAULT_PIPELINE = "two_stage.yml"
+DEFAULT_ALGO = "dagger"
+DEFAULT_ENV = "QuadTargetTracking-v0"
+# A pipeline's stages have their own values of these.
+KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
+# 1e6 is a text to YAML.
+Number = Annotated[int, BeforeValidator(parse_number)]
 
 
 def _check_device(device: str) -> str:
@@ -26,9 +37,9 @@ def _check_device(device: str) -> str:
 class SettingsOptions(Frozen):
     """Keys of a settings file that have a flag of their own; None keeps the file's value."""
 
-    n_timesteps: int | None = None
+    n_timesteps: Number | None = None
     """timesteps, in whole rollouts; fewer than one shorten it"""
-    n_envs: int | None = None
+    n_envs: Number | None = None
     """number of parallel environments"""
     vec_env: str | None = None
     """batch (compiled), dummy (PyBullet) or subproc (one process each)"""
@@ -49,11 +60,11 @@ class RunOptions(Frozen):
     """environments of an evaluation (batch: one per episode; else 1)"""
     device: Annotated[str, AfterValidator(_check_device)] = "cpu"
     """cpu, cuda or auto"""
-    eval_freq: int = 250_000
+    eval_freq: Number = 250_000
     """timesteps between evaluations; below 1: one at the end"""
-    eval_episodes: int = 48
+    eval_episodes: Number = 48
     """episodes per evaluation; 0: no evaluations"""
-    save_freq: int = -1
+    save_freq: Number = -1
     """timesteps between checkpoints; below 1: none"""
     snapshot_every: NonNegativeFloat = 60.0
     """seconds between snapshots, from which --resume continues after a crash; 0: none"""

@@ -1,19 +1,17 @@
 """The files of a search: the best settings as YAML, all trials as CSV."""
 
-import json
+from collections import Counter
 from pathlib import Path
 
 import yaml
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrDict
-from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
-from sb3_quad.tuning.space import current
+from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, STATES, SUCCESS, Search
 
 BEST = "best.yml"
 TRIALS = "trials.csv"
-STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
 
 
 def write_results(search: Search) -> None:
@@ -35,8 +33,9 @@ def write_results(search: Search) -> None:
     best = search.best
     if best is None:
         return
+    config = search.config(best)
     # The best settings say where they come from, in comments that train skips.
-    settings = yaml.safe_dump({search.job.config.env_id: settings_of(best)}, sort_keys=False)
+    settings = yaml.safe_dump({config.env_id: config.settings}, sort_keys=False)
     origin = (
         f"# Found by sb3-quad tune: trial {best.number} of study {search.name}, "
         f"{in_words(search, best)}.\n# {train_command(search)}\n"
@@ -48,33 +47,19 @@ def _row(search: Search, trial: FrozenTrial) -> StrDict:
     """The line of a trial in the table of all trials."""
     row: StrDict = {
         **trial.user_attrs,
-        **varied(search, trial),
+        **search.space.values(trial.params),
         "number": trial.number,
         "state": trial.state.name,
         "evaluations": len(trial.intermediate_values),
     }
     if trial.duration is not None:
         row["seconds"] = round(trial.duration.total_seconds(), 2)
-    if trial.state.name == "COMPLETE":
+    if trial.state == TrialState.COMPLETE:
         row["value"] = trial.value
-    if trial.state.name == "FAIL":
+    if trial.state == TrialState.FAIL:
         # A process that was killed could not write down why its trial ended.
         row.setdefault(ERROR, INTERRUPTED)
     return row
-
-
-def settings_of(trial: FrozenTrial) -> StrDict:
-    """All settings of a trial, as YAML holds them; none if it failed before it had any."""
-    return dict(json.loads(trial.user_attrs.get(SETTINGS, "{}")))
-
-
-def varied(search: Search, trial: FrozenTrial) -> StrDict:
-    """The settings of a trial that the search varies."""
-    settings = settings_of(trial)
-    if not settings:
-        return dict.fromkeys(search.space.dimensions)
-    algo = search.job.config.algo
-    return {name: current(algo, settings, name) for name in search.space.dimensions}
 
 
 def in_words(search: Search, trial: FrozenTrial) -> str:
@@ -87,23 +72,22 @@ def in_words(search: Search, trial: FrozenTrial) -> str:
 
 def trial_line(search: Search, trial: FrozenTrial) -> str:
     """One line about the end of a trial."""
-    if trial.state.name == "FAIL":
+    if trial.state == TrialState.FAIL:
         end = f"failed: {trial.user_attrs.get(ERROR, INTERRUPTED)}"
     else:
-        end = f"{STATES[trial.state.name]}, {in_words(search, trial)}"
+        end = f"{STATES[trial.state]}, {in_words(search, trial)}"
     if search.best is not None and search.best.number == trial.number:
         end += " (best so far)"
-    values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
+    values = " ".join(
+        f"{name}:{value}" for name, value in search.space.values(trial.params).items()
+    )
     return f"trial {trial.number} {end} ({values})"
 
 
 def count_trials(search: Search) -> str:
     """The numbers of trials of the study that finished, were pruned and failed."""
-    words = []
-    for state, word in STATES.items():
-        count = len(search.trials(state))
-        if count:
-            words.append(f"{count} {word}")
+    counts = Counter(trial.state for trial in search.trials())
+    words = [f"{counts[state]} {word}" for state, word in STATES.items() if counts[state]]
     return ", ".join(words) or "no trial yet"
 
 

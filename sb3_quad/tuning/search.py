@@ -6,12 +6,14 @@ samplers are seeded once for a process. A study here may be a journal file, on a
 repeats by its seed however often it was interrupted; so retries and seeds of trials are our own.
 """
 
-import hashlib
 import json
 import math
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Container
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,38 +26,37 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
-from sb3_quad.base.files import one_line
+from sb3_quad.base.files import kind_and_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.training.config import TrainingJob, build_config
+from sb3_quad.evaluation.controllers import ControllerSpec, controller_record
+from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 
 Factories = dict[str, Callable[..., Any]]
-# From a seed and n_startup_trials.
+# From n_startup_trials and a seed.
 SAMPLERS: Factories = {
-    "tpe": lambda seed, n: TPESampler(
-        seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True
-    ),
-    "random": lambda seed, n: RandomSampler(seed=seed),
-    "cmaes": lambda seed, n: CmaEsSampler(
-        seed=seed, n_startup_trials=n, warn_independent_sampling=False
-    ),
+    "tpe": partial(TPESampler, multivariate=True, constant_liar=True),
+    "random": lambda n_startup_trials, seed: RandomSampler(seed),
+    "cmaes": partial(CmaEsSampler, warn_independent_sampling=False),
 }
 # From n_startup_trials and n_evaluations.
 PRUNERS: Factories = {
-    "median": lambda n, evaluations: MedianPruner(
-        n_startup_trials=n, n_warmup_steps=evaluations // 3
-    ),
+    "median": lambda n, evaluations: MedianPruner(n, n_warmup_steps=evaluations // 3),
     "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
     "none": lambda n, evaluations: NopPruner(),
 }
-ENDED = ("COMPLETE", "PRUNED", "FAIL")  # states of trials
+# The states of trials that ended, in words.
+STATES = {
+    TrialState.COMPLETE: "finished",
+    TrialState.PRUNED: "pruned",
+    TrialState.FAIL: "failed",
+}
 BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials share
 # User attributes of a trial. The owner is the machine and the process that trains it.
 OWNER = "owner"
-SETTINGS = "settings"
 SUCCESS = "success_rate"
 REWARD = "mean_reward"
 RUN = "run"
@@ -64,6 +65,7 @@ INTERRUPTED = "interrupted"  # the error of trials that are tried again
 AGAIN = {"again": True}  # user attributes of the trials that do so
 
 
+@dataclass
 class Search:
     """Trains with one choice of settings after the other.
 
@@ -85,41 +87,31 @@ class Search:
         study of this name of another kind.
     """
 
-    def __init__(
-        self,
-        job: TrainingJob,
-        space: SearchSpace,
-        name: str,
-        storage: StrPath,
-        sampler: str,
-        pruner: str,
-        n_startup_trials: int,
-        n_evaluations: int,
-    ) -> None:
-        if sampler not in SAMPLERS:
-            raise ConfigError(unknown("sampler", sampler, SAMPLERS))
-        if pruner not in PRUNERS:
-            raise ConfigError(unknown("pruner", pruner, PRUNERS))
-        if min(n_evaluations, job.eval_episodes) < 1 or n_startup_trials < 0:
-            raise ConfigError(
-                "n_evaluations and eval_episodes must be at least 1, n_startup_trials at least 0"
-            )
-        self.job = job
-        self.space = space
-        self.name = name
-        self.storage = storage
-        self.n_evaluations = n_evaluations
+    job: TrainingJob
+    space: SearchSpace
+    name: str
+    storage: StrPath
+    sampler: str
+    pruner: str
+    n_startup_trials: int
+    n_evaluations: int
+
+    def __post_init__(self) -> None:
+        if self.sampler not in SAMPLERS:
+            raise ConfigError(unknown("sampler", self.sampler, SAMPLERS))
+        if self.pruner not in PRUNERS:
+            raise ConfigError(unknown("pruner", self.pruner, PRUNERS))
         # Only trials of one kind compare. This is the kind, as a storage gives it back.
         wanted = json.loads(json.dumps(self._shared(), default=str))
-        self.study = open_study(name, storage)
+        self.study = open_study(self.name, self.storage)
         if BEGUN_WITH not in self.study.user_attrs and not self.study.trials:
             self.study.set_user_attr(BEGUN_WITH, wanted)
             # The first trial has the settings as they are, if the space holds them.
-            first = space.start()
+            first = self.space.start()
             if first is not None:
                 self.study.enqueue_trial(first)
         known = self.study.user_attrs.get(BEGUN_WITH)
-        where = f"study {name} in {storage}"
+        where = f"study {self.name} in {self.storage}"
         if known is None:
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
@@ -129,8 +121,8 @@ class Search:
                 "give the same again, or another --study-name"
             )
         # Sampler and pruner may differ from one session to the next.
-        self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
-        self.study.sampler = NumberedSampler(sampler, job.seed, n_startup_trials)
+        self.study.pruner = PRUNERS[self.pruner](self.n_startup_trials, self.n_evaluations)
+        self.study.sampler = NumberedSampler(self.sampler, self.job.seed, self.n_startup_trials)
 
     def try_one(self, most: int | None) -> FrozenTrial | None:
         """Train once.
@@ -143,25 +135,34 @@ class Search:
         try:
             # A trial that another process left behind counts no longer, but is tried again.
             retry_dead_trials(self.study)
-            if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
+            counted = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
+            if most is not None and len(self.trials(counted)) >= most:
                 return None
             trial = self.study.ask(self.space.dimensions)
             trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
             return self.study.tell(trial, *self._outcome(trial))
         except (OSError, optuna.exceptions.OptunaError) as error:
-            raise ConfigError(
-                f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})"
-            ) from error
+            raise ConfigError(f"storage {self.storage}: fails ({kind_and_line(error)})") from error
 
-    def trials(self, *states: str) -> list[FrozenTrial]:
-        """The trials in these states, such as ``COMPLETE``; all that ended by default."""
-        trials = self.study.get_trials(deepcopy=False)
-        return [trial for trial in trials if trial.state.name in (states or ENDED)]
+    def trials(self, states: Container[TrialState] = STATES) -> list[FrozenTrial]:
+        """The trials in these states; all that ended by default."""
+        return self.study.get_trials(deepcopy=False, states=states)
 
     @property
     def best(self) -> FrozenTrial | None:
         """The best trial that was finished, of any process; None before the first one."""
-        return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
+        with suppress(ValueError):
+            return self.study.best_trial
+        return None
+
+    def config(self, trial: FrozenTrial | optuna.Trial) -> TrainingConfig:
+        """The settings of a trial.
+
+        :raises ConfigError: they do not go together.
+        """
+        known = self.job.config
+        settings = self.space.settings(trial.params)
+        return build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
 
     def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
         """Train as a trial says; return its value and state. Whatever happens to a choice of
@@ -170,7 +171,7 @@ class Search:
         try:
             value = self._value(trial)
         except Exception as error:
-            trial.set_user_attr(ERROR, f"{type(error).__name__}: {one_line(error)}")
+            trial.set_user_attr(ERROR, kind_and_line(error))
             return None, TrialState.FAIL
         except KeyboardInterrupt:
             trial.set_user_attr(ERROR, INTERRUPTED)
@@ -180,19 +181,15 @@ class Search:
 
     def _value(self, trial: optuna.Trial) -> float | None:
         """Train as a trial says; return the value of its last evaluation, None if it was pruned."""
-        known = self.job.config
-        settings = self.space.settings(trial.params)
-        trial.set_user_attr(SETTINGS, json.dumps(settings))
-        config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
+        config = self.config(trial)
         # A training ends with a whole rollout.
-        rollout = config.rollout_steps * config.n_envs
-        total = math.ceil(config.n_timesteps / rollout) * rollout
+        total = math.ceil(config.n_timesteps / config.rollout) * config.rollout
         eval_freq = math.ceil(total / self.n_evaluations)
         changes = {"config": config, "eval_freq": eval_freq, "snapshot_every": 0}
         values: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
-            if known.task is None:
+            if config.task is None:
                 values.append(reward)
             else:
                 values.append(score(success, reward, self.job.eval_episodes))
@@ -222,10 +219,7 @@ class Search:
         # The agent counts by its content, since its file may move.
         agent = None
         if job.trained_agent is not None:
-            try:
-                agent = hashlib.sha256(Path(job.trained_agent).read_bytes()).hexdigest()
-            except OSError as error:
-                raise ConfigError(f"{job.trained_agent}: cannot be read ({error})") from None
+            agent = controller_record(ControllerSpec("agent", job.trained_agent)).content
         return {
             "algo": job.config.algo,
             "env": job.config.env_id,
@@ -238,6 +232,7 @@ class Search:
         }
 
 
+@dataclass
 class NumberedSampler(BaseSampler):
     """One of :data:`SAMPLERS`, made again for each trial, from a seed, the known trials and its
     number, retries not counted.
@@ -246,17 +241,17 @@ class NumberedSampler(BaseSampler):
     as if it had never been interrupted.
     """
 
-    def __init__(self, kind: str, seed: int, n_startup_trials: int) -> None:
-        self._kind = kind
-        self._seed = seed
-        self._startup = n_startup_trials
+    kind: str
+    seed: int
+    n_startup_trials: int
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> Any:
         # A retry has the parameters of an earlier trial, and no number of its own.
         before = study.get_trials(deepcopy=False)[: trial.number]
         number = sum("again" not in earlier.user_attrs for earlier in before)
-        seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
-        self._sampler = SAMPLERS[self._kind](seed, self._startup)
+        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
+        make = SAMPLERS[self.kind]
+        self._sampler = make(n_startup_trials=self.n_startup_trials, seed=seed)
         return self._sampler.infer_relative_search_space(study, trial)
 
     def sample_relative(self, *arguments: Any) -> Any:
@@ -281,8 +276,7 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
             study_name=name, storage=backend, direction="maximize", load_if_exists=True
         )
     except Exception as error:  # databases and damaged journals raise anything
-        reason = f"{type(error).__name__}: {one_line(error)}"
-        raise ConfigError(f"storage {storage}: cannot be used ({reason})") from None
+        raise ConfigError(f"storage {storage}: cannot be used ({kind_and_line(error)})") from None
 
 
 def _open_journal(path: Path) -> JournalStorage:

@@ -18,6 +18,7 @@ from optuna.distributions import (
     FloatDistribution,
     IntDistribution,
 )
+from optuna.trial import create_trial
 from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -28,9 +29,9 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.training.algorithms import (
     constructor_parameters,
     get_algorithm,
-    is_off_policy,
     takes_whole,
 )
+from sb3_quad.training.config import TrainingConfig, build_config
 
 SPACES = YamlFolder("search space", "sb3_quad.zoo_configs.search_spaces", ".yml")
 MINIBATCHES = "n_minibatches"
@@ -64,29 +65,40 @@ class Factor(Frozen):
 class SearchSpace:
     """The settings that are varied, by name, and those that stay.
 
-    :param algo: the algorithm whose settings these are.
-    :param base: all settings, as a search starts from them.
+    :param config: the settings that a search starts from.
     :param dimensions: the distributions that Optuna samples from. Values of lists that are not
         plain ones are there as JSON.
     """
 
-    algo: str
-    base: StrMapping
+    config: TrainingConfig
     dimensions: dict[str, Any]
+
+    def values(self, parameters: StrMapping) -> StrDict:
+        """Return the values of the varied settings that some parameters stand for."""
+        values: StrDict = {}
+        for name, parameter in parameters.items():
+            values[name] = parameter
+            if isinstance(parameter, str) and parameter[:1] in ("[", "{"):
+                values[name] = json.loads(parameter)
+            elif isinstance(self.dimensions[name], FloatDistribution):
+                rounded = f"{parameter:.4g}"
+                is_linear = str(_current(self.config, name)).startswith(LINEAR)
+                values[name] = LINEAR + rounded if is_linear else float(rounded)
+        return values
 
     def settings(self, parameters: StrMapping) -> StrDict:
         """Return all settings of a trial with these parameters, as YAML holds them."""
-        changed = dict(self.base)
-        for name, parameter in parameters.items():
+        changed = dict(self.config.settings)
+        for name, value in self.values(parameters).items():
             outer, _, inner = name.partition(".")
-            value = self._setting(name, parameter)
             if inner:
-                value = {**_plain(changed.get(outer)), inner: value}
+                value = {**_entries(changed.get(outer)), inner: value}
             changed[outer] = value
         if MINIBATCHES in changed:
             # All of the same size, but for the last, which may be smaller.
             count = changed.pop(MINIBATCHES)
-            changed["batch_size"] = math.ceil(_rollout(self.algo, changed) / count)
+            config = build_config(self.config.algo, self.config.env_id, changed)
+            changed["batch_size"] = math.ceil(config.rollout / count)
         return changed
 
     def start(self) -> StrDict | None:
@@ -95,94 +107,73 @@ class SearchSpace:
         """
         start: StrDict = {}
         for name, dimension in self.dimensions.items():
-            # A list must hold the value, a range must include it.
-            value = current(self.algo, self.base, name)
-            if isinstance(dimension, CategoricalDistribution):
-                value = _label(value)
-                inside = value in dimension.choices
-            else:
-                value = _number_of(value)
-                inside = value is not None and dimension.low <= value <= dimension.high
-            if not inside:
-                return None
-            start[name] = value
+            value = _current(self.config, name)
+            is_list = isinstance(dimension, CategoricalDistribution)
+            start[name] = _label(value) if is_list else _number_of(value)
+        try:
+            # Optuna checks that the list holds the value, or that the range includes it.
+            create_trial(value=0.0, params=start, distributions=self.dimensions)
+        except ValueError:
+            return None
         return start
 
-    def _setting(self, name: str, parameter: Any) -> Any:
-        """Return the value that a parameter stands for."""
-        dimension = self.dimensions[name]
-        if isinstance(parameter, str) and parameter[:1] in ("[", "{"):
-            return json.loads(parameter)
-        if not isinstance(dimension, FloatDistribution):
-            return parameter
-        rounded = f"{parameter:.4g}"
-        if str(current(self.algo, self.base, name)).startswith(LINEAR):
-            return LINEAR + rounded
-        return float(rounded)
 
-
-def load_space(algo: str, settings: StrMapping, source: StrPath | None = None) -> SearchSpace:
+def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchSpace:
     """Load the space of a search around some settings.
 
     :param source: a YAML file; None: the package's own for the algorithm.
     :raises ConfigError: an unreadable file, an unknown setting, bounds that are not any.
     """
-    content, where = SPACES.read(source or algo)
+    content, where = SPACES.read(source or config.algo)
     if not content:
         raise ConfigError(
             f"{where}: must hold settings with their ranges, such as 'learning_rate: {{around: 5}}'"
         )
     # The algorithm's arguments and the training's own settings may vary.
-    parameters = constructor_parameters(get_algorithm(algo))
-    valid = [*parameters, *JOB_SETTINGS]
-    if {"n_steps", "batch_size"} <= parameters.keys() and not is_off_policy(get_algorithm(algo)):
+    valid = [*constructor_parameters(get_algorithm(config.algo)), *JOB_SETTINGS]
+    if {"n_steps", "batch_size"} <= {*valid} and not config.is_off_policy:
         valid.append(MINIBATCHES)
     # Of mappings, any entry may vary.
     for name in content:
         outer, _, inner = str(name).partition(".")
         if name not in valid and not (inner and outer in MAPPINGS):
-            raise ConfigError(f"{where}: {unknown(f'setting of {algo}', name, valid)}")
+            raise ConfigError(f"{where}: {unknown(f'setting of {config.algo}', name, valid)}")
     if MINIBATCHES in content and "batch_size" in content:
         raise ConfigError(f"{where}: {MINIBATCHES} sets batch_size; remove one of them")
     dimensions = {}
     for name, values in content.items():
-        dimensions[name] = _dimension(algo, settings, name, values, f"{where}: {name}")
-    return SearchSpace(algo, settings, dimensions)
+        dimensions[name] = _dimension(config, name, values, f"{where}: {name}")
+    return SearchSpace(config, dimensions)
 
 
-def current(algo: str, settings: StrMapping, name: str) -> Any:
+def _current(config: TrainingConfig, name: str) -> Any:
     """Return the value that some settings have under a name of a search space, or else the
     algorithm's default.
     """
     outer, _, inner = name.partition(".")
     # An entry of a mapping, such as policy_kwargs.net_arch.
     if inner:
-        return _plain(settings.get(outer)).get(inner)
+        return _entries(config.settings.get(outer)).get(inner)
     if name == MINIBATCHES:
-        batch_size = _number_of(current(algo, settings, "batch_size")) or 1
-        return round(_rollout(algo, settings) / batch_size)
-    if name in settings:
-        return settings[name]
-    # A setting of the training is no parameter: there is one environment by default.
-    parameter = constructor_parameters(get_algorithm(algo)).get(name)
-    if parameter is None:
-        return 1 if name == "n_envs" else None
-    return parameter.default
+        return round(config.rollout / (config.keyword("batch_size") or 1))
+    if name in config.settings:
+        return config.settings[name]
+    if name in JOB_SETTINGS:
+        return getattr(config, name)
+    return config.keyword(name)
 
 
-def _dimension(
-    algo: str, settings: StrMapping, name: str, values: Any, where: str
-) -> BaseDistribution:
+def _dimension(config: TrainingConfig, name: str, values: Any, where: str) -> BaseDistribution:
     if isinstance(values, list) and values:
         return CategoricalDistribution([_label(value) for value in values])
     if not isinstance(values, dict):
         raise ConfigError(
             f"{where}: {values!r} must be {{low: …, high: …}}, {{around: …}} or a list of values"
         )
-    parameter = constructor_parameters(get_algorithm(algo)).get(name)
+    parameter = constructor_parameters(get_algorithm(config.algo)).get(name)
     whole = name in (MINIBATCHES, "n_envs") or (parameter is not None and takes_whole(parameter))
     if "around" in values:
-        values = _around(current(algo, settings, name), values, whole, where)
+        values = _around(_current(config, name), values, whole, where)
     # The fields of an interval are the arguments of Optuna's distributions.
     interval = validate(WholeInterval if whole else Interval, values, where)
     try:
@@ -208,17 +199,11 @@ def _around(value: Any, factor: Any, whole: bool, where: str) -> StrDict:
     return {"low": low, "high": high, "log": True}
 
 
-def _rollout(algo: str, settings: StrMapping) -> float:
-    """Return the timesteps of a rollout of all environments."""
-    n_steps = _number_of(current(algo, settings, "n_steps")) or 1
-    return n_steps * (_number_of(current(algo, settings, "n_envs")) or 1)
-
-
-def _plain(value: Any) -> StrDict:
+def _entries(value: Any) -> StrDict:
     """Return a mapping of the settings with its values as written, also one like ``dict(…)``."""
     if isinstance(value, str):
         value = parse_value(value)
-    return dict(value) if isinstance(value, dict) else {}
+    return value or {}
 
 
 def _label(value: Any) -> Any:

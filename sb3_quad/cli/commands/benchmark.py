@@ -151,5 +151,5 @@ def _training_loop(stack: ExitStack, algo: str, conf_file: str | None) -> Subjec
         raise ConfigError(f"{algo}: only loops of on-policy algorithms are measured")
     env = stack.enter_context(closing(make_environments(config, config.n_envs, 0)))
     model = build_model(TrainingJob(config=config), env)
-    steps = config.rollout_steps * config.n_envs
+    steps = config.rollout
     return Subject(f"{algo}, whole loop", config.n_envs, steps, lambda: model.learn(steps))

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.types import StrDict
-from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.parser import (
     EXECUTOR,
     PAIRS,
@@ -85,30 +84,29 @@ def add_arguments(parser: Parser) -> None:
 def run(options: Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
     from sb3_quad.base.imports import import_packages
-    from sb3_quad.sweep.folder import Sweep, SweepFolder
+    from sb3_quad.sweep.folder import Sweep, read_sweep
     from sb3_quad.sweep.runs import make_runs, suite_of
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
         names = ("sweep", *SweepSpec.model_fields, "suite", "episodes")
         refuse(options, names, "--resume keeps the sweep's own settings; remove {}")
-        folder = SweepFolder(options.resume)
-        return _execute(options, folder.read(), folder)
+        folder = Path(options.resume)
+        return _execute(options, read_sweep(folder), folder)
     spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
     sweep = Sweep(spec=spec, runs=tuple(make_runs(spec)), suite=suite_of(spec))
-    if options.dry_run:
-        for planned in sweep.runs:
-            stages = [
-                f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
-                for stage in planned.stages
-            ]
-            print(f"{planned.name}: {', then '.join(stages)}")
-        configurations = {planned.configuration for planned in sweep.runs}
-        runs = _count(len(sweep.runs), "run")
-        print(f"{runs} of {_count(len(configurations), 'configuration')}")
-        return 0
-    return _execute(options, sweep, None)
+    if not options.dry_run:
+        return _execute(options, sweep, None)
+    for planned in sweep.runs:
+        stages = [
+            f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
+            for stage in planned.stages
+        ]
+        print(f"{planned.name}: {', then '.join(stages)}")
+    configurations = {planned.configuration for planned in sweep.runs}
+    print(f"{_count(len(sweep.runs), 'run')} of {_count(len(configurations), 'configuration')}")
+    return 0
 
 
 def _spec(options: Namespace) -> Any:
@@ -118,8 +116,6 @@ def _spec(options: Namespace) -> Any:
     """
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
-    from sb3_quad.training.algorithms import as_list
-    from sb3_quad.training.pipeline import is_pipeline
 
     data: StrDict = {"name": "sweep"}
     if options.sweep is not None:
@@ -140,69 +136,57 @@ def _spec(options: Namespace) -> Any:
             grid[name] = flags.pop(name)
     evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
     data |= {**flags, "grid": grid, "evaluation": evaluation}
-    keys = {**data, **grid}
-    # A sweep without settings trains what train does by default.
-    if not (data.get("configurations") or keys.keys() & {"conf_file", "algo", "env"}):
-        data["conf_file"] = DEFAULT_PIPELINE
-    elif not (data.get("configurations") or any(map(is_pipeline, as_list(keys.get("conf_file"))))):
-        data = {"algo": DEFAULT_ALGO, "env": DEFAULT_ENV, **data}
     return validate(SweepSpec, data, options.sweep or "command line")
 
 
-def _execute(options: Namespace, sweep: Any, folder: Any) -> int:
+def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
     """Do what is left of a sweep. Returns the exit code.
 
-    :param sweep: The sweep.
-    :param folder: Its SweepFolder, None for a new one.
+    :param sweep: The :class:`~sb3_quad.sweep.folder.Sweep`.
+    :param folder: Its folder, None for a new one.
     """
     from sb3_quad.base.files import locked
     from sb3_quad.base.process import StopSignals, available_cpus
     from sb3_quad.cli.output import console, progress_bar
     from sb3_quad.executors import start_executor
-    from sb3_quad.sweep.folder import SweepFolder
-    from sb3_quad.sweep.results import tables, write_report, write_results
+    from sb3_quad.sweep.folder import write_sweep
+    from sb3_quad.sweep.results import write_results
     from sb3_quad.sweep.run import execute
     from sb3_quad.training.runs import claim_folder
 
     start = time.perf_counter()
     workers = min(options.workers or available_cpus(), len(sweep.runs))
-    needs = sweep.spec.resources
     runs = _count(len(sweep.runs), "run")
-    with start_executor(
-        options.executor, workers, options.address, needs.num_cpus, needs.num_gpus
-    ) as executor:
+    resources = dict(sweep.spec.resources)
+    with start_executor(options.executor, workers, options.address, **resources) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
             parent = Path(options.log_folder or "logs") / "sweep"
-            folder = SweepFolder(claim_folder(parent, sweep.spec.name or "sweep"))
-            folder.write(sweep)
+            folder = claim_folder(parent, sweep.spec.name or "sweep")
+            write_sweep(folder, sweep)
         parallel = f"{executor.workers} in parallel, executor {options.executor}"
-        print(f"sweep {folder.path}: {runs}, {parallel}")
+        print(f"sweep {folder}: {runs}, {parallel}")
         with (
-            locked(folder.path, "sweep folder"),
+            locked(folder, "sweep folder"),
             StopSignals() as signals,
             progress_bar(options.progress) as show,
         ):
-            records = execute(folder, sweep, executor, signals, show, print)
+            ended = execute(folder, sweep, executor, signals, show, print)
             # Nothing interrupts the results.
             signals.hold()
-            results = write_results(folder, sweep, records)
-            if results.finished:
-                shown = tables(results)
-                for table in shown:
-                    console().print(table)
-                write_report(folder, results, shown)
-    failures = [record for record in records.values() if record.state == "failed"]
+            results, tables = write_results(folder, sweep, ended)
+            for table in tables:
+                console().print(table)
     seconds = time.perf_counter() - start
-    print(f"{results.finished} of {runs} finished, {len(failures)} failed; {seconds:.1f} s")
+    print(f"{results.finished} of {runs} finished, {len(results.failed)} failed; {seconds:.1f} s")
     report = ", report.md, report.html" if results.finished else ""
-    print(f"saved in {folder.path}: results.csv, results.json, runs/{report}")
-    for record in failures:
-        print(f"failed: {record.name}: {record.message}", file=sys.stderr)
+    print(f"saved in {folder}: results.csv, results.json, runs/{report}")
+    for name, message in results.failed.items():
+        print(f"failed: {name}: {message}", file=sys.stderr)
     if signals.received:
-        print(f"to continue: --resume {folder.path}")
+        print(f"to continue: --resume {folder}")
         return signals.exit_code
-    return int(bool(failures))
+    return int(bool(results.failed))
 
 
 def _count(number: int, noun: str) -> str:

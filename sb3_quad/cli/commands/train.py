@@ -53,12 +53,16 @@ from sb3_quad.cli.parser import (
     seed,
 )
 from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.training.options import JobOptions, SettingsOptions
+from sb3_quad.training.options import (
+    DEFAULT_ALGO,
+    DEFAULT_ENV,
+    DEFAULT_PIPELINE,
+    KEPT_BY_STAGES,
+    JobOptions,
+    SettingsOptions,
+)
 
-DEFAULT_PIPELINE = "two_stage.yml"
 THESIS = "thesis.yml"
-DEFAULT_ALGO = "dagger"
-DEFAULT_ENV = "QuadTargetTracking-v0"
 # A resumed run has its own values of these.
 KEPT_BY_RESUME = (
     "algo",
@@ -71,8 +75,6 @@ KEPT_BY_RESUME = (
     "seed",
     *SettingsOptions.model_fields,
 )
-# A pipeline's stages have their own values of these.
-KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
 
 
 SETTINGS_FLAGS: Flags = {

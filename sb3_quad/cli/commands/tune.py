@@ -35,7 +35,7 @@ from typing import Any
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
-from sb3_quad.cli.parser import Flags, Parser, add_flags, given, natural, positive, seed, whole
+from sb3_quad.cli.parser import Flags, Parser, add_flags, given, natural, positive, seed
 
 JOURNAL = "study.log"
 # Episodes per evaluation by --vec-env.
@@ -59,14 +59,14 @@ FLAGS: Flags = {
         "median",
         "method that stops poor trials early: median (default), halving or none",
     ),
-    "--n-startup-trials N": (whole, 10, "random trials before sampler and pruner start (10)"),
-    "--n-evaluations N": (whole, 10, "evaluations per trial, for the pruner (10)"),
+    "--n-startup-trials N": (natural, 10, "random trials before sampler and pruner start (10)"),
+    "--n-evaluations N": (positive, 10, "evaluations per trial, for the pruner (10)"),
     "--storage WHERE": "journal file, or URL of a database (study.log in the new folder)",
     "--study-name NAME": "name of the study in the storage (ALGO_ENV)",
     "--search-space FILE": "YAML file of settings to vary (the package's file for the algorithm)",
     "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
     "--seed N": (seed, None, "seed of trainings and sampler, negative for a random one (0)"),
-    "--eval-episodes N": (whole, None, "episodes per evaluation (batch: 240, else 48)"),
+    "--eval-episodes N": (positive, None, "episodes per evaluation (batch: 240, else 48)"),
 }
 
 
@@ -119,7 +119,7 @@ def _make_search(options: Namespace) -> Any:
         evaluation = {**config.eval_env_kwargs, **options.eval_env_kwargs}
         settings = {**config.settings, "eval_env_kwargs": evaluation}
         config = build_config(config.algo, config.env_id, settings)
-    space = load_space(config.algo, config.settings, options.search_space)
+    space = load_space(config, options.search_space)
     episodes = options.eval_episodes
     if episodes is None:
         episodes = EPISODES[config.vec_env]
@@ -149,21 +149,18 @@ def _print_results(search: Any) -> None:
     from sb3_quad.cli.closing import agent_and_expert
     from sb3_quad.cli.output import console
     from sb3_quad.controllers.zips import load_model
-    from sb3_quad.training.config import build_config
     from sb3_quad.training.runs import open_run
-    from sb3_quad.tuning.results import count_trials, settings_of, train_command, trial_line
+    from sb3_quad.tuning.results import count_trials, train_command, trial_line
     from sb3_quad.tuning.search import RUN
 
-    config = search.job.config
     best = search.best
     if best is not None:
         print(f"the best: {trial_line(search, best)}")
         path = Path(best.user_attrs[RUN])
         # A process on another machine may have trained it.
-        if config.task and path.is_dir():
+        if search.job.config.task and path.is_dir():
             model = open_run(path).model
-            flown = build_config(config.algo, config.env_id, settings_of(best))
-            job = search.job.model_copy(update={"config": flown})
+            job = search.job.model_copy(update={"config": search.config(best)})
             console().print(agent_and_expert(job, load_model(model)))
             print(f"agent: {model}")
         print(f"to train: {train_command(search)}")
