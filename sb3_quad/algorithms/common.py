@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -13,9 +14,11 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.algorithms import offset_correction
+from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.networks.gradients import network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import BoolArray, Float32Array
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.pretrained import agent_path
@@ -117,6 +120,24 @@ class ExpertMixin:
             isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
         )
 
+    def _label(self, buffer: ExpertRolloutBuffer) -> Float32Array:
+        """Write the expert's actions for the states before the step into a buffer.
+
+        :return: these actions, (n_envs, action_dim).
+        """
+        assert self._labeller is not None
+        with th.enable_grad():  # SB3's loop has no gradients, which an expert may need
+            labels = self._labeller.labels(self._last_obs, self._last_episode_starts)
+        buffer.expert_actions[buffer.pos] = labels
+        return labels
+
+    def _update_info_buffer(self, infos: list[Any], dones: BoolArray | None = None) -> None:
+        # SB3 would look at all infos, and only those of episodes that have ended say anything.
+        ended = np.flatnonzero(dones)
+        super()._update_info_buffer(  # type: ignore[misc]
+            [infos[row] for row in ended], np.ones(len(ended), dtype=np.bool_)
+        )
+
     def _refuse_dict_observations(self) -> None:
         space = self.observation_space  # type: ignore[attr-defined]
         if isinstance(space, spaces.Dict):
@@ -127,7 +148,8 @@ class ExpertMixin:
 
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
-        return [*super()._excluded_save_params(), "expert", "_labeller"]  # type: ignore[misc]
+        own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
+        return [*super()._excluded_save_params(), *own]  # type: ignore[misc]
 
 
 def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:

@@ -3,10 +3,9 @@
 import math
 import secrets
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
@@ -22,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
+from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, sample_rows
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     actor_and_critic_parameters,
@@ -31,7 +30,6 @@ from sb3_quad.algorithms.common import (
 )
 from sb3_quad.algorithms.networks.gradients import (
     Batch,
-    Network,
     Perceptrons,
     mean_actions,
     network_of,
@@ -183,6 +181,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             seed=seed,
             device=device,
             supported_action_spaces=(spaces.Box,),
+            rollout_buffer_class=ExpertRolloutBuffer,
             _init_setup_model=False,
         )
         self.batch_size = batch_size
@@ -330,102 +329,79 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         It fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs.
         """
         self.policy.set_training_mode(False)
-        self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)  # +
+        buffer = cast(ExpertRolloutBuffer, rollout_buffer)
+        self._labeller = Controller.for_env(self.expert, env, self._labeller)  # +
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
-        n_envs = env.num_envs
         action_space: Any = self.action_space
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
-        # + The label of each step, and what the auxiliary loss teaches
-        labels = np.empty((n_rollout_steps, n_envs, rollout_buffer.action_dim), dtype=np.float32)
+        by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
+        # + What the auxiliary loss teaches, by step
         aux_targets: list[Float32Array] = []
         true_state = true_state_of(env) if self._aux_layer else None
-        # Step, environment and last observation of each episode that a time limit has ended
-        timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []
-        not_yet = th.zeros(n_envs)
-        n_by_expert = 0
+        not_yet = th.zeros(env.num_envs)
 
-        rollout_buffer.reset()
+        buffer.reset()
         callback.on_rollout_start()
 
         for step in range(n_rollout_steps):
             # + Label the state before the step.
-            observations: Any = self._last_obs
-            labels[step] = labeller.labels(observations, self._last_episode_starts)
+            labels = self._label(buffer)
             if true_state is not None:
                 aux_targets.append(unobserved(true_state()))
 
             # + The expert's action flies with probability β, else a sample of the agent's.
+            observations: Any = self._last_obs
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
-            by_expert = rng.random(n_envs) < beta
-            actions = np.where(by_expert[:, None], labels[step], sampled)
-            n_by_expert += int(by_expert.sum())
-            shaped = actions.reshape(n_envs, *action_space.shape)
+            by_expert[step] = rng.random(env.num_envs) < beta
+            actions = np.where(by_expert[step, :, None], labels, sampled)
+            shaped = actions.reshape(-1, *action_space.shape)
             clipped_actions = np.clip(shaped, action_space.low, action_space.high)
 
             new_obs, rewards, dones, infos = env.step(clipped_actions)
 
-            self.num_timesteps += n_envs
+            self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
 
-            ended = np.flatnonzero(dones)
-            self._update_info_buffer([infos[row] for row in ended], dones[ended])
-            for row in ended:
+            self._update_info_buffer(infos, dones)
+            # A time limit is no failure: V of the last observation stands for what would follow.
+            for row in np.flatnonzero(dones):
                 last = infos[row].get("terminal_observation")
-                if infos[row].get("TimeLimit.truncated") and last is not None:
-                    timeouts.append((step, int(row), last))
+                if last is not None and infos[row].get("TimeLimit.truncated"):
+                    rewards[row] += self.gamma * state_values(network, last[None])[0]
 
             starts: Any = self._last_episode_starts
-            rollout_buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
+            buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
 
-        flown = rollout_buffer.observations.reshape(-1, *rollout_buffer.obs_shape)
-        self._evaluate(network, rollout_buffer, flown, timeouts)
+        # + The critic does not change in a rollout. It evaluates many states at once.
+        flown = buffer.observations.reshape(-1, *buffer.obs_shape)
+        parts = np.array_split(flown, math.ceil(len(flown) / _VALUE_CHUNK))
+        values = np.concatenate([state_values(network, part) for part in parts])
+        buffer.values = values.reshape(buffer.values.shape)
         last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
-        rollout_buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
+        buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
         # + Add the labels to the dataset.
         if self.dataset_capacity == 0:
             self.dataset.clear()
-        targets = labels
+        targets = buffer.expert_actions
         if aux_targets:
-            targets = np.concatenate([labels, aux_targets], axis=2)
+            targets = np.concatenate([targets, aux_targets], axis=2)
         self.dataset.add(flown, targets.reshape(len(flown), -1))
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
         self.logger.record("dagger/dataset_size", len(self.dataset))
-        self.logger.record("rollout/expert_fraction", n_by_expert / (n_rollout_steps * n_envs))
+        self.logger.record("rollout/expert_fraction", by_expert.mean())
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
-
-    def _evaluate(
-        self,
-        network: Network,
-        rollout_buffer: RolloutBuffer,
-        flown: npt.NDArray[Any],
-        timeouts: list[tuple[int, int, npt.NDArray[Any]]],
-    ) -> None:
-        """Let the critic evaluate a whole rollout at once; it does not change while that is flown.
-
-        A time limit is no failure: the rewards that would have followed are worth V of the last
-        observation.
-        """
-        values = [
-            state_values(network, flown[first : first + _VALUE_CHUNK])
-            for first in range(0, len(flown), _VALUE_CHUNK)
-        ]
-        rollout_buffer.values = np.concatenate(values).reshape(rollout_buffer.values.shape)
-        if timeouts:
-            steps, rows, last = zip(*timeouts, strict=True)
-            following = self.gamma * state_values(network, np.stack(last))
-            rollout_buffer.rewards[list(steps), list(rows)] += following
 
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.

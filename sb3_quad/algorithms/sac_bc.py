@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.sac.policies import SACPolicy
@@ -20,12 +21,6 @@ from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.buffers import (
-    ExpertDictReplayBuffer,
-    ExpertNStepReplayBuffer,
-    ExpertReplayBuffer,
-    ExpertReplaySamples,
-)
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, model_of, policy_arguments
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
@@ -188,36 +183,22 @@ class SACBC(ExpertMixin, SAC):
                 f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
                 " observations; give 1"
             )
-        if self._clones:
-            self.replay_buffer = self._expert_buffer()
-        super()._setup_model()
-        if self.critic_layer_norm:
-            _normalise_layers(self.critic)
-            _normalise_layers(self.critic_target)
-
-    def _expert_buffer(self) -> ExpertReplayBuffer:
-        """Return a buffer as SB3 would make it, but with room for the labels."""
-        if self.replay_buffer_class not in _STOCK_BUFFERS:
+        if self._clones and self.replay_buffer_class not in _STOCK_BUFFERS:
             raise ConfigError(
                 f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's"
                 " actions"
             )
-        kind = ExpertReplayBuffer
-        keywords = dict(self.replay_buffer_kwargs)
-        if isinstance(self.observation_space, spaces.Dict):
-            kind = ExpertDictReplayBuffer
-        elif self.n_steps > 1:
-            kind = ExpertNStepReplayBuffer
-            keywords |= {"n_steps": self.n_steps, "gamma": self.gamma}
-        return kind(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            n_envs=self.n_envs,
-            optimize_memory_usage=self.optimize_memory_usage,
-            **keywords,
-        )
+        super()._setup_model()
+        if self._clones:
+            # An action is stored with the expert's behind it, as one. So the two cannot be
+            # separated, whichever rows SB3 samples.
+            buffer: Any = self.replay_buffer
+            buffer.action_dim *= 2
+            shape = (*buffer.actions.shape[:2], buffer.action_dim)
+            buffer.actions = np.zeros(shape, dtype=np.float32)
+        if self.critic_layer_norm:
+            _normalise_layers(self.critic)
+            _normalise_layers(self.critic_target)
 
     @property
     def policy_is_idle(self) -> bool:
@@ -283,8 +264,7 @@ class SACBC(ExpertMixin, SAC):
         dones: npt.NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        if isinstance(replay_buffer, ExpertReplayBuffer):
-            assert self._labels is not None
+        if self._labels is not None:
             flown = buffer_action.reshape(self._labels.shape)
             buffer_action = np.hstack([flown, self._labels])
         self._starts = dones
@@ -317,6 +297,7 @@ class SACBC(ExpertMixin, SAC):
         for gradient_step in range(gradient_steps):
             # Sample the replay buffer, + with the expert's actions where there are any
             data: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            actions, *labels = data.actions.split(get_action_dim(self.action_space), dim=1)
             discounts = data.discounts if data.discounts is not None else self.gamma
             if self.use_sde:
                 self.actor.reset_noise()
@@ -351,7 +332,7 @@ class SACBC(ExpertMixin, SAC):
                 targets = data.rewards + (1 - data.dones) * discounts * next_values
 
             # Critic loss
-            current = self.critic(data.observations, data.actions)
+            current = self.critic(data.observations, actions)
             critic_loss: Any = 0.5 * sum(F.mse_loss(q, targets) for q in current)
             log("critic_loss", critic_loss)
             if not np.isfinite(history["critic_loss"][-1]):  # +
@@ -368,8 +349,8 @@ class SACBC(ExpertMixin, SAC):
                 q_pi = self._least_q(self.critic, data.observations, actions_pi)
                 actor_loss = (ent_coef * log_prob - q_pi).mean()
                 log("actor_loss", actor_loss)
-                if mean is not None and isinstance(data, ExpertReplaySamples):  # +
-                    bc_loss, bc_share = self._bc_loss(data.observations, mean, data.expert_actions)
+                if mean is not None and labels:  # +
+                    bc_loss, bc_share = self._bc_loss(data.observations, mean, labels[0])
                     actor_loss = actor_loss + bc_coef * q_pi.detach().abs().mean() * bc_loss
                     log("bc_loss", bc_loss)
                     log("bc_share", bc_share)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -28,22 +28,6 @@ _TYPES = tuple(Loss.__annotations__.values())
 _NONE = np.empty(0)
 
 
-class Place(NamedTuple):
-    """The place of a layer in the array of all parameters: weights, then biases, padded.
-
-    :param start: of its weights.
-    :param middle: of its biases.
-    :param rows: its outputs, padded.
-    :param columns: its inputs, padded.
-    """
-
-    layer: Any
-    start: int
-    middle: int
-    rows: int
-    columns: int
-
-
 class Perceptron:
     """Linear layers with tanh or ReLU between them, whose parameters stay PyTorch's.
 
@@ -56,27 +40,34 @@ class Perceptron:
         # Widths are padded to multiples of 4.
         sizes = [self._layers[0].in_features, *(layer.out_features for layer in self._layers)]
         self._widths = np.array([-(-size // 4) * 4 for size in sizes])
-        self._places: list[Place] = []
+        self._size = int((self._widths[1:] * (self._widths[:-1] + 1)).sum())
+        self._scratch_size = int(self._widths.sum() + 2 * self._widths.max()) * ROWS
+        # Parameters with the weights as they are, and with the weights transposed. PyTorch's memory
+        # is copied into them before each call.
+        self._packed = np.zeros((2, self._size), np.float32)
+        own = [parameter.detach().numpy() for parameter in self.parameters()]
+        self._copies = [
+            *zip(self._views(self._packed[0]), own, strict=True),
+            *zip(self._views(self._packed[1], transposed=True), own, strict=True),
+        ]
+
+    def _views(self, packed: Float32Array, transposed: bool = False) -> list[Float32Array]:
+        """Return the views of :meth:`parameters` in an array of all layers' parameters.
+
+        :param transposed: whether each layer's weights lie there as (inputs, outputs).
+        """
+        views: list[Float32Array] = []
         start = 0
         for i, layer in enumerate(self._layers):
-            columns, rows = self._widths[i : i + 2].tolist()
+            columns, rows = self._widths[i : i + 2]
             middle = start + rows * columns
-            self._places.append(Place(layer, start, middle, rows, columns))
+            weights = packed[start:middle].reshape(rows, columns)
+            if transposed:
+                weights = packed[start:middle].reshape(columns, rows).T
+            views.append(weights[: layer.out_features, : layer.in_features])
+            views.append(packed[middle : middle + layer.out_features])
             start = middle + rows
-        self._size = start
-        # Parameters with the weights as they are, and with the weights transposed
-        self._packed = np.zeros((2, self._size), np.float32)
-        # Views of those and of PyTorch's memory, which is copied into them before each call
-        self._copies: list[tuple[Float32Array, Float32Array]] = []
-        for layer, start, middle, rows, columns in self._places:
-            weight = layer.weight.detach().numpy()
-            bias = layer.bias.detach().numpy()
-            outputs, inputs = weight.shape
-            plain = self._packed[0, start:middle].reshape(rows, columns)
-            transposed = self._packed[1, start:middle].reshape(columns, rows)
-            self._copies.append((plain[:outputs, :inputs], weight))
-            self._copies.append((transposed[:inputs, :outputs], weight.T))
-            self._copies.append((self._packed[:, middle : middle + outputs], bias))
+        return views
 
     @staticmethod
     def fits(modules: Sequence[nn.Module]) -> bool:
@@ -124,14 +115,11 @@ class Perceptron:
         terms = np.empty((chunks, TERMS))
         typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
         self._compute(gradient, len(index), x, index, targets, typed, stds, sums, terms)
-        total = th.from_numpy(sums.sum(axis=0))
-        for layer, start, middle, rows, columns in self._places:
-            weights = total[start:middle].view(rows, columns)
-            own = weights[: layer.out_features, : layer.in_features]
-            layer.weight.grad = own.contiguous()
-            layer.bias.grad = total[middle : middle + layer.out_features]
+        total = sums.sum(axis=0)
+        for parameter, view in zip(self.parameters(), self._views(total), strict=True):
+            parameter.grad = th.from_numpy(view).contiguous()
         if log_std is not None:
-            log_std.grad = total[self._size :]
+            log_std.grad = th.from_numpy(total[self._size :])
         result: FloatArray = terms.sum(axis=0)
         return result
 
@@ -154,7 +142,7 @@ class Perceptron:
         firsts = iter(range(0, chunks, size))
 
         def work() -> None:
-            scratch = _aligned(int(self._widths.sum() + 2 * self._widths.max()) * ROWS)
+            scratch = _aligned(self._scratch_size)
             for first in firsts:
                 function(first, min(first + size, chunks), chunks, scratch, layers, *arguments)
 
