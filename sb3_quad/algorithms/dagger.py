@@ -16,7 +16,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, explained_variance
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
@@ -44,7 +44,7 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.controller import Controller, true_state_of
 from sb3_quad.controllers.expert_like import ExpertLike
@@ -330,7 +330,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         """
         self.policy.set_training_mode(False)
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
-        self._labeller = Controller.for_env(self.expert, env, self._labeller)  # +
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
@@ -347,7 +346,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         for step in range(n_rollout_steps):
             # + Label the state before the step.
-            labels = self._label(buffer)
+            labels = self._labels(env)
+            buffer.expert_actions[step] = labels
             if true_state is not None:
                 aux_targets.append(unobserved(true_state()))
 
@@ -376,7 +376,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
             starts: Any = self._last_episode_starts
             buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
-            self._last_obs = new_obs  # type: ignore[assignment]
+            self._last_obs = new_obs
             self._last_episode_starts = dones
 
         # + The critic does not change in a rollout. It evaluates many states at once.
@@ -523,23 +523,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             for name, term in terms.items():
                 history.setdefault(name, []).append(term)
 
-        # Logs
-        explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        for name, values_of_term in history.items():
-            self.logger.record(f"train/{name}", float(np.mean(values_of_term)))
-        self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-        self.logger.record("train/explained_variance", explained_var)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
-
-    def _diverged(self, terms: dict[str, float]) -> TrainingError:
-        """Return the error for a loss or gradient that is not finite."""
-        return TrainingError(
-            f"training diverged at {self.num_timesteps} timesteps (cloning loss"
-            f" {terms['bc_loss']:.3g}, value loss {terms.get('value_loss', 0.0):.3g}); lower"
-            " learning_rate, or look for rewards and observations that are not finite"
-        )
+        self._log_update(history)
+        self._log_rollout(buffer, clip_range_vf)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "dataset", "_aux_layer"]

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, explained_variance
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
@@ -28,7 +28,7 @@ from sb3_quad.algorithms.common import (
     model_of,
     policy_arguments,
 )
-from sb3_quad.algorithms.networks.gradients import Perceptrons, Terms, act, network_of
+from sb3_quad.algorithms.networks.gradients import Perceptrons, act, network_of
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
     CLONING_LOSSES,
@@ -41,8 +41,7 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.base.errors import ConfigError, ExpertError, unknown
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # By default a rollout is so many mini-batches, but none has less than so many rows.
@@ -297,7 +296,6 @@ class PPOBC(ExpertMixin, PPO):
             self._labeller = None
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
 
-        self._labeller = Controller.for_env(self.expert, env, self._labeller)
         network = network_of(self.policy)
         sample: Any = self.policy.forward
         if isinstance(network, Perceptrons):
@@ -306,10 +304,10 @@ class PPOBC(ExpertMixin, PPO):
         def forward(observations: th.Tensor) -> Any:
             output = sample(observations)
             # Label the state before the step.
-            self._label(buffer)
+            buffer.expert_actions[buffer.pos] = self._labels(env)
             return output
 
-        self.policy.forward = forward  # type: ignore[method-assign]
+        self.policy.forward = forward
         try:
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
         finally:
@@ -481,28 +479,10 @@ class PPOBC(ExpertMixin, PPO):
                 break
 
         self._n_rollouts_trained += 1  # +
-        explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-
         # Logs
-        averages = {name: float(np.mean(values)) for name, values in history.items()}
-        averages["approx_kl"] = float(np.mean(approx_kl_divs))
-        averages["loss"] = terms["loss"]
-        for name, average in averages.items():
-            self.logger.record(f"train/{name}", average)
-        self.logger.record("train/explained_variance", explained_var)
-        if hasattr(self.policy, "log_std"):
-            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        history["approx_kl"] = approx_kl_divs
+        history["loss"] = [terms["loss"]]
+        self._log_update(history)
+        self._log_rollout(buffer, clip_range_vf)
         self.logger.record("train/clip_range", clip_range)
-        if clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
         self.logger.record("train/bc_coef", bc_coef)  # +
-
-    def _diverged(self, terms: Terms) -> TrainingError:
-        """Return the error for a loss or gradient that is not finite."""
-        values = ", ".join(f"{name} {term:.3g}" for name, term in terms.items())
-        return TrainingError(
-            f"the loss is not finite after {self.num_timesteps} timesteps ({values}): try a smaller"
-            " learning_rate or bc_coef, and check the expert's actions"
-        )

@@ -1,5 +1,6 @@
 """Soft actor-critic that also clones an expert: a value-based stage two."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,8 @@ from sb3_quad.algorithms.networks.losses import (
     cloning_errors,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.base.types import BoolArray, Float32Array
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.base.errors import ConfigError, ExpertError, unknown
+from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.expert_like import ExpertLike
 
 _STOCK_BUFFERS = (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer)
@@ -160,9 +160,7 @@ class SACBC(ExpertMixin, SAC):
         self.critic_layer_norm = critic_layer_norm
         self._clones = False
         # The expert's scaled actions for the present states, (n_envs, action_dim)
-        self._labels: Float32Array | None = None
-        # Which rows have just begun an episode, (n_envs,); None: all
-        self._starts: BoolArray | None = None
+        self._scaled_labels: Float32Array | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -226,10 +224,6 @@ class SACBC(ExpertMixin, SAC):
             raise ExpertError(
                 "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
             )
-        if reset_num_timesteps or self._last_obs is None:
-            # The environments begin again.
-            self._starts = None
-            self._labeller = None
         with self._threads():
             return super().learn(
                 total_timesteps=total_timesteps,
@@ -246,13 +240,10 @@ class SACBC(ExpertMixin, SAC):
         # Before the step: an expert that sees the true state labels the present one.
         if self._clones:
             assert self.env is not None
-            observations: Any = self._last_obs
-            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
-            labels = self._labeller.labels(observations, self._starts)
-            scaled: Any = self.policy.scale_action(
-                labels.reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
-            )
-            self._labels = scaled.reshape(n_envs, -1)
+            labels = self._labels(self.env)
+            space: Any = self.action_space
+            scaled: Any = self.policy.scale_action(labels.reshape(n_envs, *space.shape))
+            self._scaled_labels = scaled.reshape(n_envs, -1)
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
@@ -264,10 +255,10 @@ class SACBC(ExpertMixin, SAC):
         dones: npt.NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        if self._labels is not None:
-            flown = buffer_action.reshape(self._labels.shape)
-            buffer_action = np.hstack([flown, self._labels])
-        self._starts = dones
+        if self._scaled_labels is not None:
+            flown = buffer_action.reshape(self._scaled_labels.shape)
+            buffer_action = np.hstack([flown, self._scaled_labels])
+        self._last_episode_starts = dones
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     @staticmethod
@@ -336,10 +327,7 @@ class SACBC(ExpertMixin, SAC):
             critic_loss: Any = 0.5 * sum(F.mse_loss(q, targets) for q in current)
             log("critic_loss", critic_loss)
             if not np.isfinite(history["critic_loss"][-1]):  # +
-                raise TrainingError(
-                    f"the critic's loss is not finite after {self.num_timesteps} timesteps: lower"
-                    " learning_rate, or look for rewards and observations that are not finite"
-                )
+                raise self._diverged({"critic_loss": math.nan})
             self.critic.optimizer.zero_grad()
             critic_loss.backward()
             self.critic.optimizer.step()
@@ -366,9 +354,7 @@ class SACBC(ExpertMixin, SAC):
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
         self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in history.items():
-            self.logger.record(f"train/{name}", np.mean(values))
+        self._log_update(history)
         if self._clones:  # +
             self.logger.record("train/bc_coef", bc_coef)
 
@@ -395,7 +381,7 @@ class SACBC(ExpertMixin, SAC):
         return (errors * kept).mean(), kept.float().mean()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_labels", "_starts"]
+        return [*super()._excluded_save_params(), "_scaled_labels"]
 
 
 def _normalise_layers(critic: ContinuousCritic) -> None:

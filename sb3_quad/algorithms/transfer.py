@@ -8,7 +8,6 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_quad.algorithms.buffers import AggregatedDataset
@@ -34,13 +33,13 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
     """
     if isinstance(source, BaseAlgorithm):
         name = f"the policy of {type(source).__name__}"
-        theirs = dict(source.policy.state_dict())
+        teacher = source
     else:
         name = str(source)
-        theirs = _saved_policy(source)
+        teacher = load_model(source)
+    theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()
     if isinstance(model, OffPolicyAlgorithm) and theirs.keys() != ours.keys():
-        teacher = source if isinstance(source, BaseAlgorithm) else load_model(source)
         try:
             clone_policy(teacher, model, seed=model.seed or 0)
         except ExpertError as error:  # other spaces
@@ -58,17 +57,6 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
             f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
             " train takes them from it unless --conf-file is given"
         ) from None
-
-
-def _saved_policy(path: str | Path) -> dict[str, th.Tensor]:
-    """Return the parameters of the policy in a zip; nothing is unpickled."""
-    try:
-        _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")
-        return dict(parameters["policy"])
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise ConfigError(f"{path}: not a complete SB3 zip ({one_line(error)})") from None
 
 
 # At least so many states are flown for a clone, and so many steps in each environment.
@@ -109,12 +97,9 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
     # The states flown, and the teacher's actions there as the actor gives them
-    dataset = AggregatedDataset(
-        steps * n,
-        env.observation_space.shape or (),
-        get_action_dim(env.action_space),
-        env.observation_space.dtype,
-    )
+    space: Any = env.observation_space
+    action_dim = get_action_dim(env.action_space)
+    dataset = AggregatedDataset(steps * n, space.shape, action_dim, space.dtype)
     errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)

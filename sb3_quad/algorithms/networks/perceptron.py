@@ -146,7 +146,7 @@ class Perceptron:
             for first in firsts:
                 function(first, min(first + size, chunks), chunks, scratch, layers, *arguments)
 
-        helpers = [_pool.submit(work) for _ in range(threads - 1)] if _pool is not None else []
+        helpers = [_pool.submit(work) for _ in range(threads - 1)]
         work()
         for helper in helpers:
             # Do not wait for one that has not begun: its core is busy with something else.
@@ -165,9 +165,10 @@ def _aligned(size: int) -> Float32Array:
     return room[to_next_line : to_next_line + size]
 
 
-# Threads that share the work of every perceptron, and the pool of all but the first
+# Threads that share the work of every perceptron, and the pool of all but the first. None of its
+# threads begins before there is work for it.
 _threads = 1
-_pool: ThreadPoolExecutor | None = None
+_pool = ThreadPoolExecutor(1)
 
 
 def use_one_torch_thread() -> None:
@@ -199,7 +200,7 @@ def one_torch_thread(compiled: bool) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(torch_threads)
-        if _pool is not pool and _pool is not None:
+        if _pool is not pool:
             _pool.shutdown()
         _threads = threads
         _pool = pool
