@@ -40,18 +40,21 @@ class Perceptron:
         # Widths are padded to multiples of 4.
         sizes = [self._layers[0].in_features, *(layer.out_features for layer in self._layers)]
         self._widths = np.array([-(-size // 4) * 4 for size in sizes])
-        self._size = int((self._widths[1:] * (self._widths[:-1] + 1)).sum())
-        self._scratch_size = int(self._widths.sum() + 2 * self._widths.max()) * ROWS
-        # Parameters with the weights as they are, and with the weights transposed. PyTorch's memory
-        # is copied into them before each call.
+        before = self._widths[:-1]
+        after = self._widths[1:]
+        self._size = int((after * (before + 1)).sum())
+        room = self._widths.sum() + 2 * self._widths.max()
+        self._scratch_size = int(room) * ROWS
+        # Parameters with the weights as they are, and with the weights transposed
         self._packed = np.zeros((2, self._size), np.float32)
+        # Views of those and of PyTorch's memory, which is copied into them before each call
+        self._copies: list[tuple[Float32Array, Float32Array]] = []
         own = [parameter.detach().numpy() for parameter in self.parameters()]
-        self._copies = [
-            *zip(self._views(self._packed[0]), own, strict=True),
-            *zip(self._views(self._packed[1], transposed=True), own, strict=True),
-        ]
+        for packed, transposed in zip(self._packed, (False, True), strict=True):
+            views = self._views(packed, transposed)
+            self._copies.extend(zip(views, own, strict=True))
 
-    def _views(self, packed: Float32Array, transposed: bool = False) -> list[Float32Array]:
+    def _views(self, packed: Float32Array, transposed: bool) -> list[Float32Array]:
         """Return the views of :meth:`parameters` in an array of all layers' parameters.
 
         :param transposed: whether each layer's weights lie there as (inputs, outputs).
@@ -59,7 +62,7 @@ class Perceptron:
         views: list[Float32Array] = []
         start = 0
         for i, layer in enumerate(self._layers):
-            columns, rows = self._widths[i : i + 2]
+            columns, rows = self._widths[i : i + 2].tolist()
             middle = start + rows * columns
             weights = packed[start:middle].reshape(rows, columns)
             if transposed:
@@ -116,7 +119,7 @@ class Perceptron:
         typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
         self._compute(gradient, len(index), x, index, targets, typed, stds, sums, terms)
         total = sums.sum(axis=0)
-        for parameter, view in zip(self.parameters(), self._views(total), strict=True):
+        for parameter, view in zip(self.parameters(), self._views(total, False), strict=True):
             parameter.grad = th.from_numpy(view).contiguous()
         if log_std is not None:
             log_std.grad = th.from_numpy(total[self._size :])
