@@ -1,4 +1,4 @@
-"""Buffers with an expert's actions: SB3's rollout and replay buffers, and DAgger's dataset."""
+"""Buffers with an expert's actions: SB3's rollout buffer, and DAgger's dataset."""
 
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -7,13 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.buffers import (
-    DictReplayBuffer,
-    NStepReplayBuffer,
-    ReplayBuffer,
-    RolloutBuffer,
-)
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
@@ -98,55 +92,6 @@ class ExpertRolloutBuffer(RolloutBuffer):
     ) -> ExpertRolloutSamples:
         stock = super()._get_samples(batch_inds, env)
         return ExpertRolloutSamples(*stock, self.to_torch(self.expert_actions[batch_inds]))
-
-
-class ExpertReplaySamples(NamedTuple):
-    """SB3's ``ReplayBufferSamples``, (b, ...) each, and the expert's scaled actions.
-
-    Dict observations are tensors by key.
-    """
-
-    observations: th.Tensor | dict[str, th.Tensor]
-    actions: th.Tensor
-    next_observations: th.Tensor | dict[str, th.Tensor]
-    dones: th.Tensor
-    rewards: th.Tensor
-    discounts: th.Tensor | None
-    expert_actions: th.Tensor
-
-
-class ExpertReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer with the expert's scaled action for each state.
-
-    What it stores as one action is the action that was flown with the expert's behind it, (n_envs,
-    2 action_dim). So an action and its label cannot be separated, whichever rows SB3 samples.
-    """
-
-    def __init__(
-        self,
-        buffer_size: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        *args: Any,
-        **kwargs: Any,
-    ) -> None:
-        both = spaces.Box(-1.0, 1.0, (2 * spaces.flatdim(action_space),), np.float32)
-        super().__init__(buffer_size, observation_space, both, *args, **kwargs)
-
-    def _get_samples(  # type: ignore[override]
-        self, batch_inds: IntArray, env: VecNormalize | None = None
-    ) -> ExpertReplaySamples:
-        data = super()._get_samples(batch_inds, env)
-        actions, expert_actions = data.actions.chunk(2, dim=1)
-        return ExpertReplaySamples(*data._replace(actions=actions), expert_actions=expert_actions)
-
-
-class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):  # type: ignore[misc]
-    """The same with SB3's n-step returns."""
-
-
-class ExpertDictReplayBuffer(ExpertReplayBuffer, DictReplayBuffer):  # type: ignore[misc]
-    """The same for Dict observations."""
 
 
 class AggregatedDataset:

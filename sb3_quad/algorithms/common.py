@@ -6,16 +6,21 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.pretrained import agent_path
@@ -57,6 +62,13 @@ class ExpertMixin:
     """The expert of an algorithm, and what its zips say about its flights."""
 
     env: VecEnv | None
+    policy: Any
+    logger: Logger
+    num_timesteps: int
+    observation_space: spaces.Space[Any]
+    _last_obs: Any
+    _last_episode_starts: Any
+    _n_updates: int
     expert: ExpertLike | None
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
@@ -112,22 +124,62 @@ class ExpertMixin:
 
     def _threads(self) -> AbstractContextManager[None]:
         """Return the context to learn in: compiled code leaves PyTorch one thread."""
-        policy: Any = self.policy  # type: ignore[attr-defined]
+        policy = self.policy
         return one_torch_thread(
             isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
         )
 
+    def _labels(self, env: VecEnv) -> Float32Array:
+        """Return the expert's actions for the present states, (n_envs, action_dim).
+
+        Call it before the step.
+        """
+        self._labeller = Controller.for_env(self.expert, env, self._labeller)
+        with th.enable_grad():  # SB3's loops have no gradients, which an expert may need
+            return self._labeller.labels(self._last_obs, self._last_episode_starts)
+
+    def _update_info_buffer(self, infos: list[Any], dones: Any = None) -> None:
+        # SB3 would look at all infos, and only those of episodes that have ended say anything.
+        ended = np.flatnonzero(dones)
+        super()._update_info_buffer(  # type: ignore[misc]
+            [infos[row] for row in ended], np.ones(len(ended), dtype=np.bool_)
+        )
+
     def _refuse_dict_observations(self) -> None:
-        space = self.observation_space  # type: ignore[attr-defined]
+        space = self.observation_space
         if isinstance(space, spaces.Dict):
             raise ConfigError(
                 f"observation space {space}: {type(self).__name__} does not support Dict with an"
                 " expert; wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
 
+    def _log_update(self, history: dict[str, list[float]]) -> None:
+        """Log the means of an update's terms, whose values are given by name."""
+        for name, values in history.items():
+            self.logger.record(f"train/{name}", float(np.mean(values)))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _log_rollout(self, buffer: RolloutBuffer, clip_range_vf: float | None) -> None:
+        """Log what else PPO logs after an update."""
+        explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        self.logger.record("train/explained_variance", explained_var)
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+        if clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def _diverged(self, terms: dict[str, float]) -> TrainingError:
+        """Return the error for a loss or gradient that is not finite."""
+        values = ", ".join(f"{name} {term:.3g}" for name, term in terms.items())
+        return TrainingError(
+            f"the loss is not finite after {self.num_timesteps} timesteps ({values}): lower"
+            " learning_rate or bc_coef, and look for rewards and observations that are not finite"
+        )
+
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
-        return [*super()._excluded_save_params(), "expert", "_labeller"]  # type: ignore[misc]
+        own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
+        return [*super()._excluded_save_params(), *own]  # type: ignore[misc]
 
 
 def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:

@@ -3,10 +3,9 @@
 import math
 import secrets
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
@@ -17,12 +16,12 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, explained_variance
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
+from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, sample_rows
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     actor_and_critic_parameters,
@@ -31,7 +30,6 @@ from sb3_quad.algorithms.common import (
 )
 from sb3_quad.algorithms.networks.gradients import (
     Batch,
-    Network,
     Perceptrons,
     mean_actions,
     network_of,
@@ -46,7 +44,7 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.controller import Controller, true_state_of
 from sb3_quad.controllers.expert_like import ExpertLike
@@ -183,6 +181,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             seed=seed,
             device=device,
             supported_action_spaces=(spaces.Box,),
+            rollout_buffer_class=ExpertRolloutBuffer,
             _init_setup_model=False,
         )
         self.batch_size = batch_size
@@ -330,102 +329,79 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         It fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs.
         """
         self.policy.set_training_mode(False)
-        self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)  # +
+        buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
-        n_envs = env.num_envs
         action_space: Any = self.action_space
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
-        # + The label of each step, and what the auxiliary loss teaches
-        labels = np.empty((n_rollout_steps, n_envs, rollout_buffer.action_dim), dtype=np.float32)
+        by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
+        # + What the auxiliary loss teaches, by step
         aux_targets: list[Float32Array] = []
         true_state = true_state_of(env) if self._aux_layer else None
-        # Step, environment and last observation of each episode that a time limit has ended
-        timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []
-        not_yet = th.zeros(n_envs)
-        n_by_expert = 0
+        not_yet = th.zeros(env.num_envs)
 
-        rollout_buffer.reset()
+        buffer.reset()
         callback.on_rollout_start()
 
         for step in range(n_rollout_steps):
             # + Label the state before the step.
-            observations: Any = self._last_obs
-            labels[step] = labeller.labels(observations, self._last_episode_starts)
+            labels = self._labels(env)
+            buffer.expert_actions[step] = labels
             if true_state is not None:
                 aux_targets.append(unobserved(true_state()))
 
             # + The expert's action flies with probability β, else a sample of the agent's.
+            observations: Any = self._last_obs
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
-            by_expert = rng.random(n_envs) < beta
-            actions = np.where(by_expert[:, None], labels[step], sampled)
-            n_by_expert += int(by_expert.sum())
-            shaped = actions.reshape(n_envs, *action_space.shape)
+            by_expert[step] = rng.random(env.num_envs) < beta
+            actions = np.where(by_expert[step, :, None], labels, sampled)
+            shaped = actions.reshape(-1, *action_space.shape)
             clipped_actions = np.clip(shaped, action_space.low, action_space.high)
 
             new_obs, rewards, dones, infos = env.step(clipped_actions)
 
-            self.num_timesteps += n_envs
+            self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
 
-            ended = np.flatnonzero(dones)
-            self._update_info_buffer([infos[row] for row in ended], dones[ended])
-            for row in ended:
+            self._update_info_buffer(infos, dones)
+            # A time limit is no failure: V of the last observation stands for what would follow.
+            for row in np.flatnonzero(dones):
                 last = infos[row].get("terminal_observation")
-                if infos[row].get("TimeLimit.truncated") and last is not None:
-                    timeouts.append((step, int(row), last))
+                if last is not None and infos[row].get("TimeLimit.truncated"):
+                    rewards[row] += self.gamma * state_values(network, last[None])[0]
 
             starts: Any = self._last_episode_starts
-            rollout_buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
-            self._last_obs = new_obs  # type: ignore[assignment]
+            buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
+            self._last_obs = new_obs
             self._last_episode_starts = dones
 
-        flown = rollout_buffer.observations.reshape(-1, *rollout_buffer.obs_shape)
-        self._evaluate(network, rollout_buffer, flown, timeouts)
+        # + The critic does not change in a rollout. It evaluates many states at once.
+        flown = buffer.observations.reshape(-1, *buffer.obs_shape)
+        parts = np.array_split(flown, math.ceil(len(flown) / _VALUE_CHUNK))
+        values = np.concatenate([state_values(network, part) for part in parts])
+        buffer.values = values.reshape(buffer.values.shape)
         last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
-        rollout_buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
+        buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
         # + Add the labels to the dataset.
         if self.dataset_capacity == 0:
             self.dataset.clear()
-        targets = labels
+        targets = buffer.expert_actions
         if aux_targets:
-            targets = np.concatenate([labels, aux_targets], axis=2)
+            targets = np.concatenate([targets, aux_targets], axis=2)
         self.dataset.add(flown, targets.reshape(len(flown), -1))
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
         self.logger.record("dagger/dataset_size", len(self.dataset))
-        self.logger.record("rollout/expert_fraction", n_by_expert / (n_rollout_steps * n_envs))
+        self.logger.record("rollout/expert_fraction", by_expert.mean())
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
-
-    def _evaluate(
-        self,
-        network: Network,
-        rollout_buffer: RolloutBuffer,
-        flown: npt.NDArray[Any],
-        timeouts: list[tuple[int, int, npt.NDArray[Any]]],
-    ) -> None:
-        """Let the critic evaluate a whole rollout at once; it does not change while that is flown.
-
-        A time limit is no failure: the rewards that would have followed are worth V of the last
-        observation.
-        """
-        values = [
-            state_values(network, flown[first : first + _VALUE_CHUNK])
-            for first in range(0, len(flown), _VALUE_CHUNK)
-        ]
-        rollout_buffer.values = np.concatenate(values).reshape(rollout_buffer.values.shape)
-        if timeouts:
-            steps, rows, last = zip(*timeouts, strict=True)
-            following = self.gamma * state_values(network, np.stack(last))
-            rollout_buffer.rewards[list(steps), list(rows)] += following
 
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
@@ -547,23 +523,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             for name, term in terms.items():
                 history.setdefault(name, []).append(term)
 
-        # Logs
-        explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        for name, values_of_term in history.items():
-            self.logger.record(f"train/{name}", float(np.mean(values_of_term)))
-        self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-        self.logger.record("train/explained_variance", explained_var)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
-
-    def _diverged(self, terms: dict[str, float]) -> TrainingError:
-        """Return the error for a loss or gradient that is not finite."""
-        return TrainingError(
-            f"training diverged at {self.num_timesteps} timesteps (cloning loss"
-            f" {terms['bc_loss']:.3g}, value loss {terms.get('value_loss', 0.0):.3g}); lower"
-            " learning_rate, or look for rewards and observations that are not finite"
-        )
+        self._log_update(history)
+        self._log_rollout(buffer, clip_range_vf)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "dataset", "_aux_layer"]

@@ -1,6 +1,7 @@
 """PPO with behavioural cloning towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,12 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import (
-    FloatSchedule,
-    LinearSchedule,
-    explained_variance,
-    obs_as_tensor,
-)
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
@@ -32,7 +28,7 @@ from sb3_quad.algorithms.common import (
     model_of,
     policy_arguments,
 )
-from sb3_quad.algorithms.networks.gradients import Perceptrons, Terms, act, network_of
+from sb3_quad.algorithms.networks.gradients import Perceptrons, act, network_of
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
     CLONING_LOSSES,
@@ -45,8 +41,7 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.base.errors import ConfigError, ExpertError, unknown
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # By default a rollout is so many mini-batches, but none has less than so many rows.
@@ -219,10 +214,6 @@ class PPOBC(ExpertMixin, PPO):
         if self.expert is not None and self.will_clone():
             self._check_cloning()
 
-    def _excluded_save_params(self) -> list[str]:
-        own = ["rollout_buffer_class", "rollout_buffer_kwargs"]
-        return [*super()._excluded_save_params(), *own]
-
     @property
     def policy_is_idle(self) -> bool:
         """Whether only the critic has learnt so far (``critic_warmup``)."""
@@ -294,98 +285,33 @@ class PPOBC(ExpertMixin, PPO):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly a rollout by PPO's loop. Additions are marked with ``+``.
-
-        It is as long as SB3's, in one piece, so that the two can be compared line by line.
-        """
-        assert self._last_obs is not None, "No previous observation was provided"
-        self.policy.set_training_mode(False)
-
-        # + The update comes at the end of this rollout and takes the weight of that time. Without a
-        # weight, no state is labelled.
+        """Fly a rollout by PPO's loop, and label its states where the update will clone."""
+        # The update comes at the end of this rollout and takes the weight of that time.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         progress = 1.0 - float(end) / float(self._total_timesteps)
         buffer.bc_coef = float(self.bc_coef(progress))  # type: ignore[operator]
-        # + A recurrent expert that has not seen the last rollout begins again.
-        labeller = None
-        network: Any = self.policy
-        if buffer.bc_coef != 0.0:
-            labeller = Controller.for_env(self.expert, env, self._labeller)
-            network = network_of(self.policy)
-        self._labeller = labeller
+        if buffer.bc_coef == 0.0:
+            # A recurrent expert that does not see this rollout begins again.
+            self._labeller = None
+            return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
 
-        n_steps = 0
-        rollout_buffer.reset()
-        if self.use_sde:
-            self.policy.reset_noise(env.num_envs)
+        network = network_of(self.policy)
+        sample: Any = self.policy.forward
+        if isinstance(network, Perceptrons):
+            sample = partial(act, network)
 
-        callback.on_rollout_start()
+        def forward(observations: th.Tensor) -> Any:
+            output = sample(observations)
+            # Label the state before the step.
+            buffer.expert_actions[buffer.pos] = self._labels(env)
+            return output
 
-        while n_steps < n_rollout_steps:
-            if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
-                self.policy.reset_noise(env.num_envs)
-
-            with th.no_grad():
-                obs_tensor: Any = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
-                actions_tensor, values, log_probs = act(network, obs_tensor)  # +
-            actions = actions_tensor.cpu().numpy()
-
-            clipped_actions = actions
-            if isinstance(self.action_space, spaces.Box):
-                if self.policy.squash_output:
-                    clipped_actions = self.policy.unscale_action(clipped_actions)
-                else:
-                    clipped_actions = np.clip(
-                        actions, self.action_space.low, self.action_space.high
-                    )
-
-            # + Label the state before the step.
-            if labeller is not None:
-                observations: Any = self._last_obs
-                labels = labeller.labels(observations, self._last_episode_starts)
-                buffer.expert_actions[buffer.pos] = labels
-
-            new_obs, rewards, dones, infos = env.step(clipped_actions)
-
-            self.num_timesteps += env.num_envs
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-
-            self._update_info_buffer(infos, dones)
-            n_steps += 1
-
-            if isinstance(self.action_space, spaces.Discrete):
-                actions = actions.reshape(-1, 1)
-
-            # Handle timeout by bootstrapping with value function
-            for idx in np.flatnonzero(dones):
-                if infos[idx].get("terminal_observation") is not None and infos[idx].get(
-                    "TimeLimit.truncated", False
-                ):
-                    terminal_obs = self.policy.obs_to_tensor(infos[idx]["terminal_observation"])[0]
-                    with th.no_grad():
-                        rewards[idx] += self.gamma * self.policy.predict_values(terminal_obs)[0]
-
-            rollout_buffer.add(
-                self._last_obs,  # type: ignore[arg-type]
-                actions,
-                rewards,
-                self._last_episode_starts,  # type: ignore[arg-type]
-                values,
-                log_probs,
-            )
-            self._last_obs = new_obs  # type: ignore[assignment]
-            self._last_episode_starts = dones
-
-        with th.no_grad():
-            values = self.policy.predict_values(obs_as_tensor(new_obs, self.device))  # type: ignore[arg-type]
-        rollout_buffer.compute_returns_and_advantage(last_values=values, dones=dones)
-
-        callback.update_locals(locals())
-        callback.on_rollout_end()
-        return True
+        self.policy.forward = forward
+        try:
+            return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
+        finally:
+            del self.policy.forward
 
     def train(self) -> None:
         """Update the policy on the rollout just flown, by PPO's lines. Additions are marked ``+``.
@@ -553,28 +479,10 @@ class PPOBC(ExpertMixin, PPO):
                 break
 
         self._n_rollouts_trained += 1  # +
-        explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-
         # Logs
-        averages = {name: float(np.mean(values)) for name, values in history.items()}
-        averages["approx_kl"] = float(np.mean(approx_kl_divs))
-        averages["loss"] = terms["loss"]
-        for name, average in averages.items():
-            self.logger.record(f"train/{name}", average)
-        self.logger.record("train/explained_variance", explained_var)
-        if hasattr(self.policy, "log_std"):
-            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        history["approx_kl"] = approx_kl_divs
+        history["loss"] = [terms["loss"]]
+        self._log_update(history)
+        self._log_rollout(buffer, clip_range_vf)
         self.logger.record("train/clip_range", clip_range)
-        if clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
         self.logger.record("train/bc_coef", bc_coef)  # +
-
-    def _diverged(self, terms: Terms) -> TrainingError:
-        """Return the error for a loss or gradient that is not finite."""
-        values = ", ".join(f"{name} {term:.3g}" for name, term in terms.items())
-        return TrainingError(
-            f"the loss is not finite after {self.num_timesteps} timesteps ({values}): try a smaller"
-            " learning_rate or bc_coef, and check the expert's actions"
-        )

@@ -1,5 +1,6 @@
 """Soft actor-critic that also clones an expert: a value-based stage two."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.sac.policies import SACPolicy
@@ -20,12 +22,6 @@ from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.buffers import (
-    ExpertDictReplayBuffer,
-    ExpertNStepReplayBuffer,
-    ExpertReplayBuffer,
-    ExpertReplaySamples,
-)
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, model_of, policy_arguments
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
@@ -36,9 +32,8 @@ from sb3_quad.algorithms.networks.losses import (
     cloning_errors,
 )
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.base.types import BoolArray, Float32Array
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.base.errors import ConfigError, ExpertError, unknown
+from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.expert_like import ExpertLike
 
 _STOCK_BUFFERS = (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer)
@@ -165,9 +160,7 @@ class SACBC(ExpertMixin, SAC):
         self.critic_layer_norm = critic_layer_norm
         self._clones = False
         # The expert's scaled actions for the present states, (n_envs, action_dim)
-        self._labels: Float32Array | None = None
-        # Which rows have just begun an episode, (n_envs,); None: all
-        self._starts: BoolArray | None = None
+        self._scaled_labels: Float32Array | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -188,36 +181,22 @@ class SACBC(ExpertMixin, SAC):
                 f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
                 " observations; give 1"
             )
-        if self._clones:
-            self.replay_buffer = self._expert_buffer()
-        super()._setup_model()
-        if self.critic_layer_norm:
-            _normalise_layers(self.critic)
-            _normalise_layers(self.critic_target)
-
-    def _expert_buffer(self) -> ExpertReplayBuffer:
-        """Return a buffer as SB3 would make it, but with room for the labels."""
-        if self.replay_buffer_class not in _STOCK_BUFFERS:
+        if self._clones and self.replay_buffer_class not in _STOCK_BUFFERS:
             raise ConfigError(
                 f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's"
                 " actions"
             )
-        kind = ExpertReplayBuffer
-        keywords = dict(self.replay_buffer_kwargs)
-        if isinstance(self.observation_space, spaces.Dict):
-            kind = ExpertDictReplayBuffer
-        elif self.n_steps > 1:
-            kind = ExpertNStepReplayBuffer
-            keywords |= {"n_steps": self.n_steps, "gamma": self.gamma}
-        return kind(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            n_envs=self.n_envs,
-            optimize_memory_usage=self.optimize_memory_usage,
-            **keywords,
-        )
+        super()._setup_model()
+        if self._clones:
+            # An action is stored with the expert's behind it, as one. So the two cannot be
+            # separated, whichever rows SB3 samples.
+            buffer: Any = self.replay_buffer
+            buffer.action_dim *= 2
+            shape = (*buffer.actions.shape[:2], buffer.action_dim)
+            buffer.actions = np.zeros(shape, dtype=np.float32)
+        if self.critic_layer_norm:
+            _normalise_layers(self.critic)
+            _normalise_layers(self.critic_target)
 
     @property
     def policy_is_idle(self) -> bool:
@@ -245,10 +224,6 @@ class SACBC(ExpertMixin, SAC):
             raise ExpertError(
                 "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
             )
-        if reset_num_timesteps or self._last_obs is None:
-            # The environments begin again.
-            self._starts = None
-            self._labeller = None
         with self._threads():
             return super().learn(
                 total_timesteps=total_timesteps,
@@ -265,13 +240,10 @@ class SACBC(ExpertMixin, SAC):
         # Before the step: an expert that sees the true state labels the present one.
         if self._clones:
             assert self.env is not None
-            observations: Any = self._last_obs
-            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
-            labels = self._labeller.labels(observations, self._starts)
-            scaled: Any = self.policy.scale_action(
-                labels.reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
-            )
-            self._labels = scaled.reshape(n_envs, -1)
+            labels = self._labels(self.env)
+            space: Any = self.action_space
+            scaled: Any = self.policy.scale_action(labels.reshape(n_envs, *space.shape))
+            self._scaled_labels = scaled.reshape(n_envs, -1)
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
@@ -283,11 +255,10 @@ class SACBC(ExpertMixin, SAC):
         dones: npt.NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        if isinstance(replay_buffer, ExpertReplayBuffer):
-            assert self._labels is not None
-            flown = buffer_action.reshape(self._labels.shape)
-            buffer_action = np.hstack([flown, self._labels])
-        self._starts = dones
+        if self._scaled_labels is not None:
+            flown = buffer_action.reshape(self._scaled_labels.shape)
+            buffer_action = np.hstack([flown, self._scaled_labels])
+        self._last_episode_starts = dones
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     @staticmethod
@@ -317,6 +288,7 @@ class SACBC(ExpertMixin, SAC):
         for gradient_step in range(gradient_steps):
             # Sample the replay buffer, + with the expert's actions where there are any
             data: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            actions, *labels = data.actions.split(get_action_dim(self.action_space), dim=1)
             discounts = data.discounts if data.discounts is not None else self.gamma
             if self.use_sde:
                 self.actor.reset_noise()
@@ -351,14 +323,11 @@ class SACBC(ExpertMixin, SAC):
                 targets = data.rewards + (1 - data.dones) * discounts * next_values
 
             # Critic loss
-            current = self.critic(data.observations, data.actions)
+            current = self.critic(data.observations, actions)
             critic_loss: Any = 0.5 * sum(F.mse_loss(q, targets) for q in current)
             log("critic_loss", critic_loss)
             if not np.isfinite(history["critic_loss"][-1]):  # +
-                raise TrainingError(
-                    f"the critic's loss is not finite after {self.num_timesteps} timesteps: lower"
-                    " learning_rate, or look for rewards and observations that are not finite"
-                )
+                raise self._diverged({"critic_loss": math.nan})
             self.critic.optimizer.zero_grad()
             critic_loss.backward()
             self.critic.optimizer.step()
@@ -368,8 +337,8 @@ class SACBC(ExpertMixin, SAC):
                 q_pi = self._least_q(self.critic, data.observations, actions_pi)
                 actor_loss = (ent_coef * log_prob - q_pi).mean()
                 log("actor_loss", actor_loss)
-                if mean is not None and isinstance(data, ExpertReplaySamples):  # +
-                    bc_loss, bc_share = self._bc_loss(data.observations, mean, data.expert_actions)
+                if mean is not None and labels:  # +
+                    bc_loss, bc_share = self._bc_loss(data.observations, mean, labels[0])
                     actor_loss = actor_loss + bc_coef * q_pi.detach().abs().mean() * bc_loss
                     log("bc_loss", bc_loss)
                     log("bc_share", bc_share)
@@ -385,9 +354,7 @@ class SACBC(ExpertMixin, SAC):
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
         self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in history.items():
-            self.logger.record(f"train/{name}", np.mean(values))
+        self._log_update(history)
         if self._clones:  # +
             self.logger.record("train/bc_coef", bc_coef)
 
@@ -414,7 +381,7 @@ class SACBC(ExpertMixin, SAC):
         return (errors * kept).mean(), kept.float().mean()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_labels", "_starts"]
+        return [*super()._excluded_save_params(), "_scaled_labels"]
 
 
 def _normalise_layers(critic: ContinuousCritic) -> None:

@@ -7,8 +7,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.utils import update_learning_rate
 
+from sb3_quad.algorithms.buffers import AggregatedDataset
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
 from sb3_quad.controllers.controller import Controller
@@ -31,13 +33,13 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
     """
     if isinstance(source, BaseAlgorithm):
         name = f"the policy of {type(source).__name__}"
-        theirs = dict(source.policy.state_dict())
+        teacher = source
     else:
         name = str(source)
-        theirs = _saved_policy(source)
+        teacher = load_model(source)
+    theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()
     if isinstance(model, OffPolicyAlgorithm) and theirs.keys() != ours.keys():
-        teacher = source if isinstance(source, BaseAlgorithm) else load_model(source)
         try:
             clone_policy(teacher, model, seed=model.seed or 0)
         except ExpertError as error:  # other spaces
@@ -55,17 +57,6 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
             f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
             " train takes them from it unless --conf-file is given"
         ) from None
-
-
-def _saved_policy(path: str | Path) -> dict[str, th.Tensor]:
-    """Return the parameters of the policy in a zip; nothing is unpickled."""
-    try:
-        _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")
-        return dict(parameters["policy"])
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise ConfigError(f"{path}: not a complete SB3 zip ({one_line(error)})") from None
 
 
 # At least so many states are flown for a clone, and so many steps in each environment.
@@ -105,17 +96,17 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     flown_by_teacher = (np.arange(n) % 2 == 0)[:, None]
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
-    # Of each step: the observations (n, ...), and the teacher's actions as the actor gives them.
-    states: list[Any] = []
-    targets: list[Any] = []
+    # The states flown, and the teacher's actions there as the actor gives them
+    space: Any = env.observation_space
+    action_dim = get_action_dim(env.action_space)
+    dataset = AggregatedDataset(steps * n, space.shape, action_dim, space.dtype)
     errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)
     for step in range(steps):
         labels = expert.labels(observation, begins)
         scaled: Any = policy.scale_action(labels.reshape(n, *actor.action_space.shape))
-        states.append(observation)
-        targets.append(scaled.reshape(n, -1))
+        dataset.add(observation, scaled.reshape(n, -1))
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
@@ -123,14 +114,13 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
         if not is_round_over:
             continue
         # Fit all that has been flown so far.
-        inputs = th.as_tensor(np.concatenate(states), device=model.device)
-        outputs = th.as_tensor(np.concatenate(targets), device=model.device)
         for _ in range(CLONE_STEPS // CLONE_ROUNDS):
-            for group in optimiser.param_groups:
-                group["lr"] = CLONE_RATE * max(1.0 - len(errors) / CLONE_STEPS, 0.01)
-            rows = th.as_tensor(rng.integers(len(inputs), size=CLONE_BATCH), device=model.device)
-            predicted = policy._predict(inputs[rows], deterministic=True)
-            loss = (predicted - outputs[rows]).square().mean()
+            rate = CLONE_RATE * max(1.0 - len(errors) / CLONE_STEPS, 0.01)
+            update_learning_rate(optimiser, rate)
+            batch = dataset.batch(rng.integers(len(dataset), size=CLONE_BATCH))
+            inputs, outputs = batch.tensors(model.device)
+            predicted = policy._predict(inputs, deterministic=True)
+            loss = (predicted - outputs).square().mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

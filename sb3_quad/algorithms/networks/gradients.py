@@ -146,14 +146,11 @@ def state_values(network: Network, observations: npt.NDArray[Any]) -> Float32Arr
     return np.asarray(values.flatten().cpu().numpy())
 
 
-def act(network: Network, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+def act(network: Perceptrons, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """Return what ``policy(observations)`` does, from the same random numbers.
 
     :return: sampled actions (b, a), values (b, 1), log-probabilities (b,).
     """
-    if not isinstance(network, Perceptrons):
-        actions, values, log_prob = network(observations)
-        return actions, values, log_prob
     array = observations.numpy()
     mean = th.from_numpy(mean_actions(network, array))
     values = th.from_numpy(state_values(network, array))[:, None]

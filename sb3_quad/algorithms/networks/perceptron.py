@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -28,22 +28,6 @@ _TYPES = tuple(Loss.__annotations__.values())
 _NONE = np.empty(0)
 
 
-class Place(NamedTuple):
-    """The place of a layer in the array of all parameters: weights, then biases, padded.
-
-    :param start: of its weights.
-    :param middle: of its biases.
-    :param rows: its outputs, padded.
-    :param columns: its inputs, padded.
-    """
-
-    layer: Any
-    start: int
-    middle: int
-    rows: int
-    columns: int
-
-
 class Perceptron:
     """Linear layers with tanh or ReLU between them, whose parameters stay PyTorch's.
 
@@ -56,27 +40,37 @@ class Perceptron:
         # Widths are padded to multiples of 4.
         sizes = [self._layers[0].in_features, *(layer.out_features for layer in self._layers)]
         self._widths = np.array([-(-size // 4) * 4 for size in sizes])
-        self._places: list[Place] = []
-        start = 0
-        for i, layer in enumerate(self._layers):
-            columns, rows = self._widths[i : i + 2].tolist()
-            middle = start + rows * columns
-            self._places.append(Place(layer, start, middle, rows, columns))
-            start = middle + rows
-        self._size = start
+        before = self._widths[:-1]
+        after = self._widths[1:]
+        self._size = int((after * (before + 1)).sum())
+        room = self._widths.sum() + 2 * self._widths.max()
+        self._scratch_size = int(room) * ROWS
         # Parameters with the weights as they are, and with the weights transposed
         self._packed = np.zeros((2, self._size), np.float32)
         # Views of those and of PyTorch's memory, which is copied into them before each call
         self._copies: list[tuple[Float32Array, Float32Array]] = []
-        for layer, start, middle, rows, columns in self._places:
-            weight = layer.weight.detach().numpy()
-            bias = layer.bias.detach().numpy()
-            outputs, inputs = weight.shape
-            plain = self._packed[0, start:middle].reshape(rows, columns)
-            transposed = self._packed[1, start:middle].reshape(columns, rows)
-            self._copies.append((plain[:outputs, :inputs], weight))
-            self._copies.append((transposed[:inputs, :outputs], weight.T))
-            self._copies.append((self._packed[:, middle : middle + outputs], bias))
+        own = [parameter.detach().numpy() for parameter in self.parameters()]
+        for packed, transposed in zip(self._packed, (False, True), strict=True):
+            views = self._views(packed, transposed)
+            self._copies.extend(zip(views, own, strict=True))
+
+    def _views(self, packed: Float32Array, transposed: bool) -> list[Float32Array]:
+        """Return the views of :meth:`parameters` in an array of all layers' parameters.
+
+        :param transposed: whether each layer's weights lie there as (inputs, outputs).
+        """
+        views: list[Float32Array] = []
+        start = 0
+        for i, layer in enumerate(self._layers):
+            columns, rows = self._widths[i : i + 2].tolist()
+            middle = start + rows * columns
+            weights = packed[start:middle].reshape(rows, columns)
+            if transposed:
+                weights = packed[start:middle].reshape(columns, rows).T
+            views.append(weights[: layer.out_features, : layer.in_features])
+            views.append(packed[middle : middle + layer.out_features])
+            start = middle + rows
+        return views
 
     @staticmethod
     def fits(modules: Sequence[nn.Module]) -> bool:
@@ -124,14 +118,11 @@ class Perceptron:
         terms = np.empty((chunks, TERMS))
         typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
         self._compute(gradient, len(index), x, index, targets, typed, stds, sums, terms)
-        total = th.from_numpy(sums.sum(axis=0))
-        for layer, start, middle, rows, columns in self._places:
-            weights = total[start:middle].view(rows, columns)
-            own = weights[: layer.out_features, : layer.in_features]
-            layer.weight.grad = own.contiguous()
-            layer.bias.grad = total[middle : middle + layer.out_features]
+        total = sums.sum(axis=0)
+        for parameter, view in zip(self.parameters(), self._views(total, False), strict=True):
+            parameter.grad = th.from_numpy(view).contiguous()
         if log_std is not None:
-            log_std.grad = total[self._size :]
+            log_std.grad = th.from_numpy(total[self._size :])
         result: FloatArray = terms.sum(axis=0)
         return result
 
@@ -154,11 +145,11 @@ class Perceptron:
         firsts = iter(range(0, chunks, size))
 
         def work() -> None:
-            scratch = _aligned(int(self._widths.sum() + 2 * self._widths.max()) * ROWS)
+            scratch = _aligned(self._scratch_size)
             for first in firsts:
                 function(first, min(first + size, chunks), chunks, scratch, layers, *arguments)
 
-        helpers = [_pool.submit(work) for _ in range(threads - 1)] if _pool is not None else []
+        helpers = [_pool.submit(work) for _ in range(threads - 1)]
         work()
         for helper in helpers:
             # Do not wait for one that has not begun: its core is busy with something else.
@@ -177,9 +168,10 @@ def _aligned(size: int) -> Float32Array:
     return room[to_next_line : to_next_line + size]
 
 
-# Threads that share the work of every perceptron, and the pool of all but the first
+# Threads that share the work of every perceptron, and the pool of all but the first. None of its
+# threads begins before there is work for it.
 _threads = 1
-_pool: ThreadPoolExecutor | None = None
+_pool = ThreadPoolExecutor(1)
 
 
 def use_one_torch_thread() -> None:
@@ -211,7 +203,7 @@ def one_torch_thread(compiled: bool) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(torch_threads)
-        if _pool is not pool and _pool is not None:
+        if _pool is not pool:
             _pool.shutdown()
         _threads = threads
         _pool = pool
