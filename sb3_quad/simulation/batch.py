@@ -172,14 +172,15 @@ class QuadcopterBatch:
         if self.distribution is not None or self.randomize.sets_vehicle:
             self.vehicles = np.repeat(self.base_vehicles, self.n // columns, axis=1)
 
-        # All vehicles can fly if the weakest of a distribution can.
+        # All vehicles can fly if the hardest to fly can.
         self.distribution_numbers = NO_DISTRIBUTION
-        weakest = vehicles
+        hardest = vehicles
         if self.distribution is not None:
             self.distribution_numbers = self.distribution.numbers()
-            weakest = [self.distribution.weakest(vehicle) for vehicle in vehicles]
-        for vehicle in weakest:
-            self.randomize.check(vehicle)
+            hardest = [self.distribution.hardest(vehicle) for vehicle in hardest]
+        if self.randomize.sets_vehicle:
+            for vehicle in hardest:
+                self.randomize.hardest(vehicle)
         return vehicles
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
