@@ -141,12 +141,8 @@ class QuadcopterBatch:
         self.streams = np.zeros((4, n), dtype=np.uint32)
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
-        # One column serves all rows until some differ.
-        self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[:, None]
-        self._bind()
+        self._set_scaling(settings)
         self.set_noise(settings.noise)
-        self._set_scaling(0, "observation_mean", settings.observation_mean)
-        self._set_scaling(OBSERVATION_SIZE, "observation_std", settings.observation_std)
         with compile_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
@@ -160,17 +156,16 @@ class QuadcopterBatch:
         self.distribution = settings.vehicles
         self.randomize = settings.randomize or Randomization()
         sources = settings.vehicle
-        columns = self.n
         if not isinstance(sources, (list, tuple)):
             sources = [sources]
-            columns = 1
         vehicles = load_vehicles(sources, settings.rotor_layout)
         self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, self.n)
-        parameters = [vehicle.parameters() for vehicle in self.vehicle_list[:columns]]
-        self.base_vehicles = np.stack(parameters, axis=1)
+        self.base_vehicles = np.stack([vehicle.parameters() for vehicle in vehicles], axis=1)
+        if len(vehicles) > 1:
+            self.base_vehicles = self.base_vehicles[:, np.arange(self.n) % len(vehicles)]
         self.vehicles = self.base_vehicles.copy()
         if self.distribution is not None or self.randomize.sets_vehicle:
-            self.vehicles = np.repeat(self.base_vehicles, self.n // columns, axis=1)
+            self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.vehicles), self.n)).copy()
 
         # All vehicles can fly if the hardest to fly can.
         self.distribution_numbers = NO_DISTRIBUTION
@@ -397,35 +392,30 @@ class QuadcopterBatch:
         """
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
         relative, additive = levels(noise)
-        relative_rows = per_row("noise", relative, self.rows(indices).size)
-        both = np.vstack([relative_rows, np.full_like(relative_rows, additive)])
-        by_row = isinstance(noise, list) or indices is not None
-        self._write_scaling(2 * OBSERVATION_SIZE, both, by_row, indices)
+        chosen = self.rows(indices)
+        self._scaling_of_rows[-2, chosen] = per_row("noise", relative, chosen.size)
+        self._scaling_of_rows[-1, chosen] = additive
+        self._bind()
 
-    def _set_scaling(self, first: int, name: str, value: Any) -> None:
-        """Set μ or σ of Eq. 3.16, (18,) or (n, 18); None leaves it as it is."""
-        if value is None:
-            return
-        values = per_row(name, value, self.n, OBSERVATION_SIZE)
-        if first > 0 and (values <= 0).any():
-            raise ConfigError(f"{name}: every value must be positive")
-        self._write_scaling(first, values, np.ndim(value) == 2, None)
-
-    def _write_scaling(self, first: int, values: FloatArray, by_row: bool, rows: Rows) -> None:
-        """Write some of the scaling, from row ``first`` of the array on.
-
-        One column serves all rows until some are set ``by_row``.
-        """
-        if by_row and self.scaling.shape[1] < self.n:
-            self.scaling = np.repeat(self.scaling, self.n, axis=1)
-            self._bind()
-        part = self.scaling[first : first + len(values)]
-        if part.shape[1] == self.n:
-            part[:, self.rows(rows)] = values
-        else:
-            part[:] = values[:, :1]
+    def _set_scaling(self, settings: FlightSettings) -> None:
+        """Set μ and σ of Eq. 3.16, (18,) or (n, 18) each; the levels of the noise follow them."""
+        mean = settings.observation_mean
+        std = settings.observation_std
+        if mean is None:
+            mean = DEFAULT_MEAN
+        if std is None:
+            std = DEFAULT_STD
+        means = per_row("observation_mean", mean, self.n, OBSERVATION_SIZE)
+        stds = per_row("observation_std", std, self.n, OBSERVATION_SIZE)
+        if (stds <= 0).any():
+            raise ConfigError("observation_std: every value must be positive")
+        self._scaling_of_rows = np.vstack([means, stds, np.zeros((2, self.n))])
 
     def _bind(self) -> None:
+        self.scaling = self._scaling_of_rows
+        # One column serves all rows where they do not differ.
+        if (self.scaling == self.scaling[:, :1]).all():
+            self.scaling = self.scaling[:, :1].copy()
         self.mean = self.scaling[:OBSERVATION_SIZE]
         self.std = self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
         self.noise_level, self.additive_level = self.scaling[-2:]

@@ -14,6 +14,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.state import first_rows
 
 Length = Annotated[float, Field(ge=0, le=1e6)]  # m
@@ -190,20 +191,13 @@ def resolve_tasks(
     else:
         parameters = _resolve(task, TASK_NAMES, overrides).parameters()
         return parameters[None], np.ones(1)
-    if not weights:
+    shares = per_row("task: the weights", list(weights.values()), len(weights))[0]
+    if (shares < 0).any() or shares.sum() <= 0:
         raise ConfigError(
-            "task: the mixture names no task; give at least one, such as {'target_tracking': 1.0}"
+            f"task: the weights {shares.tolist()} must not be negative, and one must be positive,"
+            " as in {'target_tracking': 1.0}"
         )
     parameters = np.stack([_resolve(name, TASKS, overrides).parameters() for name in weights])
-    given = list(weights.values())
-    try:
-        shares = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"task: the weights {given} must be numbers") from None
-    if not np.isfinite(shares).all() or (shares < 0).any() or shares.sum() <= 0:
-        raise ConfigError(
-            f"task: the weights {shares.tolist()} must be finite, not negative and not all zero"
-        )
     cumulative = np.cumsum(shares / shares.sum())
     cumulative[-1] = 1.0
     return parameters, cumulative
