@@ -54,10 +54,10 @@ class BulletBody:
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
         self.has_window = window is not None and has_display()
-        if window is None or not self.has_window:
-            client = int(p.connect(p.DIRECT))
-        else:
+        if window is not None and self.has_window:
             client = open_window(*window)
+        else:
+            client = int(p.connect(p.DIRECT))
         if window is not None and not self.has_window:
             sys.stderr.write(
                 "sb3_quad: DISPLAY is not set, so no window opens; "

@@ -1,22 +1,20 @@
 """``QuadcopterVectorEnv``: n quadcopters as one Gymnasium vector environment."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, StrDict, StrMapping
+from sb3_quad.base.types import AnyArray, BoolArray, Float32Array, StrDict
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
 
-class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.NDArray[Any]]):
+class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArray]):
     """The batched environment for users outside Stable-Baselines3.
 
     ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8,
@@ -44,7 +42,6 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         self,
         num_envs: int = 1,
         task: TaskSpec = "target_tracking",
-        task_kwargs: StrMapping | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         seed: int | None = None,
@@ -62,7 +59,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
             raise ConfigError(unknown("autoreset_mode", name, modes))
         self._mode = modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
-        self._make_batch(num_envs, seed, n_threads, task, task_kwargs, autoreset=False, **keywords)
+        self._make_batch(num_envs, seed, n_threads, task, autoreset=False, **keywords)
         self.num_envs = self.batch.n
         # The batch does not reset rows by itself, since both modes need their last observations.
         # Rows that the next step resets, in mode NextStep.
@@ -104,7 +101,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         return self._begin(~self._ended), self._infos()
 
     def step(
-        self, actions: npt.NDArray[Any]
+        self, actions: AnyArray
     ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, StrDict]:
         """Fly one control step.
 

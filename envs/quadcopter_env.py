@@ -1,15 +1,14 @@
 """``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import Float32Array, FloatArray, Image, StrDict, StrMapping
+from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, Image, StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
@@ -209,7 +208,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     def __init__(
         self,
         task: TaskSpec = "target_tracking",
-        task_kwargs: StrMapping | None = None,
         render_mode: str | None = None,
         render_width: int = 640,
         render_height: int = 480,
@@ -226,7 +224,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
                 f"max_episode_steps {steps}: give it to gymnasium.make, whose TimeLimit truncates"
             )
         # One row of the batched environment. PyBullet moves its body.
-        self._make_batch(1, seed, 1, task, task_kwargs, autoreset=False, **keywords)
+        self._make_batch(1, seed, 1, task, autoreset=False, **keywords)
         self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
@@ -276,7 +274,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         batch.clear_outcome()
         return self.observe(), self._info()
 
-    def step(self, action: npt.NDArray[Any]) -> tuple[Float32Array, float, bool, bool, StrDict]:
+    def step(self, action: AnyArray) -> tuple[Float32Array, float, bool, bool, StrDict]:
         """Fly one control step.
 
         :param action: (4,), clipped to [-1, 1].

@@ -376,5 +376,5 @@ def test_the_manual_lists_every_argument() -> None:
 
 
 def test_the_typed_keywords_are_the_flight_settings() -> None:
-    typed = {"task", "task_kwargs", *FlightKeywords.__annotations__}
+    typed = {"task", *FlightKeywords.__annotations__}
     assert typed == FlightSettings.model_fields.keys()

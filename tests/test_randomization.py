@@ -193,7 +193,7 @@ def test_gusts_have_their_spread_and_time_constant(kind, std, unit, size):
 
 def test_a_wrench_that_is_set_lasts_until_the_next_episode_brings_its_own():
     batch = batch_of(2, randomize={"force": [1.0, 1.0]})
-    batch.set_wrench([3.0, 0.0, 0.0])
+    batch.wrench[W.force_world] = 3.0
     batch.step(np.zeros((2, 4), np.float32))
     assert batch.wrench[W.force_world].tolist() == [3.0, 3.0]
     batch.reset(0)

@@ -4,12 +4,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import available_cpus
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, IntArray
+from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import compile_notice
@@ -32,20 +31,17 @@ from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import (
     FORCE_WORLD,
     STATE_SIZE,
-    TARGET,
     WRENCH_SIZE,
     P,
     QuadcopterState,
     drag_forces,
-    make_wrench,
 )
-from sb3_quad.simulation.tasks import TaskSpec, resolve_tasks
+from sb3_quad.simulation.tasks import resolve_tasks
 from sb3_quad.simulation.threads import share_out
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
-Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
-AnyArray: TypeAlias = npt.NDArray[Any]
+Rows: TypeAlias = "int | slice | Iterable[int] | AnyArray | None"
 StepResult: TypeAlias = tuple[Float32Array, Float32Array, BoolArray]
 MAX_ROWS = 2**20
 MAX_THREADS = 2**16
@@ -127,9 +123,8 @@ class QuadcopterBatch:
         self.integral_numbers = np.array((integral or PositionIntegral()).numbers(control_step))
         self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
 
-        self.task: TaskSpec = settings.task
-        self.task_kwargs = dict(settings.task_kwargs or {})
-        self.task_parameters, self.task_weights = resolve_tasks(self.task, self.task_kwargs)
+        tasks = resolve_tasks(settings.task, settings.task_kwargs)
+        self.task_parameters, self.task_weights = tasks
         self.task_index = np.zeros(n, dtype=np.int64)
         steps = np.atleast_1d(settings.max_episode_steps).tolist()
         self.max_steps = np.array(repeated("max_episode_steps", steps, n), dtype=np.int64)
@@ -162,20 +157,20 @@ class QuadcopterBatch:
         self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, self.n)
         self.base_vehicles = np.stack([vehicle.parameters() for vehicle in vehicles], axis=1)
         if len(vehicles) > 1:
-            self.base_vehicles = self.base_vehicles[:, np.arange(self.n) % len(vehicles)]
+            columns = np.arange(self.n) % len(vehicles)
+            self.base_vehicles = np.take(self.base_vehicles, columns, axis=1)
         self.vehicles = self.base_vehicles.copy()
         if self.distribution is not None or self.randomize.sets_vehicle:
             self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.vehicles), self.n)).copy()
 
-        # All vehicles can fly if the hardest to fly can.
         self.distribution_numbers = NO_DISTRIBUTION
-        hardest = vehicles
         if self.distribution is not None:
             self.distribution_numbers = self.distribution.numbers()
-            hardest = [self.distribution.hardest(vehicle) for vehicle in hardest]
-        if self.randomize.sets_vehicle:
-            for vehicle in hardest:
-                self.randomize.hardest(vehicle)
+        # All vehicles can fly if the hardest to fly can.
+        for vehicle in vehicles:
+            if self.distribution is not None:
+                vehicle = self.distribution.hardest(vehicle)
+            self.randomize.hardest(vehicle)
         return vehicles
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
@@ -352,40 +347,6 @@ class QuadcopterBatch:
         for name, array in snapshot.items():
             getattr(self, name)[...] = array
 
-    def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
-        """Move targets r_T to a position, (3,) or (rows, 3), world frame, m, until the row's next
-        reset.
-        """
-        chosen = self.rows(indices)
-        self.state[TARGET, chosen] = per_row("target", position, chosen.size, 3)
-
-    def set_wrench(
-        self,
-        force: npt.ArrayLike = (0.0, 0.0, 0.0),
-        torque: npt.ArrayLike = (0.0, 0.0, 0.0),
-        force_frame: str = "world",
-        torque_frame: str = "body",
-        indices: Rows = None,
-    ) -> None:
-        """Apply an external force (N) and torque (N m), (3,) or (rows, 3) each, at the centre of
-        mass, until they are set again.
-
-        Without arguments it removes both.
-
-        :param force_frame: ``"world"`` or ``"body"``; ``torque_frame`` likewise.
-        """
-        chosen = self.rows(indices)
-        forces = per_row("force", force, chosen.size, 3).T
-        torques = per_row("torque", torque, chosen.size, 3).T
-        self.wrench[:, chosen] = make_wrench(forces, torques, force_frame, torque_frame)
-
-    def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
-        """Set the velocity of the air, (3,) or (rows, 3), world frame, m/s, until it is set again.
-        It acts on vehicles with drag.
-        """
-        chosen = self.rows(indices)
-        self.wind[:, chosen] = per_row("wind", velocity, chosen.size, 3)
-
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a
         ``Noise``; 0 switches it off.
@@ -399,8 +360,8 @@ class QuadcopterBatch:
 
     def _set_scaling(self, settings: FlightSettings) -> None:
         """Set μ and σ of Eq. 3.16, (18,) or (n, 18) each; the levels of the noise follow them."""
-        mean = settings.observation_mean
-        std = settings.observation_std
+        mean: Any = settings.observation_mean
+        std: Any = settings.observation_std
         if mean is None:
             mean = DEFAULT_MEAN
         if std is None:

@@ -39,28 +39,6 @@ VECTOR = {"length": RANGE, "direction": 3, "axes": 3, "by_weight": 1, "in_body":
 V = first_rows(VECTOR)
 GUST = {"std": RANGE, "keeps": 1, "by_weight": 1}
 N = first_rows(GUST)
-VEHICLE_RANGES = (
-    "mass",
-    "inertia",
-    "motor_gain",
-    "motor_gain_up",
-    "motor_gain_down",
-    "thrust",
-    "arm",
-    "center_of_mass",
-    "delay",
-    "drag",
-)
-"""The ranges of a :class:`Randomization` that change the vehicle."""
-RANDOMIZATION = {
-    "share": 1,
-    "wrench_share": 1,
-    **dict.fromkeys(VEHICLE_RANGES, RANGE),
-    **dict.fromkeys(("force", "torque", "wind"), sum(VECTOR.values())),
-    **dict.fromkeys(("gusts", "wind_gusts"), sum(GUST.values())),
-}
-"""Numbers of :meth:`Randomization.numbers`."""
-R = first_rows(RANDOMIZATION)
 Bounded = TypeVar("Bounded", bound=float)
 
 
@@ -257,7 +235,7 @@ class Randomization(Frozen):
     @property
     def sets_vehicle(self) -> bool:
         """Whether an episode begins with a vehicle of its own."""
-        return any(getattr(self, name) is not None for name in VEHICLE_RANGES)
+        return any(isinstance(given, Range) for _, given in self)
 
     @property
     def sets_wrench(self) -> bool:
@@ -298,6 +276,16 @@ class Randomization(Frozen):
         # floor(uniform(low, high + 1)) makes every whole number equally likely.
         table[R.delay + 1] += 1.0
         return table
+
+
+RANDOMIZATION = dict.fromkeys(Randomization.model_fields, RANGE) | {
+    "share": 1,
+    "wrench_share": 1,
+    **dict.fromkeys(("force", "torque", "wind"), sum(VECTOR.values())),
+    **dict.fromkeys(("gusts", "wind_gusts"), sum(GUST.values())),
+}
+"""Numbers of :meth:`Randomization.numbers`."""
+R = first_rows(RANDOMIZATION)
 
 
 def table_row(sizes: Mapping[str, int], parts: Mapping[str, Sequence[float]]) -> FloatArray:

@@ -32,25 +32,6 @@ from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.vehicles.distributions")
-_RANGES = (
-    "mass",
-    "thrust_to_weight",
-    "torque_to_inertia",
-    "motor_time_constant",
-    "moment_thrust_ratio",
-    "least_thrust",
-    "motor_time_constant_down",
-    "drag",
-)
-DISTRIBUTION_NUMBERS = {
-    **dict.fromkeys(_RANGES, RANGE),
-    "inertia_ratios": 3,
-    "size_deviation": 1,
-}
-"""Numbers of :meth:`VehicleDistribution.numbers`; ratios that are not given are 0."""
-D = first_rows(DISTRIBUTION_NUMBERS)
-# Its ranges are FIXED.
-NO_DISTRIBUTION = table_row(DISTRIBUTION_NUMBERS, {})
 Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
@@ -120,9 +101,8 @@ class VehicleDistribution(Frozen):
     def __str__(self) -> str:
         """Such as ``sampled quadcopters (SI units; mass 0.02 to 5, thrust to weight 1.5 to 5)``."""
         texts = []
-        for name in _RANGES:
-            given = getattr(self, name)
-            if given is not None:
+        for name, given in self:
+            if isinstance(given, Range):
                 texts.append(f"{name.replace('_', ' ')} {given.low:g} to {given.high:g}")
         return f"sampled quadcopters (SI units; {', '.join(texts)})"
 
@@ -137,6 +117,16 @@ class VehicleDistribution(Frozen):
         if self.inertia_ratios is not None:
             parts["inertia_ratios"] = self.inertia_ratios
         return table_row(DISTRIBUTION_NUMBERS, parts)
+
+
+DISTRIBUTION_NUMBERS = dict.fromkeys(VehicleDistribution.model_fields, RANGE) | {
+    "inertia_ratios": 3,
+    "size_deviation": 1,
+}
+"""Numbers of :meth:`VehicleDistribution.numbers`; ratios that are not given are 0."""
+D = first_rows(DISTRIBUTION_NUMBERS)
+# Its ranges are FIXED.
+NO_DISTRIBUTION = table_row(DISTRIBUTION_NUMBERS, {})
 
 
 @compiled
