@@ -35,7 +35,7 @@ AxisFactor = Annotated[float, Field(ge=0, le=10)]
 MAX_DELAY = 100  # control steps
 Vector = tuple[float, float, float]
 Unit = Literal["SI", "weight"]
-VECTOR = {"length": RANGE, "direction": 3, "axes": 3, "by_weight": 1, "in_body": 1}
+VECTOR = {"length": RANGE, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
 V = first_rows(VECTOR)
 GUST = {"std": RANGE, "keeps": 1, "by_weight": 1}
 N = first_rows(GUST)
@@ -99,15 +99,19 @@ UNCHANGED = Factor(low=1.0, high=1.0)
 
 
 class RandomVector(Frozen):
-    """A wind at the centre of mass, constant during an episode.
+    """A force or torque at the centre of mass, or a wind, constant during an episode.
 
     You may write ``[low, high]`` for its magnitude alone.
     """
 
     magnitude: Magnitude
-    """its length, m/s; of a force N, of a torque N m, or in the unit that unit names"""
+    """its length, N, N m or m/s; or in the unit that unit names"""
+    unit: Unit = "SI"
+    """weight: a force in multiples of the weight m g, a torque of m g times the arm length"""
+    frame: Literal["world", "body"] | None = None
+    """frame in which it is constant; default: world for a force, body for a torque"""
     direction: Vector | None = None
-    """its direction; default: uniformly random, that of a wind horizontal"""
+    """its direction; default: uniformly random"""
     axes: tuple[AxisFactor, AxisFactor, AxisFactor] = (1.0, 1.0, 1.0)
     """factor of each component, such as [1, 1, 0] for a horizontal one"""
 
@@ -124,36 +128,17 @@ class RandomVector(Frozen):
         return value
 
     def numbers(self) -> list[float]:
-        """Return numbers in the order of ``VECTOR``; those that are left are 0."""
+        """Return numbers in the order of ``VECTOR``."""
         direction = np.zeros(3)
         if self.direction is not None:
             direction = np.array(self.direction) / np.linalg.norm(self.direction)
-        return [*self.magnitude.numbers(), *direction, *self.axes]
+        units = [self.unit == "weight", self.frame == "body"]
+        return [*self.magnitude.numbers(), *units, *direction, *self.axes]
 
 
-class RandomForce(RandomVector):
-    """A force at the centre of mass, constant during an episode; else like a wind."""
-
-    unit: Unit = "SI"
-    """weight: a force in multiples of the weight m g, a torque of m g times the arm length"""
-    frame: Literal["world", "body"] = "world"
-    """frame in which it is constant"""
-
-    def numbers(self) -> list[float]:
-        """Return all numbers of ``VECTOR``."""
-        return [*super().numbers(), self.unit == "weight", self.frame == "body"]
-
-
-class RandomTorque(RandomForce):
-    """A torque, constant during an episode; else like a force."""
-
-    frame: Literal["world", "body"] = "body"
-    """frame in which it is constant"""
-
-
-class WindGusts(Frozen):
-    """A velocity of the air that changes at random: each component in the world frame is an
-    Ornstein-Uhlenbeck process.
+class Gusts(Frozen):
+    """A force, or velocity of the air, that changes at random: each component in the world frame is
+    an Ornstein-Uhlenbeck process.
 
     Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930). The update
     is that of D. T. Gillespie, "Exact numerical simulation of the Ornstein-Uhlenbeck process"
@@ -165,27 +150,19 @@ class WindGusts(Frozen):
     """
 
     std: Magnitude
-    """standard deviation of each component, m/s; of a force N; sampled per episode"""
+    """standard deviation of each component, N, or m/s of wind; sampled per episode"""
+    unit: Unit = "SI"
+    """weight: in multiples of the vehicle's weight m g"""
     time_constant: PositiveFloat = Field(default=1.0, le=1e6)
     """time after which a gust has faded to 1/e, s"""
 
     def numbers(self, control_step: float) -> list[float]:
-        """Return numbers in the order of ``GUST``; those that are left are 0.
+        """Return numbers in the order of ``GUST``.
 
         :param control_step: s, after which a share of a gust is kept.
         """
-        return [*self.std.numbers(), math.exp(-control_step / self.time_constant)]
-
-
-class Gusts(WindGusts):
-    """A force that changes at random, as the wind does."""
-
-    unit: Unit = "SI"
-    """weight: in multiples of the vehicle's weight m g"""
-
-    def numbers(self, control_step: float) -> list[float]:
-        """Return all numbers of ``GUST``."""
-        return [*super().numbers(control_step), self.unit == "weight"]
+        keeps = math.exp(-control_step / self.time_constant)
+        return [*self.std.numbers(), keeps, self.unit == "weight"]
 
 
 class Randomization(Frozen):
@@ -221,16 +198,26 @@ class Randomization(Frozen):
     """added drag along each body axis, 1/s times the nominal mass, such as [0, 0.5]"""
     wrench_share: Share = 1.0
     """fraction of the episodes with force, torque, gusts and wind"""
-    force: RandomForce | None = None
+    force: RandomVector | None = None
     """a constant force, such as {magnitude: [0, 5]}, N"""
-    torque: RandomTorque | None = None
+    torque: RandomVector | None = None
     """a constant torque, such as {magnitude: [0, 0.1]}, N m"""
     gusts: Gusts | None = None
     """a random force, such as {std: [0, 1], time_constant: 1}"""
     wind: RandomVector | None = None
     """m/s, horizontal unless it has a direction; the air's velocity, acts on vehicles with drag"""
-    wind_gusts: WindGusts | None = None
+    wind_gusts: Gusts | None = None
     """a random velocity added to the wind, such as {std: [0, 1]}, m/s"""
+
+    @model_validator(mode="after")
+    def _possible(self) -> "Randomization":
+        for wind in (self.wind, self.wind_gusts):
+            if wind is not None and (wind.unit != "SI" or getattr(wind, "frame", None)):
+                raise ValueError(
+                    "wind and wind_gusts: remove unit and frame;"
+                    " they are velocities, m/s, in the world frame"
+                )
+        return self
 
     @property
     def sets_vehicle(self) -> bool:
@@ -268,11 +255,13 @@ class Randomization(Frozen):
         """
         parts = {"share": [self.share * self.sets_vehicle], "wrench_share": [self.wrench_share]}
         for name, given in self:
-            if isinstance(given, WindGusts):
+            if isinstance(given, Gusts):
                 parts[name] = given.numbers(control_step)
             elif isinstance(given, (Range, RandomVector)):
                 parts[name] = given.numbers()
         table = table_row(RANDOMIZATION, parts)
+        if self.torque is not None and self.torque.frame is None:
+            table[R.torque + V.in_body] = 1.0
         # floor(uniform(low, high + 1)) makes every whole number equally likely.
         table[R.delay + 1] += 1.0
         return table

@@ -163,7 +163,7 @@ def _sample_vector(table, k, share, unit, u, out):
     if table[k + V.by_weight] != 0.0:
         size *= unit
     # A direction of zeros stands for a random one.
-    direction = table[k + V.direction : k + V.direction + 3]
+    direction = table[k + V.direction : k + V.axes]
     if not direction.any():
         direction = np.array(_spherical(1.0, 2.0 * u[1] - 1.0, TURN * u[2]))
     axes = table[k + V.axes : k + V.axes + 3]
