@@ -81,10 +81,9 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         :param seed: one number, from which each row gets its own stream, or a number or None for
             each row. None: continue with the current streams.
         """
-        for key in options or {}:
+        if options:
             raise ConfigError(
-                f"reset option {key!r}: the batched environment takes none; "
-                "call set_target after it"
+                "reset options: the batched environment takes none; call set_target after reset()"
             )
         if isinstance(seed, (int, np.integer)):
             seed = row_seeds(int(seed), self.num_envs)

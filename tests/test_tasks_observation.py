@@ -378,7 +378,7 @@ def test_a_named_mixture_gives_way_to_what_the_user_gives():
         ("hover", {}, "unknown task 'hover'"),
         ("thesis_recover", {}, "did you mean 'thesis_recovery'"),
         ({"thesis_recovery": 1.0}, {}, "unknown task 'thesis_recovery'"),
-        ({}, {}, "one must be positive"),
+        ({}, {}, "names no task"),
         ({"target_tracking": -1.0}, {}, "weights"),
         ("target_tracking", {"target_distanc": 1}, "did you mean 'target_distance'"),
         ("target_tracking", {"nearest_target": 11}, "nearest_target 11"),

@@ -191,11 +191,14 @@ def resolve_tasks(
     else:
         parameters = _resolve(task, TASK_NAMES, overrides).parameters()
         return parameters[None], np.ones(1)
-    shares = per_row("task: the weights", list(weights.values()), len(weights))[0]
-    if (shares < 0).any() or shares.sum() <= 0:
+    if not weights:
         raise ConfigError(
-            f"task: the weights {shares.tolist()} must not be negative, and one must be positive,"
-            " as in {'target_tracking': 1.0}"
+            "task: the mixture names no task; give at least one, such as {'target_tracking': 1.0}"
+        )
+    shares = per_row("task: the weights", list(weights.values()), len(weights))[0]
+    if (shares < 0).any() or not shares.any():
+        raise ConfigError(
+            f"task: the weights {shares.tolist()} must be not negative and not all zero"
         )
     parameters = np.stack([_resolve(name, TASKS, overrides).parameters() for name in weights])
     cumulative = np.cumsum(shares / shares.sum())
