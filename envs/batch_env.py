@@ -1,26 +1,22 @@
 """The part that all environments share: spaces, keywords, and reading and setting in flight."""
 
 import inspect
-from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import FloatArray, StrDict, StrMapping
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.batch import QuadcopterBatch, Rows
-from sb3_quad.simulation.frames import PositionIntegral
+from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.randomization import Randomization
-from sb3_quad.simulation.settings import FlightSettings, Noise
-from sb3_quad.simulation.state import TARGET, QuadcopterState
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import TARGET, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec
-from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
-from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource
+from sb3_quad.vehicles.vehicle import Vehicle
 
 # Keys of an info, and the fields of ``batch.outcome`` that they show.
 INFOS = {
@@ -30,26 +26,6 @@ INFOS = {
     "collision": "collision",
     "out_of_range": "out_of_range",
 }
-
-
-class FlightKeywords(TypedDict, total=False):
-    """Keywords of the environments for editors and type checkers.
-
-    :class:`~sb3_quad.simulation.settings.FlightSettings` declares them, with their defaults and
-    meanings. Each constructor adds ``task`` and ``task_kwargs``, and a test holds both lists equal.
-    """
-
-    vehicle: VehicleSource | Sequence[VehicleSource]
-    rotor_layout: VehicleSource | None
-    noise: npt.ArrayLike | StrMapping | Noise
-    observation_mean: npt.ArrayLike | None
-    observation_std: npt.ArrayLike | None
-    last_action: bool
-    history: Sequence[int] | None
-    position_integral: StrMapping | PositionIntegral | None
-    vehicles: StrMapping | VehicleDistribution | None
-    randomize: StrMapping | Randomization | None
-    max_episode_steps: int | Sequence[int]
 
 
 def quadcopter_spaces(size: int = OBSERVATION_SIZE) -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
@@ -77,9 +53,8 @@ class BatchEnv:
         seed: int | None,
         n_threads: int | None,
         task: TaskSpec,
-        task_kwargs: StrMapping | None,
         autoreset: bool,
-        **keywords: Unpack[FlightKeywords],
+        **keywords: Any,
     ) -> None:
         """Make the batch of n rows that fly as the keywords say.
 
@@ -91,8 +66,7 @@ class BatchEnv:
         valid = inspect.signature(type(self)).parameters.keys() | FlightSettings.model_fields.keys()
         for key in keywords.keys() - valid:
             raise ConfigError(f"{name}: {unknown('keyword', key, valid - {'keywords'})}")
-        settings = {"task": task, "task_kwargs": task_kwargs, **keywords}
-        self.flight_settings = validate(FlightSettings, settings, name)
+        self.flight_settings = validate(FlightSettings, {"task": task, **keywords}, name)
         self.batch = QuadcopterBatch(n, self.flight_settings, seed, n_threads, autoreset)
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
@@ -114,7 +88,8 @@ class BatchEnv:
         :param position: r_T, (3,) for all these rows or (rows, 3), world frame, m.
         :raises ConfigError: a wrong shape, or a number that is not finite.
         """
-        self.batch.set_target(position, indices)
+        rows = self.batch.rows(indices)
+        self.batch.state[TARGET, rows] = per_row("target", position, rows.size, 3)
 
     def set_wrench(
         self,
@@ -135,7 +110,10 @@ class BatchEnv:
         :param torque_frame: axes of ``torque``, likewise.
         :raises ConfigError: a wrong shape, a number that is not finite, or an unknown frame.
         """
-        self.batch.set_wrench(force, torque, force_frame, torque_frame, indices)
+        rows = self.batch.rows(indices)
+        forces = per_row("force", force, rows.size, 3).T
+        torques = per_row("torque", torque, rows.size, 3).T
+        self.batch.wrench[:, rows] = make_wrench(forces, torques, force_frame, torque_frame)
 
     def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
         """Set the velocity of the air until you set another. It acts on vehicles with ``drag``.
@@ -143,7 +121,8 @@ class BatchEnv:
         :param velocity: (3,) for all these rows or (rows, 3), world frame, m/s.
         :raises ConfigError: a wrong shape, or a number that is not finite.
         """
-        self.batch.set_wind(velocity, indices)
+        rows = self.batch.rows(indices)
+        self.batch.wind[:, rows] = per_row("wind", velocity, rows.size, 3)
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the observation noise until you set another.
@@ -181,12 +160,13 @@ class BatchEnv:
     @property
     def task(self) -> TaskSpec:
         """The task, as it was given; ``task_kwargs`` replace fields of it."""
-        return self.batch.task
+        task: TaskSpec = self.flight_settings.task
+        return task
 
     @property
     def task_kwargs(self) -> StrDict:
         """Fields of the task that are overridden."""
-        return dict(self.batch.task_kwargs)
+        return dict(self.flight_settings.task_kwargs or {})
 
     @property
     def noise(self) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_quad.base.bullet import p
 from sb3_quad.base.types import FloatArray, Image
-from sb3_quad.envs.rendering.camera import ChaseCamera
+from sb3_quad.envs.rendering.camera import CHASE_MARGIN, CHASE_SLOPE, Lens, chasing, framing_camera
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose, Scene
 from sb3_quad.envs.rendering.window import (
@@ -54,10 +54,10 @@ class BulletBody:
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
         self.has_window = window is not None and has_display()
-        if window is None or not self.has_window:
-            client = int(p.connect(p.DIRECT))
-        else:
+        if window is not None and self.has_window:
             client = open_window(*window)
+        else:
+            client = int(p.connect(p.DIRECT))
         if window is not None and not self.has_window:
             sys.stderr.write(
                 "sb3_quad: DISPLAY is not set, so no window opens; "
@@ -177,7 +177,7 @@ class Renderer:
     def __init__(self, vehicle: Vehicle, width: int, height: int, body: BulletBody) -> None:
         self.vehicle = vehicle
         self.scene = Scene(vehicle, body.client)
-        self.size = (width, height)
+        self.lens = Lens(width, height, CHASE_SLOPE)
         self.human = body.has_window
         self.shown_at = time.perf_counter()
         self.frames_due = 1.0
@@ -190,10 +190,11 @@ class Renderer:
             start_drawing(self.scene.client)
 
     def reset(self, state: FloatArray) -> None:
-        """Begin an episode: the camera jumps to the vehicle in ``state``, (STATE_SIZE,)."""
+        """Begin an episode in ``state``, (STATE_SIZE,): the camera looks along the way to the
+        target.
+        """
         self.rotor_angles = np.zeros(4)
-        self.chase = ChaseCamera(self.scene.scale, *self.size)
-        self.chase.follow(state, 1.0)
+        self.forward = chasing(state[TARGET] - state[POSITION])
 
     def render(self, state: FloatArray, wrench: FloatArray) -> Image | None:
         """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,). Call it every control step.
@@ -202,26 +203,21 @@ class Renderer:
             second, and this call waits until real time has caught up.
         """
         control_step = self.vehicle.control_step
-        camera = self.chase.follow(state, 0.04)
         self.rotor_angles += rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * control_step
-        if not self.human:
-            self._place(state, wrench)
-            return self.scene.picture(camera)
-
-        # Draw only so many frames, and wait for real time in each control step.
-        self.frames_due += WINDOW_FPS * control_step
-        if self.frames_due >= 1.0:
+        if self.human:
+            # Wait for real time. After a step that took longer, do not hurry.
+            now = time.perf_counter()
+            self.shown_at = max(self.shown_at + control_step, now)
+            time.sleep(self.shown_at - now)
+            self.frames_due += WINDOW_FPS * control_step
+            if self.frames_due < 1.0:
+                return None
             self.frames_due %= 1.0
-            self._place(state, wrench)
-            point_window(self.scene.client, camera, state[POSITION])
-        self.shown_at += control_step
-        ahead = self.shown_at - time.perf_counter()
-        if ahead > 0:
-            time.sleep(ahead)
-        else:
-            # Too slow for real time: do not hurry afterwards.
-            self.shown_at -= ahead
-        return None
-
-    def _place(self, state: FloatArray, wrench: FloatArray) -> None:
         self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])
+        # Vehicle and target are in the picture.
+        both = np.stack([state[POSITION], state[TARGET]])
+        camera = framing_camera(both, CHASE_MARGIN * self.scene.scale, self.forward, self.lens)
+        if not self.human:
+            return self.scene.picture(camera)
+        point_window(self.scene.client, camera, state[POSITION])
+        return None

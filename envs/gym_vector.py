@@ -4,19 +4,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, StrDict, StrMapping
-from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
+from sb3_quad.base.types import AnyArray, BoolArray, Float32Array, StrDict
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
 
-class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.NDArray[Any]]):
+class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArray]):
     """The batched environment for users outside Stable-Baselines3.
 
     ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8,
@@ -44,12 +42,11 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         self,
         num_envs: int = 1,
         task: TaskSpec = "target_tracking",
-        task_kwargs: StrMapping | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         seed: int | None = None,
         n_threads: int | None = None,
-        **keywords: Unpack[FlightKeywords],
+        **keywords: Any,
     ) -> None:
         if render_mode is not None:
             raise ConfigError(
@@ -62,7 +59,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
             raise ConfigError(unknown("autoreset_mode", name, modes))
         self._mode = modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
-        self._make_batch(num_envs, seed, n_threads, task, task_kwargs, autoreset=False, **keywords)
+        self._make_batch(num_envs, seed, n_threads, task, autoreset=False, **keywords)
         self.num_envs = self.batch.n
         # The batch does not reset rows by itself, since both modes need their last observations.
         # Rows that the next step resets, in mode NextStep.
@@ -84,10 +81,9 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         :param seed: one number, from which each row gets its own stream, or a number or None for
             each row. None: continue with the current streams.
         """
-        for key in options or {}:
+        if options:
             raise ConfigError(
-                f"reset option {key!r}: the batched environment takes none; "
-                "call set_target after it"
+                "reset options: the batched environment takes none; call set_target after reset()"
             )
         if isinstance(seed, (int, np.integer)):
             seed = row_seeds(int(seed), self.num_envs)
@@ -104,7 +100,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         return self._begin(~self._ended), self._infos()
 
     def step(
-        self, actions: npt.NDArray[Any]
+        self, actions: AnyArray
     ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, StrDict]:
         """Fly one control step.
 

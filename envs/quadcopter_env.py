@@ -1,27 +1,41 @@
 """``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
-from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import Float32Array, FloatArray, Image, StrDict, StrMapping
-from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
+from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, Image, StrDict, StrMapping
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
-from sb3_quad.simulation.checks import check_size, per_row
-from sb3_quad.simulation.settings import ENDLESS
+from sb3_quad.simulation.checks import check_size
+from sb3_quad.simulation.settings import ENDLESS, AsList
 from sb3_quad.simulation.state import STATE, P, row_slices
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
-# Parts of the state that ``reset`` can fix, besides the target.
-_START = ("position", "quaternion", "velocity", "body_rates")
+Vector = Annotated[tuple[float, float, float], AsList]
+Quaternion = Annotated[tuple[float, float, float, float], AsList]
 _ROWS = row_slices(STATE)
+
+
+class _Start(Frozen):
+    """Parts of the state that a reset can fix, besides the target."""
+
+    position: Vector | None = None
+    quaternion: Quaternion | None = None
+    velocity: Vector | None = None
+    body_rates: Vector | None = None
+
+
+class _ResetOptions(Frozen):
+    """The options of a reset."""
+
+    target: Vector | None = None
+    state: _Start | None = None
 
 
 class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
@@ -193,12 +207,11 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     def __init__(
         self,
         task: TaskSpec = "target_tracking",
-        task_kwargs: StrMapping | None = None,
         render_mode: str | None = None,
         render_width: int = 640,
         render_height: int = 480,
         seed: int | None = None,
-        **keywords: Unpack[FlightKeywords],
+        **keywords: Any,
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
@@ -210,7 +223,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
                 f"max_episode_steps {steps}: give it to gymnasium.make, whose TimeLimit truncates"
             )
         # One row of the batched environment. PyBullet moves its body.
-        self._make_batch(1, seed, 1, task, task_kwargs, autoreset=False, **keywords)
+        self._make_batch(1, seed, 1, task, autoreset=False, **keywords)
         self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
@@ -260,7 +273,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         batch.clear_outcome()
         return self.observe(), self._info()
 
-    def step(self, action: npt.NDArray[Any]) -> tuple[Float32Array, float, bool, bool, StrDict]:
+    def step(self, action: AnyArray) -> tuple[Float32Array, float, bool, bool, StrDict]:
         """Fly one control step.
 
         :param action: (4,), clipped to [-1, 1].
@@ -328,17 +341,12 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
 def _fixed_rows(options: StrMapping, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
     """Return the rows of the state that the options of a reset fix, with their values."""
-    start = options.get("state") or {}
-    if not isinstance(start, Mapping):
-        raise ConfigError(f"options: state {start!r}: must hold some of {', '.join(_START)}")
-    for given, known in ((options, ("target", "state")), (start, _START)):
-        for key in given.keys() - set(known):
-            raise ConfigError(f"options: {unknown('key', key, known)}")
+    given = validate(_ResetOptions, options, "options")
     fixed = []
-    for name, value in {**start, "target": options.get("target")}.items():
+    for name, value in [*(given.state or _Start()), ("target", given.target)]:
         if value is None:
             continue
-        values = per_row(f"options: {name}", value, 1, STATE[name])[:, 0]
+        values = np.array(value)
         if name == "position" and values[2] <= vehicle.collision_radius:
             raise ConfigError(
                 f"position {values.tolist()}: touches the ground; "

@@ -10,12 +10,11 @@ from gymnasium import Wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
-from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import StrDict, StrMapping
-from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
+from sb3_quad.base.types import AnyArray, StrDict
+from sb3_quad.envs.batch_env import BatchEnv, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
 _OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
@@ -71,20 +70,19 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self,
         n_envs: int,
         task: TaskSpec = "target_tracking",
-        task_kwargs: StrMapping | None = None,
         staggered: bool = False,
         seed: int | None = None,
         n_threads: int | None = None,
-        **keywords: Unpack[FlightKeywords],
+        **keywords: Any,
     ) -> None:
-        self._make_batch(n_envs, seed, n_threads, task, task_kwargs, autoreset=True, **keywords)
+        self._make_batch(n_envs, seed, n_threads, task, autoreset=True, **keywords)
         # Only QuadcopterEnv draws.
         self.render_mode = None
         self._staggered = staggered
         # The list is reused in every step; only rows that end or have just ended change.
         self._infos: list[StrDict] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
-        self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
+        self._actions: AnyArray = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces(self.batch.observation.size))
 
@@ -105,7 +103,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
             self.batch.stagger()
         return observations
 
-    def step_async(self, actions: npt.NDArray[Any]) -> None:
+    def step_async(self, actions: AnyArray) -> None:
         """Keep the actions, (n, 4), for :meth:`step_wait`."""
         self._actions = actions
 

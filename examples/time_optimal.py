@@ -19,6 +19,7 @@ import numpy as np
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import TARGET
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 NEAR = 0.1  # m
@@ -123,7 +124,7 @@ def flight(vehicle: Vehicle, way: np.ndarray) -> tuple[np.ndarray, list[float]]:
     distance = []
     batch.reset()
     start = batch.true_state().position[0].copy()
-    batch.set_target(start + way)
+    batch.state[TARGET, 0] = start + way
     for _ in range(1500):
         s = batch.state[:, 0]
         states.append([*(s[:3] - start), *s[3:13], *(s[13:17] / vehicle.hover_rotor_speed)])

@@ -39,7 +39,9 @@ def batch(**task_kwargs):
     return made
 
 def single(row):
-    made = QuadcopterEnv("upright_fall", {"speed_cost": 0.01}, vehicle="trainer_quad", noise=0.0)
+    made = QuadcopterEnv(
+        "upright_fall", task_kwargs={"speed_cost": 0.01}, vehicle="trainer_quad", noise=0.0
+    )
     made.reset(seed=row_seeds(5, 2)[row])
     return made
 

@@ -116,7 +116,7 @@ def batch_of(vehicles, states, wrenches, wind=(0.0, 0.0, 0.0)):
     )
     batch.reset()
     batch.state[:], batch.wrench[:] = states, wrenches
-    batch.set_wind(wind)
+    batch.wind.T[:] = wind
     return batch
 
 

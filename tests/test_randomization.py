@@ -155,7 +155,7 @@ def test_an_episode_is_random_within_the_ranges():
 def test_a_share_of_zero_changes_no_flight():
     envs = [
         QuadcopterVecEnv(64, task="state_recovery", seed=4, **keywords)
-        for keywords in ({}, {"randomize": {"mass": [0.5, 1.2], "share": 0.0}})
+        for keywords in ({}, {"randomize": {"mass": [0.6, 1.2], "share": 0.0}})
     ]
     actions = np.random.default_rng(0).uniform(-1, 1, (200, 64, 4)).astype(np.float32)
     np.testing.assert_array_equal(*(env.reset() for env in envs))
@@ -193,7 +193,7 @@ def test_gusts_have_their_spread_and_time_constant(kind, std, unit, size):
 
 def test_a_wrench_that_is_set_lasts_until_the_next_episode_brings_its_own():
     batch = batch_of(2, randomize={"force": [1.0, 1.0]})
-    batch.set_wrench([3.0, 0.0, 0.0])
+    batch.wrench[W.force_world] = 3.0
     batch.step(np.zeros((2, 4), np.float32))
     assert batch.wrench[W.force_world].tolist() == [3.0, 3.0]
     batch.reset(0)
@@ -371,9 +371,9 @@ def test_a_reserve_is_for_a_privileged_expert_and_not_negative(privileged, reser
         ({"weight": [1, 2]}, "unknown key 'weight'"),
         ({"mass": [1.25, 0.8]}, "exceeds"),
         ({"mass": [1.0, 1.6]}, "cannot hover"),
-        ({"mass": [0.3, 0.4]}, "give at least 0.5 times its weight"),
+        ({"mass": [0.3, 0.4]}, "cannot hover"),
         ({"mass": [1, 2, 3]}, "must be [low, high]"),
-        ({"delay": [0, 0.5]}, "whole control steps"),
+        ({"delay": [0, 0.5]}, "multiple of 1"),
         ({"force": {"magnitude": [-1, 1]}}, "greater than or equal to 0"),
         ({"force": {"magnitude": [0, 1], "direction": [0, 0, 0]}}, "must not be zero"),
         ({"wind": {"magnitude": 1, "frame": "body"}}, "remove unit and frame"),

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_quad.base.types import FloatArray
-from sb3_quad.simulation.state import POSITION, TARGET
 
 SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that distance hardly changes sizes
 CHASE_SLOPE = math.tan(math.radians(27.0))
 CHASE_MARGIN = 0.6  # around vehicle and target, m, for the default vehicle
 ASIDE = math.radians(9.0)  # between the direction to the target and that of a chasing camera
-STEEPEST = math.radians(70.0)  # elevation of a chasing camera
+STEEPEST = math.radians(70.0)  # elevation of a chasing camera's direction
 DOWN = math.radians(5.0)  # how far a camera that frames points looks down
 LOWEST = (-math.inf, -math.inf, 0.3)  # where a camera is at least, m
 
@@ -72,6 +71,17 @@ def broadside(points: FloatArray) -> FloatArray:
     return direction(math.atan2(sign * y, sign * x), -DOWN)
 
 
+def chasing(way: FloatArray) -> FloatArray:
+    """Return the direction, (3,), of a camera behind a vehicle and a little aside.
+
+    :param way: from the vehicle to its target, (3,).
+    """
+    x, y, z = way
+    elevation = math.atan2(z, math.hypot(x, y)) - ASIDE
+    elevation = float(np.clip(elevation, -STEEPEST, STEEPEST))
+    return direction(math.atan2(y, x) + ASIDE, elevation)
+
+
 def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens: Lens) -> Camera:
     """Return the nearest camera that sees balls of radius ``margin`` at all points.
 
@@ -92,34 +102,3 @@ def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens:
     distance = float((0.5 * (before + after) / lens.slopes).max())
     eye = np.array([-distance, *(0.5 * (after - before))]) @ axes
     return Camera(np.maximum(eye, LOWEST), axes, lens)
-
-
-class ChaseCamera:
-    """A camera behind the vehicle as seen from its target and a little aside, which has both in its
-    picture.
-
-    :param scale: the vehicle's size, in that of the default one.
-    :param width: of its pictures, pixels; ``height`` likewise.
-    """
-
-    def __init__(self, scale: float, width: int, height: int) -> None:
-        self.scale = scale
-        self.lens = Lens(width, height, CHASE_SLOPE)
-        self.course = ASIDE
-        self.elevation = -ASIDE
-
-    def follow(self, state: FloatArray, share: float) -> Camera:
-        """Return the camera for ``state``, (STATE_SIZE,), turned towards the target by a share of
-        the angle.
-        """
-        x, y, z = state[TARGET] - state[POSITION]
-        # Nearer targets would turn the camera to and fro.
-        if math.hypot(x, y, z) > self.scale:
-            course = math.atan2(y, x) + ASIDE
-            self.course += share * math.remainder(course - self.course, 2.0 * math.pi)
-            elevation = math.atan2(z, math.hypot(x, y)) - ASIDE
-            elevation = float(np.clip(elevation, -STEEPEST, STEEPEST))
-            self.elevation += share * (elevation - self.elevation)
-        both = np.stack([state[POSITION], state[TARGET]])
-        forward = direction(self.course, self.elevation)
-        return framing_camera(both, CHASE_MARGIN * self.scale, forward, self.lens)

@@ -1,5 +1,5 @@
 """The shapes that vehicles, targets and arrows are drawn with, as PyBullet bodies without mass that
-touch nothing; m.
+touch nothing. Their lengths are in units of their own.
 """
 
 import itertools
@@ -42,17 +42,20 @@ class Part(NamedTuple):
     angles: Vector = (0.0, 0.0, 0.0)
 
 
-def add_body(parts: Sequence[Part], colour: Colour, client: int) -> int:
-    """Add a body of at most 16 parts, out of sight; return its number."""
+def add_body(parts: Sequence[Part], unit: float, colour: Colour, client: int) -> int:
+    """Add a body of at most 16 parts, out of sight; return its number.
+
+    :param unit: of the parts' lengths, m.
+    """
+    shapes, places, boxes, radii, lengths, angles = zip(*parts, strict=True)
     # PyBullet takes lists only; tuples crash it.
-    shapes, places, boxes, radii, lengths, angles = map(list, zip(*parts, strict=True))
     shape = p.createVisualShapeArray(
-        shapeTypes=shapes,
-        halfExtents=np.divide(boxes, 2.0).tolist(),
-        radii=radii,
-        lengths=lengths,
+        shapeTypes=list(shapes),
+        halfExtents=np.multiply(boxes, unit / 2.0).tolist(),
+        radii=np.multiply(radii, unit).tolist(),
+        lengths=np.multiply(lengths, unit).tolist(),
         rgbaColors=[colour] * len(parts),
-        visualFramePositions=places,
+        visualFramePositions=np.multiply(places, unit).tolist(),
         visualFrameOrientations=list(map(p.getQuaternionFromEuler, angles)),
         physicsClientId=client,
     )
@@ -85,58 +88,58 @@ def rotor_turning(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
     return -np.sign(vehicle.rotor_directions) * speeds / SLOWED
 
 
-def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:
+def frame(centres: FloatArray) -> dict[Colour, list[Part]]:
     """Return a vehicle without its rotors, by colour: PyBullet's window gives a body one colour
-    only.
+    only. The unit is the arm.
 
     :param centres: of the rotors, (4, 3).
     """
     parts = {
-        DARK: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.02 * arm), radius=0.30 * arm, length=0.14 * arm)],
-        GREY: [
-            Part(p.GEOM_BOX, (-0.02 * arm, 0.0, -0.10 * arm), (0.34 * arm, 0.20 * arm, 0.12 * arm))
-        ],
+        DARK: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.02), radius=0.30, length=0.14)],
+        GREY: [Part(p.GEOM_BOX, (-0.02, 0.0, -0.10), (0.34, 0.20, 0.12))],
         FRONT: [],
     }
     for x, y, z in centres.tolist():
         # A beam from the middle to the rotor, and a motor below it.
-        middle = (x / 2, y / 2, 0.02 * arm)
-        beam = (math.hypot(x, y), 0.09 * arm, 0.06 * arm)
+        middle = (x / 2, y / 2, 0.02)
+        beam = (math.hypot(x, y), 0.09, 0.06)
         colour = FRONT if x > 0 else DARK
         parts[colour].append(Part(p.GEOM_BOX, middle, beam, angles=(0.0, 0.0, math.atan2(y, x))))
         motor = (x, y, 0.45 * z)
-        parts[GREY].append(Part(p.GEOM_CYLINDER, motor, radius=0.09 * arm, length=0.9 * z))
+        parts[GREY].append(Part(p.GEOM_CYLINDER, motor, radius=0.09, length=0.9 * z))
     return parts
 
 
-def rotor(radius: float, pitch: float) -> list[Part]:
-    """Return a hub and two blades in the plane z = 0, pitched by an angle, rad."""
-    parts = [Part(p.GEOM_CYLINDER, radius=0.09 * radius, length=0.16 * radius)]
-    length = 0.94 * radius
-    blade = (length, 0.15 * radius, 0.02 * radius)
+def rotor(pitch: float) -> list[Part]:
+    """Return a hub and two blades in the plane z = 0, pitched by an angle, rad. The unit is their
+    radius.
+    """
+    parts = [Part(p.GEOM_CYLINDER, radius=0.09, length=0.16)]
     for side in (1.0, -1.0):
-        middle = (side * length / 2, 0.0, 0.0)
-        parts.append(Part(p.GEOM_BOX, middle, blade, angles=(side * pitch, 0.0, 0.0)))
+        middle = (0.47 * side, 0.0, 0.0)
+        parts.append(Part(p.GEOM_BOX, middle, (0.94, 0.15, 0.02), angles=(side * pitch, 0.0, 0.0)))
     return parts
 
 
-def arrow(length: float, radius: float) -> list[Part]:
-    """Return an arrow along +z from the origin; its head has three steps."""
-    middle = (0.0, 0.0, 0.35 * length)
-    parts = [Part(p.GEOM_CYLINDER, middle, radius=radius, length=0.7 * length)]
+def arrow(radius: float) -> list[Part]:
+    """Return an arrow along +z from the origin; its head has three steps. The unit is its
+    length.
+    """
+    parts = [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.35), radius=radius, length=0.7)]
     for height, width in HEAD:
-        step = (0.0, 0.0, height * length)
-        parts.append(Part(p.GEOM_CYLINDER, step, radius=width * radius, length=0.1 * length))
+        parts.append(Part(p.GEOM_CYLINDER, (0.0, 0.0, height), radius=width * radius, length=0.1))
     return parts
 
 
-def hoop(radius: float, thickness: float, yaw: float) -> list[Part]:
-    """Return an upright ring around the origin, turned about z by an angle, rad."""
-    length = 2.06 * radius * math.tan(math.pi / 16)
+def hoop(thickness: float, yaw: float) -> list[Part]:
+    """Return an upright ring around the origin, turned about z by an angle, rad. The unit is its
+    radius.
+    """
+    length = 2.06 * math.tan(math.pi / 16)
     parts = []
     for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
-        level = radius * math.cos(angle)
-        place = (-level * math.sin(yaw), level * math.cos(yaw), radius * math.sin(angle))
+        level = math.cos(angle)
+        place = (-level * math.sin(yaw), level * math.cos(yaw), math.sin(angle))
         part = Part(p.GEOM_CYLINDER, place, radius=thickness, length=length)
         parts.append(part._replace(angles=(angle, 0.0, yaw)))
     return parts

@@ -65,8 +65,7 @@ class Scene:
         for _ in range(n_targets):
             hoops = []
             for yaw in (0.0, math.pi / 2):
-                parts = models.hoop(RING * self.scale, 0.018 * self.scale, yaw)
-                hoops.append(add_body(parts, MARKER, client))
+                hoops.append(add_body(models.hoop(0.043, yaw), RING * self.scale, MARKER, client))
             self._targets.append(hoops)
 
     def place(self, poses: Sequence[Pose], targets: FloatArray) -> None:
@@ -125,18 +124,19 @@ class _VehicleBodies:
         self.client = client
         arm = size * vehicle.arm_length
         radius = size * models.rotor_radius(vehicle)
-        places = size * np.array(vehicle.rotor_positions)
-        self.centres = np.column_stack([places, np.full(len(places), 0.17 * arm)])
+        places = np.array(vehicle.rotor_positions) / vehicle.arm_length
+        centres = np.column_stack([places, np.full(len(places), 0.17)])
+        self.centres = arm * centres
         self.frame = []
-        for colour, parts in models.frame(arm, self.centres).items():
-            self.frame.append(add_body(parts, colour, client))
+        for colour, parts in models.frame(centres).items():
+            self.frame.append(add_body(parts, arm, colour, client))
         self.rotors = []
         for (x, _), sense in zip(places, vehicle.rotor_directions, strict=True):
             # A rotor's drag on the body is opposed to its sense of turning.
-            blades = models.rotor(radius, -0.25 * sense)
-            self.rotors.append(add_body(blades, FRONT if x > 0 else WHITE, client))
-        self.force = add_body(models.arrow(0.5 * scale, 0.012 * scale), FORCE, client)
-        self.torque = add_body(models.arrow(0.4 * scale, 0.012 * scale), TORQUE, client)
+            blades = models.rotor(-0.25 * sense)
+            self.rotors.append(add_body(blades, radius, FRONT if x > 0 else WHITE, client))
+        self.force = add_body(models.arrow(0.024), 0.5 * scale, FORCE, client)
+        self.torque = add_body(models.arrow(0.03), 0.4 * scale, TORQUE, client)
 
     def place(self, pose: Pose) -> None:
         """Move it."""

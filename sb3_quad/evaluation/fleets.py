@@ -12,7 +12,7 @@ import numpy as np
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
+from sb3_quad.simulation.state import STATE, TARGET, QuadcopterState, row_slices
 
 Start = Mapping[str, FloatArray]
 # The environment on PyBullet; its task comes with the settings.
@@ -60,7 +60,7 @@ class Fleet:
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         """Move the targets of some rows, (len(rows), 3); return all observations."""
-        self._batches[0].set_target(targets, rows)
+        self._batches[0].state[TARGET, rows] = targets.T
         return self._batches[0].observe()
 
     def set_wrench(self, wrench: FloatArray) -> None:

@@ -4,12 +4,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import available_cpus
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, IntArray
+from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import compile_notice
@@ -32,20 +31,17 @@ from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import (
     FORCE_WORLD,
     STATE_SIZE,
-    TARGET,
     WRENCH_SIZE,
     P,
     QuadcopterState,
     drag_forces,
-    make_wrench,
 )
-from sb3_quad.simulation.tasks import TaskSpec, resolve_tasks
+from sb3_quad.simulation.tasks import resolve_tasks
 from sb3_quad.simulation.threads import share_out
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
-Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
-AnyArray: TypeAlias = npt.NDArray[Any]
+Rows: TypeAlias = "int | slice | Iterable[int] | AnyArray | None"
 StepResult: TypeAlias = tuple[Float32Array, Float32Array, BoolArray]
 MAX_ROWS = 2**20
 MAX_THREADS = 2**16
@@ -127,9 +123,8 @@ class QuadcopterBatch:
         self.integral_numbers = np.array((integral or PositionIntegral()).numbers(control_step))
         self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
 
-        self.task: TaskSpec = settings.task
-        self.task_kwargs = dict(settings.task_kwargs or {})
-        self.task_parameters, self.task_weights = resolve_tasks(self.task, self.task_kwargs)
+        tasks = resolve_tasks(settings.task, settings.task_kwargs)
+        self.task_parameters, self.task_weights = tasks
         self.task_index = np.zeros(n, dtype=np.int64)
         steps = np.atleast_1d(settings.max_episode_steps).tolist()
         self.max_steps = np.array(repeated("max_episode_steps", steps, n), dtype=np.int64)
@@ -141,12 +136,8 @@ class QuadcopterBatch:
         self.streams = np.zeros((4, n), dtype=np.uint32)
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
-        # One column serves all rows until some differ.
-        self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[:, None]
-        self._bind()
+        self._set_scaling(settings)
         self.set_noise(settings.noise)
-        self._set_scaling(0, "observation_mean", settings.observation_mean)
-        self._set_scaling(OBSERVATION_SIZE, "observation_std", settings.observation_std)
         with compile_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
@@ -160,26 +151,26 @@ class QuadcopterBatch:
         self.distribution = settings.vehicles
         self.randomize = settings.randomize or Randomization()
         sources = settings.vehicle
-        columns = self.n
         if not isinstance(sources, (list, tuple)):
             sources = [sources]
-            columns = 1
         vehicles = load_vehicles(sources, settings.rotor_layout)
         self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, self.n)
-        parameters = [vehicle.parameters() for vehicle in self.vehicle_list[:columns]]
-        self.base_vehicles = np.stack(parameters, axis=1)
+        self.base_vehicles = np.stack([vehicle.parameters() for vehicle in vehicles], axis=1)
+        if len(vehicles) > 1:
+            columns = np.arange(self.n) % len(vehicles)
+            self.base_vehicles = np.take(self.base_vehicles, columns, axis=1)
         self.vehicles = self.base_vehicles.copy()
         if self.distribution is not None or self.randomize.sets_vehicle:
-            self.vehicles = np.repeat(self.base_vehicles, self.n // columns, axis=1)
+            self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.vehicles), self.n)).copy()
 
-        # All vehicles can fly if the weakest of a distribution can.
         self.distribution_numbers = NO_DISTRIBUTION
-        weakest = vehicles
         if self.distribution is not None:
             self.distribution_numbers = self.distribution.numbers()
-            weakest = [self.distribution.weakest(vehicle) for vehicle in vehicles]
-        for vehicle in weakest:
-            self.randomize.check(vehicle)
+        # All vehicles can fly if the hardest to fly can.
+        for vehicle in vehicles:
+            if self.distribution is not None:
+                vehicle = self.distribution.hardest(vehicle)
+            self.randomize.hardest(vehicle)
         return vehicles
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
@@ -356,75 +347,36 @@ class QuadcopterBatch:
         for name, array in snapshot.items():
             getattr(self, name)[...] = array
 
-    def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
-        """Move targets r_T to a position, (3,) or (rows, 3), world frame, m, until the row's next
-        reset.
-        """
-        chosen = self.rows(indices)
-        self.state[TARGET, chosen] = per_row("target", position, chosen.size, 3)
-
-    def set_wrench(
-        self,
-        force: npt.ArrayLike = (0.0, 0.0, 0.0),
-        torque: npt.ArrayLike = (0.0, 0.0, 0.0),
-        force_frame: str = "world",
-        torque_frame: str = "body",
-        indices: Rows = None,
-    ) -> None:
-        """Apply an external force (N) and torque (N m), (3,) or (rows, 3) each, at the centre of
-        mass, until they are set again.
-
-        Without arguments it removes both.
-
-        :param force_frame: ``"world"`` or ``"body"``; ``torque_frame`` likewise.
-        """
-        chosen = self.rows(indices)
-        forces = per_row("force", force, chosen.size, 3).T
-        torques = per_row("torque", torque, chosen.size, 3).T
-        self.wrench[:, chosen] = make_wrench(forces, torques, force_frame, torque_frame)
-
-    def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
-        """Set the velocity of the air, (3,) or (rows, 3), world frame, m/s, until it is set again.
-        It acts on vehicles with drag.
-        """
-        chosen = self.rows(indices)
-        self.wind[:, chosen] = per_row("wind", velocity, chosen.size, 3)
-
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a
         ``Noise``; 0 switches it off.
         """
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
         relative, additive = levels(noise)
-        relative_rows = per_row("noise", relative, self.rows(indices).size)
-        both = np.vstack([relative_rows, np.full_like(relative_rows, additive)])
-        by_row = isinstance(noise, list) or indices is not None
-        self._write_scaling(2 * OBSERVATION_SIZE, both, by_row, indices)
+        chosen = self.rows(indices)
+        self._scaling_of_rows[-2, chosen] = per_row("noise", relative, chosen.size)
+        self._scaling_of_rows[-1, chosen] = additive
+        self._bind()
 
-    def _set_scaling(self, first: int, name: str, value: Any) -> None:
-        """Set μ or σ of Eq. 3.16, (18,) or (n, 18); None leaves it as it is."""
-        if value is None:
-            return
-        values = per_row(name, value, self.n, OBSERVATION_SIZE)
-        if first > 0 and (values <= 0).any():
-            raise ConfigError(f"{name}: every value must be positive")
-        self._write_scaling(first, values, np.ndim(value) == 2, None)
-
-    def _write_scaling(self, first: int, values: FloatArray, by_row: bool, rows: Rows) -> None:
-        """Write some of the scaling, from row ``first`` of the array on.
-
-        One column serves all rows until some are set ``by_row``.
-        """
-        if by_row and self.scaling.shape[1] < self.n:
-            self.scaling = np.repeat(self.scaling, self.n, axis=1)
-            self._bind()
-        part = self.scaling[first : first + len(values)]
-        if part.shape[1] == self.n:
-            part[:, self.rows(rows)] = values
-        else:
-            part[:] = values[:, :1]
+    def _set_scaling(self, settings: FlightSettings) -> None:
+        """Set μ and σ of Eq. 3.16, (18,) or (n, 18) each; the levels of the noise follow them."""
+        mean: Any = settings.observation_mean
+        std: Any = settings.observation_std
+        if mean is None:
+            mean = DEFAULT_MEAN
+        if std is None:
+            std = DEFAULT_STD
+        means = per_row("observation_mean", mean, self.n, OBSERVATION_SIZE)
+        stds = per_row("observation_std", std, self.n, OBSERVATION_SIZE)
+        if (stds <= 0).any():
+            raise ConfigError("observation_std: every value must be positive")
+        self._scaling_of_rows = np.vstack([means, stds, np.zeros((2, self.n))])
 
     def _bind(self) -> None:
+        self.scaling = self._scaling_of_rows
+        # One column serves all rows where they do not differ.
+        if (self.scaling == self.scaling[:, :1]).all():
+            self.scaling = self.scaling[:, :1].copy()
         self.mean = self.scaling[:OBSERVATION_SIZE]
         self.std = self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
         self.noise_level, self.additive_level = self.scaling[-2:]

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.utils import seeding
 from numba import float32, int32, uint32, uint64
 
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
@@ -39,14 +38,12 @@ _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     """Return streams before their first episode, shape (4, n), from n seeds.
 
-    A key is the first number of the generator that Gymnasium makes of the seed. With None it comes
-    from the operating system's entropy.
+    A key is the first number of NumPy's generator of the seed, which is Gymnasium's as well. With
+    None it comes from the operating system's entropy.
     """
     streams = np.zeros((4, len(seeds)), dtype=np.uint32)
     for row, seed in enumerate(seeds):
-        # Gymnasium takes Python's integers only.
-        generator, _ = seeding.np_random(seed if seed is None else int(seed))
-        key = int(generator.integers(2**64, dtype=np.uint64))
+        key = int(np.random.default_rng(seed).integers(2**64, dtype=np.uint64))
         streams[KEY_LO, row] = key % 2**32
         streams[KEY_HI, row] = key >> 32
     return streams

@@ -5,71 +5,49 @@ A :class:`Randomization` is data, ``randomize`` in ``env_kwargs``; :mod:`.sampli
 """
 
 import math
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import FloatArray
-from sb3_quad.base.validate import Frozen
+from sb3_quad.base.types import FloatArray, StrMapping
+from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.state import first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
 
-# The kinds of range; a FIXED one samples nothing.
+# The kinds of range; a FIXED one samples nothing. Its numbers, like all that are not given, are 0.
 FIXED, UNIFORM, LOG_UNIFORM, CUBE_ROOT = range(4)
 _KINDS = {"uniform": UNIFORM, "log_uniform": LOG_UNIFORM, "uniform_cube_root": CUBE_ROOT}
-# The numbers of a range that is not given
-FIXED_NUMBERS = (0.0, 0.0, float(FIXED))
-_RANGE = len(FIXED_NUMBERS)
+# Numbers of a range: low, high and kind
+RANGE = 3
 Share = Annotated[float, Field(ge=0, le=1)]
 AxisFactor = Annotated[float, Field(ge=0, le=10)]
 MAX_DELAY = 100  # control steps
-# The greatest force or torque, by unit
-MAX_MAGNITUDE = {"SI": 1e4, "weight": 100.0}
-Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # of a quadcopter, SI
-Vector = tuple[Number, Number, Number]
-Metre = Annotated[float, Field(ge=-1, le=1)]  # m
-FactorLimit = Annotated[float, Field(ge=0.1, le=10)]
-WholeSteps = Annotated[float, Field(ge=0, le=MAX_DELAY, multiple_of=1)]
+Vector = tuple[float, float, float]
 Unit = Literal["SI", "weight"]
-VECTOR = {"length": _RANGE, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
+VECTOR = {"length": RANGE, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
 V = first_rows(VECTOR)
-VEHICLE_RANGES = (
-    "mass",
-    "inertia",
-    "motor_gain",
-    "motor_gain_up",
-    "motor_gain_down",
-    "thrust",
-    "arm",
-    "center_of_mass",
-    "delay",
-    "drag",
-)
-"""The ranges of a :class:`Randomization` that change the vehicle."""
-RANDOMIZATION = {
-    "share": 1,
-    "wrench_share": 1,
-    **dict.fromkeys(VEHICLE_RANGES, _RANGE),
-    **dict.fromkeys(("force", "torque", "wind"), sum(VECTOR.values())),
-    "gust_std": _RANGE,
-    "gust_keeps": 1,
-    "gust_by_weight": 1,
-    "wind_std": _RANGE,
-    "wind_keeps": 1,
-}
-"""Numbers of :meth:`Randomization.numbers`."""
-R = first_rows(RANDOMIZATION)
+GUST = {"std": RANGE, "keeps": 1, "by_weight": 1}
+N = first_rows(GUST)
+Bounded = TypeVar("Bounded", bound=float)
 
 
-class Range(Frozen):
+class Range(Frozen, Generic[Bounded]):
     """Numbers from ``low`` to ``high``. You may write ``[low, high]``, or one number."""
 
-    low: Number
+    low: Bounded
     """the least number"""
-    high: Number
+    high: Bounded
     """the greatest number, at least low"""
     distribution: Literal["uniform", "log_uniform", "uniform_cube_root"] = "uniform"
     """of the number, of its logarithm (low > 0), or of its cube root"""
@@ -87,7 +65,7 @@ class Range(Frozen):
         return data
 
     @model_validator(mode="after")
-    def _rises(self) -> "Range":
+    def _rises(self) -> "Range[Bounded]":
         given = f"[{self.low:g}, {self.high:g}]"
         if self.low > self.high:
             raise ValueError(f"{given}: the first number exceeds the second")
@@ -97,53 +75,22 @@ class Range(Frozen):
             raise ValueError(f"{given}: uniform_cube_root numbers must not be negative")
         return self
 
-
-def range_numbers(given: Range | None) -> tuple[float, float, float]:
-    """Return low, high, and the kind of a range; those of a FIXED one if it is not given."""
-    if given is None:
-        return FIXED_NUMBERS
-    return given.low, given.high, _KINDS[given.distribution]
+    def numbers(self) -> list[float]:
+        """Return low, high, and the kind of the range."""
+        return [self.low, self.high, _KINDS[self.distribution]]
 
 
-class NonNegativeRange(Range):
-    """A :class:`Range` of numbers from 0."""
-
-    low: NonNegativeFloat
-    """the least number, at least 0"""
-
-
-class PositiveRange(Range):
-    """A :class:`Range` of numbers above 0."""
-
-    low: Annotated[float, Field(ge=1e-9)]
-    """the least number, at least 1e-9"""
+NonNegativeRange = Range[NonNegativeFloat]
+PositiveRange = Range[Annotated[float, Field(ge=1e-9)]]
+# N, N m or m/s, or multiples of a weight
+Magnitude = Range[Annotated[float, Field(ge=0, le=1e4)]]
+Offset = Range[Annotated[float, Field(ge=-1, le=1)]]  # m
+Delay = Range[Annotated[float, Field(ge=0, le=MAX_DELAY, multiple_of=1)]]
 
 
-class Offset(Range):
-    """A :class:`Range` of distances of at most 1 m either way."""
-
-    low: Metre
-    """the least number, at least -1"""
-    high: Metre
-    """the greatest number, from low to 1"""
-
-
-class Delay(Range):
-    """A :class:`Range` of whole numbers of control steps."""
-
-    low: WholeSteps
-    """the least number, in whole control steps"""
-    high: WholeSteps
-    """the greatest number, in whole control steps"""
-
-
-class Factor(Range):
+class Factor(Range[Annotated[float, Field(ge=0.1, le=10)]]):
     """A factor between 0.1 and 10, log-uniform unless ``distribution`` says otherwise."""
 
-    low: FactorLimit
-    """the least factor"""
-    high: FactorLimit
-    """the greatest factor, at least low"""
     distribution: Literal["uniform", "log_uniform"] = "log_uniform"
     """of the factor or its logarithm"""
 
@@ -157,7 +104,7 @@ class RandomVector(Frozen):
     You may write ``[low, high]`` for its magnitude alone.
     """
 
-    magnitude: NonNegativeRange
+    magnitude: Magnitude
     """its length, N, N m or m/s; or in the unit that unit names"""
     unit: Unit = "SI"
     """weight: a force in multiples of the weight m g, a torque of m g times the arm length"""
@@ -180,21 +127,13 @@ class RandomVector(Frozen):
             raise ValueError("direction must not be zero")
         return value
 
-    @model_validator(mode="after")
-    def _of_a_quadcopter(self) -> "RandomVector":
-        _check_magnitude(self.magnitude, self.unit)
-        return self
-
-    def numbers(self, frame: str) -> list[float]:
-        """Return numbers in the order of ``VECTOR``.
-
-        :param frame: ``world`` or ``body``, where the vector names none.
-        """
+    def numbers(self) -> list[float]:
+        """Return numbers in the order of ``VECTOR``."""
         direction = np.zeros(3)
         if self.direction is not None:
             direction = np.array(self.direction) / np.linalg.norm(self.direction)
-        units = [self.unit == "weight", (self.frame or frame) == "body"]
-        return [*range_numbers(self.magnitude), *units, *direction, *self.axes]
+        units = [self.unit == "weight", self.frame == "body"]
+        return [*self.magnitude.numbers(), *units, *direction, *self.axes]
 
 
 class Gusts(Frozen):
@@ -210,17 +149,20 @@ class Gusts(Frozen):
     L / V.
     """
 
-    std: NonNegativeRange
+    std: Magnitude
     """standard deviation of each component, N, or m/s of wind; sampled per episode"""
     unit: Unit = "SI"
     """weight: in multiples of the vehicle's weight m g"""
     time_constant: PositiveFloat = Field(default=1.0, le=1e6)
     """time after which a gust has faded to 1/e, s"""
 
-    @model_validator(mode="after")
-    def _of_a_quadcopter(self) -> "Gusts":
-        _check_magnitude(self.std, self.unit)
-        return self
+    def numbers(self, control_step: float) -> list[float]:
+        """Return numbers in the order of ``GUST``.
+
+        :param control_step: s, after which a share of a gust is kept.
+        """
+        keeps = math.exp(-control_step / self.time_constant)
+        return [*self.std.numbers(), keeps, self.unit == "weight"]
 
 
 class Randomization(Frozen):
@@ -280,73 +222,85 @@ class Randomization(Frozen):
     @property
     def sets_vehicle(self) -> bool:
         """Whether an episode begins with a vehicle of its own."""
-        return any(getattr(self, name) is not None for name in VEHICLE_RANGES)
+        return any(isinstance(given, Range) for _, given in self)
 
     @property
     def sets_wrench(self) -> bool:
         """Whether an episode begins with a wrench of its own, which may be zero."""
         return self.force is not None or self.torque is not None
 
-    def check(self, vehicle: Vehicle) -> None:
-        """Refuse a vehicle that could not fly with these numbers.
+    def hardest(self, vehicle: Vehicle) -> Vehicle:
+        """Return the vehicle with the narrowest thrust limits and the fastest motors that it can
+        get. If it can fly, all can.
 
-        :raises ConfigError: it could not hover, or its motors would overshoot.
+        :raises ConfigError: it cannot fly.
         """
         least, most = vehicle.thrust_limits
         mass = self.mass or UNCHANGED
         thrust = self.thrust or UNCHANGED
-        for is_wrong, heavy, weak, limit in (
-            (thrust.low * most <= mass.high, mass.high, thrust.low, f"lift {most:g}"),
-            (thrust.high * least > mass.low, mass.low, thrust.high, f"give at least {least:g}"),
-        ):
-            if is_wrong:
-                raise ConfigError(
-                    f"randomize: with {heavy:g} times its mass and {weak:g} times its thrust"
-                    f" {vehicle.name} cannot hover; its rotors {limit} times its weight"
-                )
-        # A rotor must not lose more than its whole error in a physics step.
-        up = vehicle.motor_gain_up * (self.motor_gain_up or UNCHANGED).high
-        down = vehicle.motor_gain_down * (self.motor_gain_down or UNCHANGED).high
-        gain = max(up, down) * (self.motor_gain or UNCHANGED).high
-        if gain * vehicle.physics_step > 1.0:
-            raise ConfigError(
-                f"randomize: motor_gain of {vehicle.name} may reach {gain:g};"
-                " times physics_step it may not exceed 1"
-            )
+        gain = (self.motor_gain or UNCHANGED).high
+        up = gain * (self.motor_gain_up or UNCHANGED).high
+        down = gain * (self.motor_gain_down or UNCHANGED).high
+        changes = {
+            "thrust_limits": (least * thrust.high / mass.low, most * thrust.low / mass.high),
+            "motor_gain_up": vehicle.motor_gain_up * up,
+            "motor_gain_down": vehicle.motor_gain_down * down,
+        }
+        return flyable(vehicle, changes, "randomize")
 
     def numbers(self, control_step: float) -> FloatArray:
         """Return the numbers that :mod:`.sampling` reads, in the order of ``RANDOMIZATION``.
 
         :param control_step: s.
         """
-        numbers = [self.share * self.sets_vehicle, self.wrench_share]
-        for name in VEHICLE_RANGES:
-            numbers += range_numbers(getattr(self, name))
-        for vector, frame in ((self.force, "world"), (self.torque, "body"), (self.wind, "world")):
-            if vector is None:
-                # Zeros: its range is FIXED.
-                numbers += [0.0] * sum(VECTOR.values())
-            else:
-                numbers += vector.numbers(frame)
-        numbers += _gust_numbers(self.gusts, control_step)
-        by_weight = self.gusts is not None and self.gusts.unit == "weight"
-        numbers += [by_weight, *_gust_numbers(self.wind_gusts, control_step)]
-        table = np.array(numbers)
+        parts = {"share": [self.share * self.sets_vehicle], "wrench_share": [self.wrench_share]}
+        for name, given in self:
+            if isinstance(given, Gusts):
+                parts[name] = given.numbers(control_step)
+            elif isinstance(given, (Range, RandomVector)):
+                parts[name] = given.numbers()
+        table = table_row(RANDOMIZATION, parts)
+        if self.torque is not None and self.torque.frame is None:
+            table[R.torque + V.in_body] = 1.0
         # floor(uniform(low, high + 1)) makes every whole number equally likely.
         table[R.delay + 1] += 1.0
         return table
 
 
-def _gust_numbers(gusts: Gusts | None, control_step: float) -> list[float]:
-    """The range of the deviation, and the share of a gust that is left after a control step."""
-    if gusts is None:
-        return [*FIXED_NUMBERS, 0.0]
-    return [*range_numbers(gusts.std), math.exp(-control_step / gusts.time_constant)]
+RANDOMIZATION = dict.fromkeys(Randomization.model_fields, RANGE) | {
+    "share": 1,
+    "wrench_share": 1,
+    **dict.fromkeys(("force", "torque", "wind"), sum(VECTOR.values())),
+    **dict.fromkeys(("gusts", "wind_gusts"), sum(GUST.values())),
+}
+"""Numbers of :meth:`Randomization.numbers`."""
+R = first_rows(RANDOMIZATION)
 
 
-def _check_magnitude(numbers: Range, unit: str) -> None:
-    if numbers.high > MAX_MAGNITUDE[unit]:
-        raise ValueError(f"{numbers.high:g} ({unit}): must be at most {MAX_MAGNITUDE[unit]:g}")
+def table_row(sizes: Mapping[str, int], parts: Mapping[str, Sequence[float]]) -> FloatArray:
+    """Return numbers one after the other, (sum of sizes,); what is not among them is 0.
+
+    :param sizes: how many numbers each part can have, in their order.
+    """
+    row = np.zeros(sum(sizes.values()))
+    first = first_rows(sizes)
+    for name, numbers in parts.items():
+        start = getattr(first, name)
+        row[start : start + len(numbers)] = numbers
+    return row
+
+
+def flyable(base: Vehicle, changes: StrMapping, where: str) -> Vehicle:
+    """Return a changed vehicle.
+
+    :param where: what changes it, for the error message.
+    :raises ConfigError: it cannot fly.
+    """
+    try:
+        return base.model_copy(update=changes)
+    except ValidationError as error:
+        reason = explain(error, Vehicle)
+        raise ConfigError(f"{where}: some vehicles could not fly ({reason})") from None
 
 
 @compiled

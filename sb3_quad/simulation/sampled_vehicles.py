@@ -30,7 +30,6 @@ def sample_vehicles(
     for number, column in enumerate(batch.vehicles.T):
         # The parameters of this vehicle, by their names
         p = P._make(column)
-        hover = p.hover_thrust
         roll, pitch = column[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4)
         changes = {
             "name": f"sampled_{seed}_{number}",
@@ -44,9 +43,9 @@ def sample_vehicles(
             "motor_gain_down": p.motor_gain_down,
             "motor_integration": "exact",
             "drag": (p.drag_x, p.drag_y, p.drag_z),
-            "thrust_limits": (
-                (p.thrust_middle - p.thrust_half_range) / hover,
-                (p.thrust_middle + p.thrust_half_range) / hover,
+            "rotor_thrust_limits": (
+                p.thrust_middle - p.thrust_half_range,
+                p.thrust_middle + p.thrust_half_range,
             ),
             "collision_radius": p.collision_radius,
         }

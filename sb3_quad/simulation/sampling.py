@@ -16,7 +16,7 @@ from sb3_quad.simulation.random import (
     WIND,
     uniforms,
 )
-from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, R, V, between
+from sb3_quad.simulation.randomization import FIXED, N, R, V, between
 from sb3_quad.simulation.state import P, W, X, first_rows, row_slices
 from sb3_quad.simulation.tasks import T
 from sb3_quad.simulation.vehicle_distribution import arm_length, sample_from_distribution
@@ -137,18 +137,15 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
         _sample_vector(table, R.force, is_disturbed, weight, u[1:4], wrench[W.force_world :, i])
         _sample_vector(table, R.torque, is_disturbed, leverage, u[4:7], wrench[W.torque_world :, i])
     if gust.shape[1] > 0:
-        unit = weight if table[R.gust_by_weight] != 0.0 else 1.0
-        _begin_gusts(
-            table, R.gust_std, unit * is_disturbed, uniforms(streams, i, 4, GUST), gust[:, i]
-        )
-
+        u = uniforms(streams, i, 4, GUST)
+        _begin_gusts(table, R.gusts, is_disturbed, weight, u, gust[:, i])
     if table[R.wind + 2] != FIXED or wind_gust.shape[1] > 0:
         u = uniforms(streams, i, 5, WIND)
         if table[R.wind + 2] != FIXED:
             # The wind is horizontal unless its direction is given.
             _sample_vector(table, R.wind, is_disturbed, 1.0, (u[8], 0.5, u[9]), wind[:, i])
         if wind_gust.shape[1] > 0:
-            _begin_gusts(table, R.wind_std, is_disturbed, u, wind_gust[:, i])
+            _begin_gusts(table, R.wind_gusts, is_disturbed, 1.0, u, wind_gust[:, i])
     if has_own_vehicle:
         _randomize_vehicle(i, streams, table, vehicles)
 
@@ -213,14 +210,16 @@ def _randomize_vehicle(i, streams, table, vehicles):
 
 
 @compiled
-def _begin_gusts(table, k, unit, u, gust):
+def _begin_gusts(table, k, share, unit, u, gust):
     """Set how the gusts of an episode are, (GUST_SIZE,), and sample the first, in place.
 
-    :param k: where their numbers begin.
+    :param k: where their numbers begin; ``share`` and ``unit`` as of :func:`_sample_vector`.
     :param u: eight uniforms.
     """
-    std = unit * between(table, k, u[0], 0.0)
-    keeps = table[k + len(FIXED_NUMBERS)]
+    std = share * between(table, k + N.std, u[0], 0.0)
+    if table[k + N.by_weight] != 0.0:
+        std *= unit
+    keeps = table[k + N.keeps]
     gust[G.keeps] = keeps
     gust[G.adds] = std * math.sqrt(1.0 - keeps * keeps)
     # The first gust has the deviation of all later ones.

@@ -9,7 +9,7 @@ and ``torque_body`` (N m), three rows each, all at the centre of mass.
 """
 
 from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
@@ -131,17 +131,15 @@ class QuadcopterState:
 
     def copy(self) -> "QuadcopterState":
         """Return a state with its own memory, unaffected by later flight."""
-        return self._apply(np.copy)
+        # Joining copies, also where there is one part.
+        return QuadcopterState.concatenate([self])
 
     def rows(self, rows: slice) -> "QuadcopterState":
         """Return some of the vehicles, as views."""
-        return self._apply(lambda array: array[:, rows])
-
-    def _apply(self, change: Callable[[FloatArray], FloatArray]) -> "QuadcopterState":
-        others = [
-            array if array is None else change(array) for array in (self.vehicles, self.wrench)
-        ]
-        return QuadcopterState(change(self.array), *others)
+        others = []
+        for array in (self.vehicles, self.wrench):
+            others.append(None if array is None else array[:, rows])
+        return QuadcopterState(self.array[:, rows], *others)
 
     @staticmethod
     def concatenate(states: Sequence["QuadcopterState"]) -> "QuadcopterState":

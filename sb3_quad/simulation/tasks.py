@@ -14,6 +14,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.state import first_rows
 
 Length = Annotated[float, Field(ge=0, le=1e6)]  # m
@@ -194,16 +195,12 @@ def resolve_tasks(
         raise ConfigError(
             "task: the mixture names no task; give at least one, such as {'target_tracking': 1.0}"
         )
-    parameters = np.stack([_resolve(name, TASKS, overrides).parameters() for name in weights])
-    given = list(weights.values())
-    try:
-        shares = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"task: the weights {given} must be numbers") from None
-    if not np.isfinite(shares).all() or (shares < 0).any() or shares.sum() <= 0:
+    shares = per_row("task: the weights", list(weights.values()), len(weights))[0]
+    if (shares < 0).any() or not shares.any():
         raise ConfigError(
-            f"task: the weights {shares.tolist()} must be finite, not negative and not all zero"
+            f"task: the weights {shares.tolist()} must be not negative and not all zero"
         )
+    parameters = np.stack([_resolve(name, TASKS, overrides).parameters() for name in weights])
     cumulative = np.cumsum(shares / shares.sum())
     cumulative[-1] = 1.0
     return parameters, cumulative

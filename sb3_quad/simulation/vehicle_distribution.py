@@ -7,50 +7,31 @@ delay, time steps, gravity.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray
-from sb3_quad.base.validate import Frozen, explain
+from sb3_quad.base.validate import Frozen
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.random import DISTRIBUTION, uniforms
 from sb3_quad.simulation.randomization import (
     FIXED,
-    FIXED_NUMBERS,
+    RANGE,
     NonNegativeRange,
     PositiveRange,
+    Range,
     between,
-    range_numbers,
+    flyable,
+    table_row,
 )
 from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.vehicles.distributions")
-_RANGES = (
-    "mass",
-    "thrust_to_weight",
-    "torque_to_inertia",
-    "motor_time_constant",
-    "moment_thrust_ratio",
-    "least_thrust",
-    "motor_time_constant_down",
-    "drag",
-)
-DISTRIBUTION_NUMBERS = {
-    **dict.fromkeys(_RANGES, len(FIXED_NUMBERS)),
-    "inertia_ratios": 3,
-    "size_deviation": 1,
-}
-"""Numbers of :meth:`VehicleDistribution.numbers`; ratios that are not given are 0."""
-D = first_rows(DISTRIBUTION_NUMBERS)
-# Its ranges are FIXED.
-NO_DISTRIBUTION = np.zeros(sum(DISTRIBUTION_NUMBERS.values()))
 Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
@@ -100,7 +81,7 @@ class VehicleDistribution(Frozen):
             raise ValueError("distribution: must be a name, or the path of a YAML file")
         return {**DISTRIBUTIONS.read(source)[0], **changes}
 
-    def weakest(self, base: Vehicle) -> Vehicle:
+    def hardest(self, base: Vehicle) -> Vehicle:
         """Return the vehicle with the least thrust and the fastest motors, at the base vehicle's
         mass. If it can fly, all can.
 
@@ -115,17 +96,13 @@ class VehicleDistribution(Frozen):
             "motor_gain": 1.0 / fastest,
             "inertia": self.inertia_ratios or base.inertia,
         }
-        try:
-            return base.model_copy(update=changes)
-        except ValidationError as error:
-            raise ConfigError(f"vehicles: some could not fly ({explain(error, Vehicle)})") from None
+        return flyable(base, changes, "vehicles")
 
     def __str__(self) -> str:
         """Such as ``sampled quadcopters (SI units; mass 0.02 to 5, thrust to weight 1.5 to 5)``."""
         texts = []
-        for name in _RANGES:
-            given = getattr(self, name)
-            if given is not None:
+        for name, given in self:
+            if isinstance(given, Range):
                 texts.append(f"{name.replace('_', ' ')} {given.low:g} to {given.high:g}")
         return f"sampled quadcopters (SI units; {', '.join(texts)})"
 
@@ -133,8 +110,23 @@ class VehicleDistribution(Frozen):
         """Return the numbers that :func:`sample_from_distribution` reads, in the order of
         ``DISTRIBUTION_NUMBERS``.
         """
-        ranges = [range_numbers(getattr(self, name)) for name in _RANGES]
-        return np.hstack([*ranges, self.inertia_ratios or np.zeros(3), self.size_deviation])
+        parts: dict[str, Sequence[float]] = {"size_deviation": [self.size_deviation]}
+        for name, given in self:
+            if isinstance(given, Range):
+                parts[name] = given.numbers()
+        if self.inertia_ratios is not None:
+            parts["inertia_ratios"] = self.inertia_ratios
+        return table_row(DISTRIBUTION_NUMBERS, parts)
+
+
+DISTRIBUTION_NUMBERS = dict.fromkeys(VehicleDistribution.model_fields, RANGE) | {
+    "inertia_ratios": 3,
+    "size_deviation": 1,
+}
+"""Numbers of :meth:`VehicleDistribution.numbers`; ratios that are not given are 0."""
+D = first_rows(DISTRIBUTION_NUMBERS)
+# Its ranges are FIXED.
+NO_DISTRIBUTION = table_row(DISTRIBUTION_NUMBERS, {})
 
 
 @compiled

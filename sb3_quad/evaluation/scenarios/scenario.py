@@ -121,7 +121,7 @@ class Scenario(Frozen):
         vehicle = self.flown_vehicle()
         # Of a distribution, the vehicle that can do least decides.
         if self.vehicles is not None:
-            vehicle = self.vehicles.weakest(vehicle)
+            vehicle = self.vehicles.hardest(vehicle)
         self._check_way(vehicle)
         # The task checks the ranges of its own fields.
         try:
@@ -129,7 +129,7 @@ class Scenario(Frozen):
         except ValidationError as error:
             raise ValueError(explain(error, Task)) from None
         if self.randomize is not None:
-            self.randomize.check(vehicle)
+            self.randomize.hardest(vehicle)
             if self.randomize.sets_wrench and self.wrenches:
                 raise ValueError(
                     "randomize: force and torque do not go with wrenches, which replace them"
