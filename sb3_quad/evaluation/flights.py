@@ -206,7 +206,7 @@ def fly_settings(
         pilot = Controller(
             controller,
             ACTIONS,
-            quadcopter_spaces(fleet.observation_size)[0],
+            quadcopter_spaces(fleet.observation.size)[0],
             fleet.true_state,
             deterministic=deterministic,
         )
@@ -226,99 +226,87 @@ def _fly_fleet(
     hooks: Sequence[Hook],
     reward: Reward | None,
 ) -> Flights:
-    observation = fleet.reset(plan.start)
-    control_step = fleet.vehicle.control_step
+    vehicle = fleet.vehicle_list[0]
+    observation = fleet.begin(plan.start)
+    # The state is a live view: copy what later steps need.
     state = fleet.true_state()
-    position = state.position
-    course = Waypoints(plan, state.n)
+    start = state.copy()
+    position = start.position
+    course = Waypoints(plan, fleet.n)
     arrivals = Arrivals(tolerances, course.to_last(state.distance))
-    motion = Motion(state, control_step)
+    motion = Motion(start, vehicle.control_step)
+    if len(plan.waypoints):
+        # A course has no single straight line to deviate from.
+        motion.cross_track_error[:] = np.nan
+    flying = np.ones(fleet.n, bool)  # a flight survives until it is lost
     last = np.zeros_like(fleet.outcome)
-    flights = _at_start(state, last, plan, arrivals, motion, course)
-    if reward is not None:
-        flights.own_reward[:] = 0.0
-    flying = flights.survival  # the same array: a flight survives until it is lost
+    path_length = np.zeros(fleet.n)
+    total = np.zeros(fleet.n)
+    own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
     for hook in hooks:
-        hook.on_start(state, fleet.vehicle)
+        hook.on_start(state, vehicle)
 
     for step in range(1, max_steps + 1):
-        time = step * control_step
+        time = step * vehicle.control_step
         # Disturbances of the plan begin and end between two control steps.
         if step - 1 in plan.wrenches:
-            fleet.set_wrench(plan.wrenches[step - 1])
+            fleet.wrench[:] = plan.wrenches[step - 1].T
         try:
             actions = controller.actions(observation, flying)
         except ControllerError as error:
-            raise ControllerError(f"{error}, after {(step - 1) * control_step:.2f} s") from error
+            before = time - vehicle.control_step
+            raise ControllerError(f"{error}, after {before:.2f} s") from error
         for hook in hooks:
-            hook.before_step(state, observation, fleet.wrench, flying)
-        observation, rewards = fleet.step(actions, flying)
-        outcome = fleet.outcome
+            hook.before_step(state, observation, fleet.total_wrench().T, flying)
+        observation, rewards, _ = fleet.step(actions)
         state = fleet.true_state()
 
         # Sums and last values count also for the flights that this step has ended.
-        flights.reward[flying] += rewards[flying]
+        total += np.where(flying, rewards, 0.0)
         if reward is not None:
-            flights.own_reward[flying] += _ask_reward(reward, state, actions)[flying]
+            own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
         way = np.linalg.norm(state.position - position, axis=1)
-        flights.path_length[flying] += way[flying]
-        position = state.position
-        last[flying] = outcome[flying]
-        flights.flown[flying] = time
-        arrivals.see(time, course.to_last(outcome["distance"]), flying)
+        path_length += np.where(flying, way, 0.0)
+        position = state.position.copy()
+        np.copyto(last, fleet.outcome, where=flying)
+        arrivals.see(time, course.to_last(last["distance"]), flying)
 
         # From here on, only the flights that continue count.
-        flying &= outcome["truncated"]
+        flying &= last["truncated"]
         motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
         # Whoever has reached a waypoint sees the next one from the next step on.
-        onward = course.see(time, outcome["distance"], flying)
+        onward = course.see(time, last["distance"], flying)
         if onward.size:
-            observation = fleet.set_targets(onward, course.targets(onward))
+            fleet.set_target(course.targets(onward), onward)
+            observation = fleet.observe()
 
     # A flight that was lost, or that did not get to its last target, has no success and no time
     # after which it stays there.
-    flights.success[~(flying & course.on_last)] = False
-    arrivals.settling_time[:, ~flying] = np.nan
-    flights.final_offset[flying] = (state.position - state.target)[flying]
-    return flights
-
-
-def _at_start(
-    state: QuadcopterState,
-    last: Any,
-    plan: Plan,
-    arrivals: "Arrivals",
-    motion: "Motion",
-    course: "Waypoints",
-) -> Flights:
-    """The metrics before the first step; the other arguments update theirs in place."""
-    n = state.n
-    # A course has no single straight line to deviate from.
-    if len(plan.waypoints):
-        motion.cross_track_error = np.full(n, np.nan)
+    settling_time = np.where(flying, arrivals.settling_time, np.nan)
+    offset = state.position - state.target
     return Flights(
-        success=last["success"],
-        survival=np.ones(n, bool),
+        success=last["success"] & flying & course.on_last,
+        survival=flying,
         collision=last["collision"],
-        reward=np.zeros(n),
-        own_reward=np.full(n, np.nan),
+        reward=total,
+        own_reward=own_total,
         length=last["length"],
-        flown=np.zeros(n),
-        time_to=dict(zip(arrivals.tolerances, arrivals.time_to, strict=True)),
-        settling_time=dict(zip(arrivals.tolerances, arrivals.settling_time, strict=True)),
+        flown=last["length"] * vehicle.control_step,
+        time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
+        settling_time=dict(zip(tolerances, settling_time, strict=True)),
         overshoot=arrivals.overshoot,
-        path_length=np.zeros(n),
+        path_length=path_length,
         final_error=last["distance"],
-        final_offset=np.full((n, 3), np.nan),
+        final_offset=np.where(flying[:, None], offset, np.nan),
         recovery_time=motion.recovery_time,
         cross_track_error=motion.cross_track_error,
         waypoint_times=course.times,
-        start=state.array[:13].T,
-        target=state.target,
+        start=start.array[:13].T,
+        target=start.target,
     )
 
 
@@ -375,25 +363,27 @@ class Arrivals:
 class Waypoints:
     """The waypoints of n flights: which of them each has reached, and when.
 
-    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet. ``on_last`` (n,):
-    whether the present target is the last one; always without waypoints.
+    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet.
     """
 
     def __init__(self, plan: Plan, n: int) -> None:
         self._plan = plan
         self._next = np.zeros(n, dtype=np.int64)
-        self.times = np.full((n, len(plan.waypoints)), np.nan)
-        self.on_last = np.full(n, len(plan.waypoints) <= 1)
+        self._count = len(plan.waypoints)
+        self.times = np.full((n, self._count), np.nan)
 
     def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
-        count = len(self._plan.waypoints)
-        near = distance <= self._plan.radius
-        reached = np.flatnonzero(flying & near & (self._next < count))
+        near = flying & (distance <= self._plan.radius)
+        reached = np.flatnonzero(near & (self._next < self._count))
         self.times[reached, self._next[reached]] = time
         self._next[reached] += 1
-        self.on_last |= self._next >= count - 1
-        return reached[self._next[reached] < count]
+        return reached[self._next[reached] < self._count]
+
+    @property
+    def on_last(self) -> BoolArray:
+        """Whether the present target is the last one, (n,); always without waypoints."""
+        return self._next >= self._count - 1
 
     def to_last(self, distance: FloatArray) -> FloatArray:
         """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
