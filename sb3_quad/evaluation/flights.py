@@ -233,13 +233,15 @@ def _fly_fleet(
     start = state.copy()
     position = start.position
     course = Waypoints(plan, fleet.n)
-    arrivals = Arrivals(tolerances, course.to_last(state.distance))
+    distance = state.distance
+    arrivals = Arrivals(tolerances, course.to_last(distance))
     motion = Motion(start, vehicle.control_step)
     if len(plan.waypoints):
         # A course has no single straight line to deviate from.
         motion.cross_track_error[:] = np.nan
     flying = np.ones(fleet.n, bool)  # a flight survives until it is lost
-    last = np.zeros_like(fleet.outcome)
+    collision = np.zeros(fleet.n, bool)
+    length = np.zeros(fleet.n, np.int64)
     path_length = np.zeros(fleet.n)
     total = np.zeros(fleet.n)
     own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
@@ -261,46 +263,49 @@ def _fly_fleet(
         observation, rewards, _ = fleet.step(actions)
         state = fleet.true_state()
 
-        # Sums and last values count also for the flights that this step has ended.
+        # This step counts also for the flights that it has ended; their distance stays.
+        length += flying
+        collision |= flying & fleet.outcome["collision"]
+        np.copyto(distance, fleet.outcome["distance"], where=flying)
         total += np.where(flying, rewards, 0.0)
         if reward is not None:
             own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
         way = np.linalg.norm(state.position - position, axis=1)
         path_length += np.where(flying, way, 0.0)
         position = state.position.copy()
-        np.copyto(last, fleet.outcome, where=flying)
-        arrivals.see(time, course.to_last(last["distance"]), flying)
+        arrivals.see(time, course.to_last(distance))
 
         # From here on, only the flights that continue count.
-        flying &= last["truncated"]
+        flying &= fleet.outcome["truncated"]
         motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
-        # Whoever has reached a waypoint sees the next one from the next step on.
-        onward = course.see(time, last["distance"], flying)
-        if onward.size:
-            fleet.set_target(course.targets(onward), onward)
-            observation = fleet.observe()
+        if len(plan.waypoints):
+            # Whoever has reached a waypoint sees the next one from the next step on.
+            onward = course.see(time, distance, flying)
+            if onward.size:
+                fleet.set_target(course.targets(onward), onward)
+                observation = fleet.observe()
 
     # A flight that was lost, or that did not get to its last target, has no success and no time
     # after which it stays there.
     settling_time = np.where(flying, arrivals.settling_time, np.nan)
     offset = state.position - state.target
     return Flights(
-        success=last["success"] & flying & course.on_last,
+        success=fleet.outcome["success"] & flying & course.on_last,
         survival=flying,
-        collision=last["collision"],
+        collision=collision,
         reward=total,
         own_reward=own_total,
-        length=last["length"],
-        flown=last["length"] * vehicle.control_step,
+        length=length,
+        flown=length * vehicle.control_step,
         time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
         settling_time=dict(zip(tolerances, settling_time, strict=True)),
         overshoot=arrivals.overshoot,
         path_length=path_length,
-        final_error=last["distance"],
+        final_error=distance,
         final_offset=np.where(flying[:, None], offset, np.nan),
         recovery_time=motion.recovery_time,
         cross_track_error=motion.cross_track_error,
@@ -348,16 +353,21 @@ class Arrivals:
             self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
         self.overshoot = np.where(np.isnan(self._first), np.nan, distance)
 
-    def see(self, time: float, distance: FloatArray, flying: BoolArray) -> None:
-        """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s."""
+    def see(self, time: float, distance: FloatArray) -> None:
+        """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s.
+
+        Of a flight that was lost it is the last one.
+        """
         inside = distance <= self._limits
-        entered = inside & flying
-        self.time_to[np.isnan(self.time_to) & entered] = time
-        # Who is outside has to settle again.
-        self.settling_time[~inside & flying] = np.nan
-        self.settling_time[np.isnan(self.settling_time) & entered] = time
-        arrived = flying & ~np.isnan(self._first)
-        self.overshoot[arrived] = np.fmax(self.overshoot, distance)[arrived]
+        np.fmin(self.time_to, np.where(inside, time, np.nan), out=self.time_to)
+        self.settling_time = _since(self.settling_time, inside, time)
+        arrived = ~np.isnan(self._first)
+        np.fmax(self.overshoot, distance, out=self.overshoot, where=arrived)
+
+
+def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
+    """Return since when a condition has held, given that it ``holds`` now; else NaN."""
+    return np.where(holds, np.fmin(times, time), np.nan)
 
 
 class Waypoints:
@@ -387,6 +397,8 @@ class Waypoints:
 
     def to_last(self, distance: FloatArray) -> FloatArray:
         """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
+        if not self._count:
+            return distance
         return np.where(self.on_last, distance, np.inf)
 
     def targets(self, rows: IntArray) -> FloatArray:
@@ -413,27 +425,25 @@ class Motion:
         self._control_step = control_step
         self._start = state.position
         self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
-        self._since = np.zeros(state.n)  # when the present stable time began
-        self._stable = np.ones(state.n, bool)
+        self._stable_since = np.zeros(state.n)  # NaN while it is not stable
         self.recovery_time = np.full(state.n, np.nan)
         self.cross_track_error = np.where(length[:, 0] > 0.0, 0.0, np.nan)
-        self.see(0, state, self._stable)
+        self.see(0, state, np.ones(state.n, bool))
 
     def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
         """See the state after control step ``step``; only the flights (n,) that continue count."""
         time = step * self._control_step
-        was_stable = self._stable
         # The cosine of the tilt is the z-z element of the rotation matrix.
         x, y = state.quaternion.T[1:3]
         upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
-        self._stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
-        self._since[self._stable & ~was_stable] = time
+        stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
+        self._stable_since = _since(self._stable_since, stable, time)
         # Half a step of tolerance, since times are multiples of steps only up to rounding.
-        held = time - self._since > HOLD - 0.5 * self._control_step
-        recovered = flying & self._stable & held & np.isnan(self.recovery_time)
-        self.recovery_time[recovered] = self._since[recovered]
+        held = flying & (time - self._stable_since > HOLD - 0.5 * self._control_step)
+        np.fmin(self.recovery_time, self._stable_since, out=self.recovery_time, where=held)
         # The part of the way flown that is across the line.
         flown = state.position - self._start
         along = (flown * self._direction).sum(axis=1, keepdims=True) * self._direction
         across = np.linalg.norm(flown - along, axis=1)
-        self.cross_track_error[flying] = np.maximum(self.cross_track_error, across)[flying]
+        error = self.cross_track_error
+        np.maximum(error, across, out=error, where=flying)
