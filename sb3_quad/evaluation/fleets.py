@@ -71,7 +71,7 @@ class PyBulletFleet(Fleet):
 
     def step(self, actions: AnyArray) -> StepResult:
         # The others have ended; their environments may not be stepped.
-        for row in np.flatnonzero(self.outcome["truncated"]):
+        for row in np.flatnonzero(self.outcome["truncated"]).tolist():
             env = self._envs[row]
             env.batch.wrench[:, 0] = self.wrench[:, row]
             env.step(actions[row])

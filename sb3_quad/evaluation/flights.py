@@ -8,7 +8,6 @@ episode, 15 s, not only of the way until arrival.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from operator import attrgetter, itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -89,12 +88,10 @@ class Flights:
         """Join several parts in their order."""
         columns: StrDict = {}
         for name, first in vars(parts[0]).items():
-            values = [*map(attrgetter(name), parts)]
+            values = [getattr(part, name) for part in parts]
             if isinstance(first, Mapping):
-                columns[name] = {}
-                for tolerance in first:
-                    arrays = [*map(itemgetter(tolerance), values)]
-                    columns[name][tolerance] = np.concatenate(arrays)
+                arrays = zip(*[value.values() for value in values], strict=True)
+                columns[name] = dict(zip(first, map(np.concatenate, arrays), strict=True))
             else:
                 columns[name] = np.concatenate(values)
         return Flights(**columns)
@@ -203,12 +200,9 @@ def fly_settings(
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     with closing(FLEETS[backend](seeds, settings)) as fleet:
+        observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
-            controller,
-            ACTIONS,
-            quadcopter_spaces(fleet.observation.size)[0],
-            fleet.true_state,
-            deterministic=deterministic,
+            controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic
         )
         if isinstance(reward, type):
             # A reward that remembers, such as the last actions, begins afresh with these episodes.
@@ -300,7 +294,7 @@ def _fly_fleet(
         reward=total,
         own_reward=own_total,
         length=length,
-        flown=length * vehicle.control_step,
+        flown=length.astype(np.float64) * vehicle.control_step,
         time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
         settling_time=dict(zip(tolerances, settling_time, strict=True)),
         overshoot=arrivals.overshoot,
