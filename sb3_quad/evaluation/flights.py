@@ -337,7 +337,6 @@ class Arrivals:
     """
 
     def __init__(self, tolerances: Sequence[float], distance: FloatArray) -> None:
-        self.tolerances = tolerances
         self._limits = np.array(tolerances)[:, None]
         self.time_to = np.where(distance <= self._limits, 0.0, np.nan)
         self.settling_time = self.time_to.copy()

@@ -59,9 +59,9 @@ NOTHING = Cell()
 Cells = Mapping[Row, Cell]  # by the rows they stand in
 
 
-def time_row(tolerance: float | str) -> Row:
+def time_row(tolerance: float) -> Row:
     """Return the row with the time to a tolerance, m."""
-    return Row(f"mean time to {float(tolerance):g} m", "s", verb="arrive")
+    return Row(f"mean time to {tolerance:g} m", "s", verb="arrive")
 
 
 def settling_row(tolerance: float) -> Row:
@@ -259,7 +259,7 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         # Only the main ones and those of references; a plot shows the others.
         kept = {min(tolerances), *MAIN_TOLERANCES}
         for reference in scenario.reference.values():
-            kept |= {*map(float, reference.time_to)}
+            kept |= {*reference.time_to}
         tolerances &= kept
     settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
     times = map(time_row, sorted(tolerances))
