@@ -211,6 +211,7 @@ def fly_settings(
         return _fly_fleet(fleet, pilot, plan or Plan(), steps, tolerances, hooks, reward)
 
 
+# It is long because a split would hand over a dozen arrays that each step changes.
 def _fly_fleet(
     fleet: Fleet,
     controller: Controller,
