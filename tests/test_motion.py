@@ -54,11 +54,10 @@ def test_the_cross_track_error_is_across_the_line_only():
 
 
 def test_arrival_and_settling_times_are_those_of_each_tolerance():
-    everyone = np.ones(3, dtype=np.bool_)
     arrivals = Arrivals((0.1, 1.0), np.array([0.05, 2.0, 2.0]))
     # The first leaves 0.1 m and returns, the second overshoots within 1 m, the third never arrives.
     for step, distance in enumerate([[0.3, 0.5, 1.5], [0.08, 0.9, 1.2], [0.02, 0.09, 1.1]], 1):
-        arrivals.see(float(step), np.array(distance), everyone)
+        arrivals.see(float(step), np.array(distance))
     np.testing.assert_array_equal(arrivals.time_to, [[0, 3, np.nan], [0, 1, np.nan]])
     np.testing.assert_array_equal(arrivals.settling_time, [[2, 3, np.nan], [0, 1, np.nan]])
     np.testing.assert_array_equal(arrivals.overshoot, [0.3, 0.09, np.nan])

@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +55,7 @@ def hit():
     wrenches = sample_wrenches(
         [Wrench(**HIT)], load_vehicle("itm"), 1500, [np.random.default_rng(0)]
     )
-    plan = replace(setting.plan(0), wrenches=wrenches)
+    plan = setting.plan(0)._replace(wrenches=wrenches)
     return flown(setting._replace(plan=lambda seed: plan), 60)
 
 

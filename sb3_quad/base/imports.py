@@ -32,10 +32,17 @@ def lazy_names(
     return get, names
 
 
-def import_name(text: str) -> Any:
-    """Import ``package.module:name`` or ``package.module.name``, as given by the user."""
-    search_present_folder(text.partition(":")[0])
-    return pkgutil.resolve_name(text)
+def import_name(text: str, where: str) -> Any:
+    """Import ``package.module:name``, ``package.module.name`` or a module, as given by the user.
+
+    :param where: The flag or key that names it, for the error message.
+    :raises ConfigError: It cannot be imported.
+    :raises MissingExtra: It needs a package that is not installed.
+    """
+    # The module's own code may raise anything.
+    with raised_as(ConfigError, f"{where} {text}: cannot be imported"):
+        search_present_folder(text.partition(":")[0])
+        return pkgutil.resolve_name(text)
 
 
 def search_present_folder(module: str) -> None:
@@ -55,10 +62,7 @@ def import_packages(packages: Iterable[str], where: str) -> None:
     :raises ConfigError: A module cannot be imported.
     """
     for package in packages:
-        # The module's own code may raise anything.
-        with raised_as(ConfigError, f"{where} {package}: cannot be imported"):
-            search_present_folder(package)
-            importlib.import_module(package)
+        import_name(package, where)
 
 
 def require(module: str, extra: str, what: str) -> Any:

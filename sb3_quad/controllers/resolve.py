@@ -66,6 +66,4 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         raise ConfigError(
             unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory"
         )
-    # The module may do anything when it is imported.
-    with raised_as(ConfigError, f"{kind} {text}: cannot be imported"):
-        return import_name(location)
+    return import_name(location, kind)

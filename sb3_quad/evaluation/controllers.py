@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
@@ -49,12 +49,11 @@ class ControllerSpec:
 
         :raises ConfigError: see :func:`agent_settings`.
         """
-        if not self.is_zip:
-            return None
-        settings, source = agent_settings(self.spec)
-        if source is None:
-            return None
-        return settings
+        if self.is_zip:
+            settings, source = agent_settings(self.spec)
+            if source is not None:
+                return settings
+        return None
 
     @property
     def observed(self) -> StrDict:
@@ -93,18 +92,15 @@ def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
 
     :raises ConfigError: two controllers of the same label.
     """
-    specs = [*map(_parse, texts)]
-    files = set[str]()
-    for spec in specs:
+    # Labels that differ may still be the same as names of files.
+    specs: dict[str, ControllerSpec] = {}
+    for spec in map(_parse, texts):
         who = f"controller {spec.label!r}"
         if not spec.label.isprintable():
             raise ConfigError(f"{who}: holds control characters; label it: name={spec.spec}")
-        # Labels that differ may still be the same as names of files.
-        file = file_name(spec.label)
-        if file in files:
+        if specs.setdefault(file_name(spec.label), spec) is not spec:
             raise ConfigError(f"{who}: two have this label; label them: name={spec.spec}")
-        files.add(file)
-    return specs
+    return [*specs.values()]
 
 
 def controller_record(spec: ControllerSpec) -> ControllerRecord:
@@ -112,16 +108,18 @@ def controller_record(spec: ControllerSpec) -> ControllerRecord:
 
     :raises ConfigError: an unknown name, a missing file, a module that cannot be imported.
     """
-    record = ControllerRecord(label=spec.label, spec=spec.spec, kind=spec.kind)
     if not spec.is_zip:
         # Import it now, so that an error shows before anything flies.
         import_factory(spec.spec, "controller")
-        return record
+        return ControllerRecord(label=spec.label, spec=spec.spec, kind=spec.kind)
     path = Path(spec.spec)
-    algorithm = saved_algorithm(path)
-    content = hashlib.sha256(path.read_bytes()).hexdigest()
-    changes = {"spec": path.name, "algorithm": algorithm, "content": content}
-    return record.model_copy(update=changes)
+    return ControllerRecord(
+        label=spec.label,
+        spec=path.name,
+        kind=spec.kind,
+        algorithm=saved_algorithm(path),
+        content=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )
 
 
 def load_reward(reward: OwnReward) -> Reward | None:
@@ -132,9 +130,7 @@ def load_reward(reward: OwnReward) -> Reward | None:
     """
     if not isinstance(reward, str):
         return reward
-    # The module may do anything when it is imported.
-    with raised_as(ConfigError, f"reward {reward}: cannot be imported as package.module:function"):
-        function = import_name(reward)
+    function = import_name(reward, "reward")
     if not callable(function):
         raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
     return function  # type: ignore[no-any-return]
@@ -143,15 +139,8 @@ def load_reward(reward: OwnReward) -> Reward | None:
 def _parse(text: str) -> ControllerSpec:
     label, equals, spec = text.partition("=")
     # An equals sign after a slash belongs to the path.
-    if equals and not {"/", "\\"} & {*label}:
-        if not label or not spec:
-            raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
-        return ControllerSpec(label, agent_path(spec))
-    spec = agent_path(text)
-    label = spec
-    # A name or a run folder has become a path: its last part is the label.
-    if spec != text:
-        label = Path(text).name
-    elif spec.endswith(".zip"):
-        label = Path(spec).stem
-    return ControllerSpec(label, spec)
+    if not equals or {"/", "\\"} & {*label}:
+        return ControllerSpec(Path(text).name.removesuffix(".zip"), agent_path(text))
+    if not label or not spec:
+        raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
+    return ControllerSpec(label, agent_path(spec))

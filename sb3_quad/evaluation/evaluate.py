@@ -47,7 +47,6 @@ PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
 RECORDED_FIXED = 24
 RECORDED_RANDOM = 8
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, the last one done
-Name = tuple[str, str]  # of a job and its entry: scenario and controller
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Job:
     reward: OwnReward
 
     @property
-    def name(self) -> Name:
+    def name(self) -> tuple[str, str]:
         """Scenario and controller, as :class:`~sb3_quad.evaluation.results.Entry` has it."""
         return self.scenario.name, self.spec.label
 
@@ -141,8 +140,8 @@ def evaluate(
     if jobs:
         make_folder(place, "results folder", "-o")
         with locked(place, "folder"):
-            done = _resume(place, results.digest, jobs, overwrite)
-            return _fly_missing(place, results, jobs, done, workers, progress, executor, address)
+            results.entries.extend(_resume(place, results.digest, jobs, overwrite))
+            return _fly_missing(place, results, jobs, workers, progress, executor, address)
     return results
 
 
@@ -152,18 +151,16 @@ def _load_controllers(
     """Load the controllers; report those that fly another vehicle than they were trained on."""
     records = {}
     failures = []
-    vehicles: dict[str, str] = {}
+    vehicles = {}
     for spec in specs:
         try:
             record = controller_record(spec)
-            notices: dict[str, None] = {}
-            for scenario in suite.scenarios:
-                notices[spec.notice(_vehicle(spec, scenario))] = None
+            # Several scenarios give the same notice, or an empty one: report it once.
+            notices = {spec.notice(_vehicle(spec, scenario)): "" for scenario in suite.scenarios}
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
             continue
         records[spec] = record
-        # Several scenarios give the same notice, or an empty one: report it once.
         for notice in filter(None, notices):
             report(notice)
         # All fly the vehicle that a scenario names.
@@ -182,44 +179,41 @@ def _fly_missing(
     place: Path,
     results: Results,
     jobs: Sequence[Job],
-    done: dict[Name, Entry],
     workers: int,
     progress: Progress,
     executor: str,
     address: str | None,
 ) -> Results:
-    """Fly the jobs that are not done, and write everything into the folder."""
+    """Fly the jobs without an entry, and write everything into the folder."""
+    # Workers finish in any order; the entries stand in that of the suite.
+    order = [job.name for job in jobs]
+    done = {entry.name for entry in results.entries}
     missing = [job for job in jobs if job.name not in done]
-    failures = [*results.failures]
     progress(len(done), len(jobs), "")
     pool: Any = nullcontext()
     if executor != "local" or min(workers, len(missing)) > 1:
         pool = start_executor(executor, workers, address)
+    unfinished = results.model_copy(update={"finished": False})
     with pool as working:
         for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
             if isinstance(outcome, Failure):
-                failures.append(outcome)
+                results.failures.append(outcome)
             else:
-                done[job.name], arrays = outcome
-                write_arrays(place / done[job.name].flights, compressed=True, **arrays)
-            # After each job, so that an interrupted evaluation can resume.
-            _write(place, results, jobs, done, finished=False)
+                entry, arrays = outcome
+                write_arrays(place / entry.flights, compressed=True, **arrays)
+                results.entries.append(entry)
+                results.entries.sort(key=lambda entry: order.index(entry.name))
+                # After each job, so that an interrupted evaluation can resume.
+                _write(place, unfinished)
             progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
-    results = results.model_copy(update={"failures": failures})
-    return _write(place, results, jobs, done, finished=True)
-
-
-def _write(
-    place: Path, results: Results, jobs: Sequence[Job], done: Mapping[Name, Entry], finished: bool
-) -> Results:
-    # Workers finish in any order; the entries stand in that of the suite.
-    entries = [done[job.name] for job in jobs if job.name in done]
-    results = results.model_copy(update={"entries": entries, "finished": finished})
-    if entries:
-        if finished:
-            write_episodes(place, entries)
-        write_text(place / RESULTS, results.model_dump_json(indent=2))
+    if results.entries:
+        write_episodes(place, results.entries)
+        _write(place, results)
     return results
+
+
+def _write(place: Path, results: Results) -> None:
+    write_text(place / RESULTS, results.model_dump_json(indent=2))
 
 
 def fly_scenario(
@@ -318,7 +312,7 @@ def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
     return first_vehicle(spec.own.vehicle)
 
 
-def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> dict[Name, Entry]:
+def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> list[Entry]:
     """Return the entries that an interrupted call of the same evaluation has left.
 
     A finished one has flown all, so that its table can be shown again. Jobs that may not repeat
@@ -330,22 +324,22 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
     if not (folder / RESULTS).is_file():
         for name in WRITTEN:
             refuse_existing(folder / name, overwrite)
-        return {}
+        return []
     before = load_results(folder)
-    if not overwrite:
-        kept = {job.name for job in jobs if job.repeats}
-        must_repeat = before.finished and len(kept) < len(jobs)
-        if before.digest != digest or must_repeat:
-            raise ConfigError(
-                f"{folder}: holds results already; give another folder with -o,"
-                " or remove them with --overwrite"
-            )
-        return {entry.name: entry for entry in before.entries if entry.name in kept}
-    # Start from scratch: all numbers in a folder are those of one command.
-    for name in WRITTEN:
-        (folder / name).unlink(missing_ok=True)
-    shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
-    return {}
+    if overwrite:
+        # Start from scratch: all numbers in a folder are those of one command.
+        for name in WRITTEN:
+            (folder / name).unlink(missing_ok=True)
+        shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
+        return []
+    kept = {job.name for job in jobs if job.repeats}
+    must_repeat = before.finished and len(kept) < len(jobs)
+    if before.digest != digest or must_repeat:
+        raise ConfigError(
+            f"{folder}: holds results already; give another folder with -o,"
+            " or remove them with --overwrite"
+        )
+    return [entry for entry in before.entries if entry.name in kept]
 
 
 def _digest(jobs: Sequence[Job], records: Mapping[ControllerSpec, ControllerRecord]) -> str:

@@ -51,9 +51,8 @@ class Recorder(Hook):
         self._control_step = vehicle.control_step
         self._stride = max(1, round(1.0 / (SAMPLE_RATE * vehicle.control_step)))
         self._log: list[Arrays] = []
-        m = min(self._m, state.n)
-        self._samples = np.zeros(m, dtype=np.int64)
-        self._wrench = np.zeros((m, 6))
+        self._samples = np.zeros(min(self._m, state.n), dtype=np.int64)
+        self._wrench = np.zeros((len(self._samples), 6))
         # No action has been given at the start.
         no_actions = np.full((state.n, 4), np.nan, np.float32)
         self._sample(state, no_actions, np.ones(state.n, bool))
@@ -83,11 +82,12 @@ class Recorder(Hook):
 
     def _sample(self, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
         rows = flying[: self._m]
-        values = {name: getattr(state, name)[: self._m] for name in STATES}
-        values["action"] = actions[: self._m]
+        values = {name: getattr(state, name) for name in STATES}
+        values["action"] = actions
         values["wrench"] = self._wrench / self._stride
         for name, array in values.items():
-            values[name] = np.where(rows[:, None], array, np.nan).astype(np.float32)
+            shown = np.where(rows[:, None], array[: self._m], np.nan)
+            values[name] = shown.astype(np.float32)
         self._log.append(values)
         self._samples[rows] = len(self._log)
         self._wrench[:] = 0.0
@@ -108,17 +108,19 @@ class Recorder(Hook):
 
 def episode_arrays(flights: Flights, seeds: Sequence[int]) -> Arrays:
     """Return the ``episode_`` arrays, of all flights."""
-    arrays: Arrays = {f"episode_{name}": getattr(flights, name) for name in EPISODES}
     # The first condition that holds decides.
     conditions = [flights.success, flights.survival, flights.collision]
-    arrays["episode_seed"] = np.array(seeds, np.int64)
-    arrays["episode_outcome"] = np.select(conditions, OUTCOMES[:3], OUTCOMES[3])
-    arrays["episode_path"] = flights.path_length
-    arrays["episode_tolerances"] = np.array([*flights.time_to])
-    arrays["episode_time_to"] = np.stack([*flights.time_to.values()], axis=1)
-    arrays["episode_settling_time"] = np.stack([*flights.settling_time.values()], axis=1)
-    arrays["episode_waypoints"] = flights.waypoint_times
-    return arrays
+    arrays = {name: getattr(flights, name) for name in EPISODES}
+    arrays |= {
+        "seed": np.array(seeds, np.int64),
+        "outcome": np.select(conditions, OUTCOMES[:3], OUTCOMES[3]),
+        "path": flights.path_length,
+        "tolerances": np.array([*flights.time_to]),
+        "time_to": np.stack([*flights.time_to.values()], axis=1),
+        "settling_time": np.stack([*flights.settling_time.values()], axis=1),
+        "waypoints": flights.waypoint_times,
+    }
+    return {f"episode_{name}": array for name, array in arrays.items()}
 
 
 read_flights = read_arrays  # by name; with the prefix ``episode_`` only the metrics

@@ -8,7 +8,6 @@ episode, 15 s, not only of the way until arrival.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from operator import attrgetter, itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -89,12 +88,10 @@ class Flights:
         """Join several parts in their order."""
         columns: StrDict = {}
         for name, first in vars(parts[0]).items():
-            values = [*map(attrgetter(name), parts)]
+            values = [getattr(part, name) for part in parts]
             if isinstance(first, Mapping):
-                columns[name] = {}
-                for tolerance in first:
-                    arrays = [*map(itemgetter(tolerance), values)]
-                    columns[name][tolerance] = np.concatenate(arrays)
+                arrays = zip(*[value.values() for value in values], strict=True)
+                columns[name] = dict(zip(first, map(np.concatenate, arrays), strict=True))
             else:
                 columns[name] = np.concatenate(values)
         return Flights(**columns)
@@ -203,12 +200,9 @@ def fly_settings(
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     with closing(FLEETS[backend](seeds, settings)) as fleet:
+        observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
-            controller,
-            ACTIONS,
-            quadcopter_spaces(fleet.observation_size)[0],
-            fleet.true_state,
-            deterministic=deterministic,
+            controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic
         )
         if isinstance(reward, type):
             # A reward that remembers, such as the last actions, begins afresh with these episodes.
@@ -217,6 +211,7 @@ def fly_settings(
         return _fly_fleet(fleet, pilot, plan or Plan(), steps, tolerances, hooks, reward)
 
 
+# It is long because a split would hand over a dozen arrays that each step changes.
 def _fly_fleet(
     fleet: Fleet,
     controller: Controller,
@@ -226,99 +221,92 @@ def _fly_fleet(
     hooks: Sequence[Hook],
     reward: Reward | None,
 ) -> Flights:
-    observation = fleet.reset(plan.start)
-    control_step = fleet.vehicle.control_step
+    vehicle = fleet.vehicle_list[0]
+    observation = fleet.begin(plan.start)
+    # The state is a live view: copy what later steps need.
     state = fleet.true_state()
-    position = state.position
-    course = Waypoints(plan, state.n)
-    arrivals = Arrivals(tolerances, course.to_last(state.distance))
-    motion = Motion(state, control_step)
-    last = np.zeros_like(fleet.outcome)
-    flights = _at_start(state, last, plan, arrivals, motion, course)
-    if reward is not None:
-        flights.own_reward[:] = 0.0
-    flying = flights.survival  # the same array: a flight survives until it is lost
+    start = state.copy()
+    position = start.position
+    course = Waypoints(plan, fleet.n)
+    distance = state.distance
+    arrivals = Arrivals(tolerances, course.to_last(distance))
+    motion = Motion(start, vehicle.control_step)
+    if len(plan.waypoints):
+        # A course has no single straight line to deviate from.
+        motion.cross_track_error[:] = np.nan
+    flying = np.ones(fleet.n, bool)  # a flight survives until it is lost
+    collision = np.zeros(fleet.n, bool)
+    length = np.zeros(fleet.n, np.int64)
+    path_length = np.zeros(fleet.n)
+    total = np.zeros(fleet.n)
+    own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
     for hook in hooks:
-        hook.on_start(state, fleet.vehicle)
+        hook.on_start(state, vehicle)
 
     for step in range(1, max_steps + 1):
-        time = step * control_step
+        time = step * vehicle.control_step
         # Disturbances of the plan begin and end between two control steps.
         if step - 1 in plan.wrenches:
-            fleet.set_wrench(plan.wrenches[step - 1])
+            fleet.wrench[:] = plan.wrenches[step - 1].T
         try:
             actions = controller.actions(observation, flying)
         except ControllerError as error:
-            raise ControllerError(f"{error}, after {(step - 1) * control_step:.2f} s") from error
+            before = time - vehicle.control_step
+            raise ControllerError(f"{error}, after {before:.2f} s") from error
         for hook in hooks:
-            hook.before_step(state, observation, fleet.wrench, flying)
-        observation, rewards = fleet.step(actions, flying)
-        outcome = fleet.outcome
+            hook.before_step(state, observation, fleet.total_wrench().T, flying)
+        observation, rewards, _ = fleet.step(actions)
         state = fleet.true_state()
 
-        # Sums and last values count also for the flights that this step has ended.
-        flights.reward[flying] += rewards[flying]
+        # This step counts also for the flights that it has ended; their distance stays.
+        length += flying
+        collision |= flying & fleet.outcome["collision"]
+        np.copyto(distance, fleet.outcome["distance"], where=flying)
+        total += np.where(flying, rewards, 0.0)
         if reward is not None:
-            flights.own_reward[flying] += _ask_reward(reward, state, actions)[flying]
+            own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
         way = np.linalg.norm(state.position - position, axis=1)
-        flights.path_length[flying] += way[flying]
-        position = state.position
-        last[flying] = outcome[flying]
-        flights.flown[flying] = time
-        arrivals.see(time, course.to_last(outcome["distance"]), flying)
+        path_length += np.where(flying, way, 0.0)
+        position = state.position.copy()
+        arrivals.see(time, course.to_last(distance))
 
         # From here on, only the flights that continue count.
-        flying &= outcome["truncated"]
+        flying &= fleet.outcome["truncated"]
         motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
-        # Whoever has reached a waypoint sees the next one from the next step on.
-        onward = course.see(time, outcome["distance"], flying)
-        if onward.size:
-            observation = fleet.set_targets(onward, course.targets(onward))
+        if len(plan.waypoints):
+            # Whoever has reached a waypoint sees the next one from the next step on.
+            onward = course.see(time, distance, flying)
+            if onward.size:
+                fleet.set_target(course.targets(onward), onward)
+                observation = fleet.observe()
 
     # A flight that was lost, or that did not get to its last target, has no success and no time
     # after which it stays there.
-    flights.success[~(flying & course.on_last)] = False
-    arrivals.settling_time[:, ~flying] = np.nan
-    flights.final_offset[flying] = (state.position - state.target)[flying]
-    return flights
-
-
-def _at_start(
-    state: QuadcopterState,
-    last: Any,
-    plan: Plan,
-    arrivals: "Arrivals",
-    motion: "Motion",
-    course: "Waypoints",
-) -> Flights:
-    """The metrics before the first step; the other arguments update theirs in place."""
-    n = state.n
-    # A course has no single straight line to deviate from.
-    if len(plan.waypoints):
-        motion.cross_track_error = np.full(n, np.nan)
+    settling_time = np.where(flying, arrivals.settling_time, np.nan)
+    offset = state.position - state.target
     return Flights(
-        success=last["success"],
-        survival=np.ones(n, bool),
-        collision=last["collision"],
-        reward=np.zeros(n),
-        own_reward=np.full(n, np.nan),
-        length=last["length"],
-        flown=np.zeros(n),
-        time_to=dict(zip(arrivals.tolerances, arrivals.time_to, strict=True)),
-        settling_time=dict(zip(arrivals.tolerances, arrivals.settling_time, strict=True)),
+        success=fleet.outcome["success"] & flying & course.on_last,
+        survival=flying,
+        collision=collision,
+        reward=total,
+        own_reward=own_total,
+        length=length,
+        flown=length.astype(np.float64) * vehicle.control_step,
+        time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
+        settling_time=dict(zip(tolerances, settling_time, strict=True)),
         overshoot=arrivals.overshoot,
-        path_length=np.zeros(n),
-        final_error=last["distance"],
-        final_offset=np.full((n, 3), np.nan),
+        path_length=path_length,
+        final_error=distance,
+        final_offset=np.where(flying[:, None], offset, np.nan),
         recovery_time=motion.recovery_time,
         cross_track_error=motion.cross_track_error,
         waypoint_times=course.times,
-        start=state.array[:13].T,
-        target=state.target,
+        start=start.array[:13].T,
+        target=start.target,
     )
 
 
@@ -348,7 +336,6 @@ class Arrivals:
     """
 
     def __init__(self, tolerances: Sequence[float], distance: FloatArray) -> None:
-        self.tolerances = tolerances
         self._limits = np.array(tolerances)[:, None]
         self.time_to = np.where(distance <= self._limits, 0.0, np.nan)
         self.settling_time = self.time_to.copy()
@@ -358,43 +345,52 @@ class Arrivals:
             self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
         self.overshoot = np.where(np.isnan(self._first), np.nan, distance)
 
-    def see(self, time: float, distance: FloatArray, flying: BoolArray) -> None:
-        """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s."""
+    def see(self, time: float, distance: FloatArray) -> None:
+        """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s.
+
+        Of a flight that was lost it is the last one.
+        """
         inside = distance <= self._limits
-        entered = inside & flying
-        self.time_to[np.isnan(self.time_to) & entered] = time
-        # Who is outside has to settle again.
-        self.settling_time[~inside & flying] = np.nan
-        self.settling_time[np.isnan(self.settling_time) & entered] = time
-        arrived = flying & ~np.isnan(self._first)
-        self.overshoot[arrived] = np.fmax(self.overshoot, distance)[arrived]
+        np.fmin(self.time_to, np.where(inside, time, np.nan), out=self.time_to)
+        self.settling_time = _since(self.settling_time, inside, time)
+        arrived = ~np.isnan(self._first)
+        np.fmax(self.overshoot, distance, out=self.overshoot, where=arrived)
+
+
+def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
+    """Return since when a condition has held, given that it ``holds`` now; else NaN."""
+    return np.where(holds, np.fmin(times, time), np.nan)
 
 
 class Waypoints:
     """The waypoints of n flights: which of them each has reached, and when.
 
-    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet. ``on_last`` (n,):
-    whether the present target is the last one; always without waypoints.
+    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet.
     """
 
     def __init__(self, plan: Plan, n: int) -> None:
         self._plan = plan
         self._next = np.zeros(n, dtype=np.int64)
-        self.times = np.full((n, len(plan.waypoints)), np.nan)
-        self.on_last = np.full(n, len(plan.waypoints) <= 1)
+        self._count = len(plan.waypoints)
+        self.times = np.full((n, self._count), np.nan)
 
     def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
-        count = len(self._plan.waypoints)
-        near = distance <= self._plan.radius
-        reached = np.flatnonzero(flying & near & (self._next < count))
+        near = flying & (distance <= self._plan.radius)
+        reached = np.flatnonzero(near & (self._next < self._count))
         self.times[reached, self._next[reached]] = time
         self._next[reached] += 1
-        self.on_last |= self._next >= count - 1
-        return reached[self._next[reached] < count]
+        return reached[self._next[reached] < self._count]
+
+    @property
+    def on_last(self) -> BoolArray:
+        """Whether the present target is the last one, (n,); always without waypoints."""
+        return self._next >= self._count - 1
 
     def to_last(self, distance: FloatArray) -> FloatArray:
         """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
+        if not self._count:
+            return distance
         return np.where(self.on_last, distance, np.inf)
 
     def targets(self, rows: IntArray) -> FloatArray:
@@ -421,27 +417,25 @@ class Motion:
         self._control_step = control_step
         self._start = state.position
         self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
-        self._since = np.zeros(state.n)  # when the present stable time began
-        self._stable = np.ones(state.n, bool)
+        self._stable_since = np.zeros(state.n)  # NaN while it is not stable
         self.recovery_time = np.full(state.n, np.nan)
         self.cross_track_error = np.where(length[:, 0] > 0.0, 0.0, np.nan)
-        self.see(0, state, self._stable)
+        self.see(0, state, np.ones(state.n, bool))
 
     def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
         """See the state after control step ``step``; only the flights (n,) that continue count."""
         time = step * self._control_step
-        was_stable = self._stable
         # The cosine of the tilt is the z-z element of the rotation matrix.
         x, y = state.quaternion.T[1:3]
         upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
-        self._stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
-        self._since[self._stable & ~was_stable] = time
+        stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
+        self._stable_since = _since(self._stable_since, stable, time)
         # Half a step of tolerance, since times are multiples of steps only up to rounding.
-        held = time - self._since > HOLD - 0.5 * self._control_step
-        recovered = flying & self._stable & held & np.isnan(self.recovery_time)
-        self.recovery_time[recovered] = self._since[recovered]
+        held = flying & (time - self._stable_since > HOLD - 0.5 * self._control_step)
+        np.fmin(self.recovery_time, self._stable_since, out=self.recovery_time, where=held)
         # The part of the way flown that is across the line.
         flown = state.position - self._start
         along = (flown * self._direction).sum(axis=1, keepdims=True) * self._direction
         across = np.linalg.norm(flown - along, axis=1)
-        self.cross_track_error[flying] = np.maximum(self.cross_track_error, across)[flying]
+        error = self.cross_track_error
+        np.maximum(error, across, out=error, where=flying)

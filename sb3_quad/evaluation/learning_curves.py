@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays
+from sb3_quad.base.files import one_line, read_arrays
 from sb3_quad.base.types import FloatArray, StrPath
 
 # The arrays of a file, (k, episodes), by what they are called here. Environments of others may not
@@ -50,21 +50,18 @@ def read_curve(run: StrPath, task: str | None = None) -> Curve:
             reason = f"{task} is not one of this run's eval_tasks"
         raise ConfigError(f"{path}: no such file; {reason}")
     arrays = read_arrays(path)
-    for name in ("timesteps", "seconds", *EPISODES.values()):
-        if name not in arrays:
-            if name in OPTIONAL:
-                continue
-            raise ConfigError(f"{path}: cannot be read ({name}: no such array)")
-        # A file of another program may hold anything. There is a row of episodes, or one number,
-        # for each evaluation.
-        array = arrays[name]
-        dimensions = 1 + (name in EPISODES.values())
-        fits = array.ndim == dimensions and len(array) == arrays["timesteps"].size > 0
-        if not fits or array.dtype.kind not in "fiub":
-            raise ConfigError(f"{path}: cannot be read ({name} does not fit to the other arrays)")
-    measures = {name: arrays[key].mean(axis=1) for name, key in EPISODES.items() if key in arrays}
-    for key in arrays:
+    measures = {}
+    try:
+        for name, key in EPISODES.items():
+            if key in arrays or key not in OPTIONAL:
+                measures[name] = arrays[key].mean(axis=1)
+        # There is a row of episodes, or one number, for each evaluation.
+        columns = np.stack([arrays["timesteps"], arrays["seconds"], *measures.values()])
+        timesteps, seconds, *_ = columns.astype(np.float64)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        # A file of another program may hold anything.
+        raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
+    for key, losses in arrays.items():
         if key.startswith("train/"):
-            measures[key.removeprefix("train/")] = arrays[key]
-    timesteps = arrays["timesteps"].astype(np.float64)
-    return Curve(timesteps, arrays["seconds"].astype(np.float64), measures)
+            measures[key.removeprefix("train/")] = losses
+    return Curve(timesteps, seconds, measures)

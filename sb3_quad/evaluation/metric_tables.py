@@ -59,9 +59,9 @@ NOTHING = Cell()
 Cells = Mapping[Row, Cell]  # by the rows they stand in
 
 
-def time_row(tolerance: float | str) -> Row:
+def time_row(tolerance: float) -> Row:
     """Return the row with the time to a tolerance, m."""
-    return Row(f"mean time to {float(tolerance):g} m", "s", verb="arrive")
+    return Row(f"mean time to {tolerance:g} m", "s", verb="arrive")
 
 
 def settling_row(tolerance: float) -> Row:
@@ -126,10 +126,10 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
 def reference_cells(reference: Reference) -> Cells:
     """Return others' metrics."""
     cells = {}
-    rows = {**ROWS, "final_error": MEDIAN}
-    for name, number in reference:
-        if name in rows and number is not None:
-            cells[rows[name]] = _printed(number, 100.0 if rows[name].unit == "%" else 1.0)
+    for name, row in {**ROWS, "final_error": MEDIAN}.items():
+        number = getattr(reference, name, None)
+        if number is not None:
+            cells[row] = _printed(number, 100.0 if row.unit == "%" else 1.0)
     for row in {SUCCESS, SURVIVAL} & {*cells}:
         cells[row] = replace(cells[row], note=reference.note)
     # Here None has a meaning: never within the tolerance.
@@ -192,9 +192,9 @@ def overview(results: Results, controllers: Sequence[str]) -> Table:
     :param controllers: labels, in the order of their columns.
     """
     columns = [*map(Column, controllers)]
-    if any(map(attrgetter("reference"), results.scenarios)):
-        columns.append(Column(results.source, align="left"))
     rows = []
+    if any(scenario.reference for scenario in results.scenarios):
+        columns.append(Column(results.source, align="left"))
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
         for scenario in scenarios:
@@ -210,12 +210,12 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
     for row in rows:
         # The values of a cell are name enough for its only row.
         names = values if values and len(rows) == 1 else [*values, row.name]
+        cells = [*row.cells[: len(controllers)]]
         # All references share a column.
         words = []
         for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
             if cell != NOTHING:
                 words.append(f"{who} {replace(cell, note='').text}")
-        cells = [*row.cells[: len(controllers)]]
         if words:
             cells.append(Cell(words="; ".join(words)))
         section.append(Row(f"  {', '.join(names)}", row.unit, cells))
@@ -259,7 +259,7 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         # Only the main ones and those of references; a plot shows the others.
         kept = {min(tolerances), *MAIN_TOLERANCES}
         for reference in scenario.reference.values():
-            kept |= {*map(float, reference.time_to)}
+            kept |= {*reference.time_to}
         tolerances &= kept
     settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
     times = map(time_row, sorted(tolerances))

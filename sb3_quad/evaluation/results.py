@@ -10,6 +10,7 @@ A number that does not exist is None, never NaN.
 
 import re
 from collections.abc import Iterable, Sequence
+from itertools import cycle
 from operator import attrgetter
 from pathlib import Path
 from typing import Literal
@@ -45,7 +46,7 @@ COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8
 
 def colours_of(names: Sequence[str]) -> dict[str, str]:
     """Return a colour, ``#rrggbb``, for each name, by its position. They repeat after eight."""
-    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
+    return dict(zip(names, cycle(COLOURS), strict=False))
 
 
 class ControllerRecord(Frozen):
@@ -124,8 +125,10 @@ class Results(Frozen):
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """Return the entry of a controller's label and a scenario's name; None if it failed."""
-        entries = {entry.name: entry for entry in self.entries}
-        return entries.get((scenario, controller))
+        for entry in self.entries:
+            if entry.name == (scenario, controller):
+                return entry
+        return None
 
 
 def load_results(folder: StrPath) -> Results:

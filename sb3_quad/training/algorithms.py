@@ -214,9 +214,7 @@ def import_class(path: str, where: str) -> Any:
     :raises ConfigError: a module or a name that does not exist, or anything but a class of the kind
         that the key is for.
     """
-    # The module may do anything when it is imported.
-    with raised_as(ConfigError, f"{where}: {path} cannot be imported"):
-        named = import_name(path)
+    named = import_name(path, where)
     base = BASES[where]
     if not (isinstance(named, type) and issubclass(named, base)):
         raise ConfigError(

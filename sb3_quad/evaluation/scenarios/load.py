@@ -113,13 +113,16 @@ def grid(entry: StrMapping, where: str) -> list[StrDict]:
     for values in itertools.product(*axes.values()):
         # Keys may lead into nested parts, which the cells must not share.
         cell = copy.deepcopy(plain)
-        cell["cell"] = dict(zip(map(str, axes), values, strict=True))
-        for key, value in cell["cell"].items():
+        varied = dict(zip(map(str, axes), values, strict=True))
+        for key, value in varied.items():
             put_key(cell, key, value, f"{where}: vary.{key}")
         name = plain.get("name")
-        cell["group"] = name
-        cell["title"] = f"{plain.get('title') or name}: {', '.join(axis_values(cell['cell']))}"
-        cell["name"] = f"{name}.{'_'.join(map('{:g}'.format, values))}"
+        cell |= {
+            "cell": varied,
+            "group": name,
+            "title": f"{plain.get('title') or name}: {', '.join(axis_values(varied))}",
+            "name": f"{name}.{'_'.join(map('{:g}'.format, values))}",
+        }
         cells.append(cell)
     return cells
 

@@ -131,8 +131,8 @@ class Target(OneOf):
     """from the start in a uniformly random direction above ground, m; 0: the start itself"""
     waypoints: tuple[Vector, ...] | None = Field(default=None, min_length=1)
     """targets one after the other, world frame, m"""
-    radius: PositiveFloat | None = None
-    """a waypoint counts as reached within this, m (0.5)"""
+    radius: PositiveFloat = 0.5
+    """a waypoint counts as reached within this, m"""
 
     @property
     def points(self) -> tuple[Vector, ...]:

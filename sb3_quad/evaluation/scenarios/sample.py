@@ -3,7 +3,7 @@ backend.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,7 @@ from sb3_quad.vehicles.vehicle import Vehicle
 Generators = Sequence[np.random.Generator]  # one for each episode
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(NamedTuple):
     """The events of n episodes, whoever flies them.
 
     :param start: replaces the environments' own sample: any of position, quaternion, velocity,
@@ -29,9 +28,9 @@ class Plan:
     :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
     """
 
-    start: Mapping[str, FloatArray] = field(default_factory=dict)
-    wrenches: Mapping[int, FloatArray] = field(default_factory=dict)
-    waypoints: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    start: Mapping[str, FloatArray] = {}
+    wrenches: Mapping[int, FloatArray] = {}
+    waypoints: FloatArray = np.zeros((0, 3))
     radius: float = 0.5
 
 
@@ -59,7 +58,7 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     vehicle = scenario.nominal_vehicle()
     wrenches = sample_wrenches(scenario.wrenches, vehicle, scenario.steps, generators)
     waypoints = np.array(target.waypoints or ()).reshape(-1, 3)
-    return Plan(start, wrenches, waypoints, target.radius or Plan.radius)
+    return Plan(start, wrenches, waypoints, target.radius)
 
 
 def sample_wrenches(

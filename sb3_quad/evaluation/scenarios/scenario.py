@@ -36,7 +36,7 @@ class Reference(Frozen):
     """share that neither crash nor leave the range: the thesis's success"""
     reward: Printed = None
     """mean per episode"""
-    time_to: dict[str, Printed] = {}
+    time_to: dict[float, Printed] = {}
     """from tolerances in m to mean times in s; null: never within it"""
     path: Printed = None
     """mean path, m"""
@@ -48,14 +48,6 @@ class Reference(Frozen):
     """until the vehicle was stable again, s"""
     note: str = ""
     """the source's own words"""
-
-    @field_validator("time_to", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        if not isinstance(value, dict):
-            raise ValueError("must map tolerances in m to times in s")
-        # Text, since JSON has no numbers as keys.
-        return {f"{key:g}" if type(key) is float else str(key): value[key] for key in value}
 
 
 class Scenario(Frozen):
