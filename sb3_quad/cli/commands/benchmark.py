@@ -20,7 +20,13 @@ from timeit import Timer
 from typing import Any, NamedTuple
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.cli.parser import SEVERAL, YES_OR_NO, Flags, Parser, above_zero, add_flags, positive
+from sb3_quad.cli.parser import (
+    SEVERAL,
+    YES_OR_NO,
+    Flags,
+    above_zero,
+    positive,
+)
 
 ENV_ID = "QuadTargetTracking-v0"
 # The environment of the training loops.
@@ -53,10 +59,6 @@ FLAGS: Flags = {
     "-conf --conf-file FILE": "settings of the training loops (ALGO.yml)",
     "--training": (YES_OR_NO, None, "measure only, or no, training loops (both)"),
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

@@ -34,15 +34,24 @@ from typing import Any
 
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.process import StopSignals
-from sb3_quad.cli.commands.train import add_settings, make_config, prepare
-from sb3_quad.cli.parser import Flags, Parser, add_flags, given, natural, positive, seed, whole
+from sb3_quad.cli.commands.train import SETTINGS_FLAGS, make_config, prepare
+from sb3_quad.cli.parser import (
+    Flags,
+    given,
+    natural,
+    positive,
+    seed,
+    whole,
+)
 
 JOURNAL = "study.log"
 # Episodes per evaluation by --vec-env.
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 
 
+# Those of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings.
 FLAGS: Flags = {
+    **SETTINGS_FLAGS,
     "--n-trials N": (natural, 500, "trials of this process; 0 only writes the results (500)"),
     "--max-total-trials N": (
         positive,
@@ -68,12 +77,6 @@ FLAGS: Flags = {
     "--seed N": (seed, None, "seed of trainings and sampler, negative for a random one (0)"),
     "--eval-episodes N": (whole, None, "episodes per evaluation (batch: 240, else 48)"),
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the flags of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings."""
-    add_settings(parser)
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:
