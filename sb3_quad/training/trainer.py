@@ -18,7 +18,7 @@ import numpy as np
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import HParam
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
+from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_text
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
@@ -55,7 +55,6 @@ class TrainingResult:
     """How a run ended.
 
     :param seconds: wall-clock time of the training, evaluations included.
-    :param signal: the name of the signal that interrupted it, empty if none did.
     :param exit_code: 0; 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP.
     """
 
@@ -63,7 +62,6 @@ class TrainingResult:
     run: RunFolder
     model: BaseAlgorithm
     seconds: float
-    signal: str = ""
     exit_code: int = 0
 
 
@@ -130,9 +128,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         if run.not_begun:
             model = build_model(job, env)
         else:
-            attributes = {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
-            attributes |= _expert(config)
-            model = load_snapshot(run, config.algo, env, job.device, **attributes)
+            model = load_snapshot(run, job, env, **_expert(config))
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"resuming after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         with tracked(job):
@@ -259,12 +255,7 @@ class _Training:
     should_continue: ShouldContinue = lambda success, reward: True
 
     def __post_init__(self) -> None:
-        self.snapshots = SnapshotFile(
-            self.run,
-            self.job.snapshot_every,
-            self.report,
-            lambda: self.signals.received is not None,
-        )
+        self.snapshots = SnapshotFile(self.run, self.job.snapshot_every, self.report, self.signals)
         self.best: BestModel | None = None
         others = dict(self.eval_envs)
         own = others.pop(OWN_TASK, None)
@@ -303,11 +294,12 @@ class _Training:
                 raise
         seconds = time.perf_counter() - start
         if self.signals.received:
-            return self._interrupted(seconds)
-        save_model(self.model, self.run.model)
-        self.run.resume_state.unlink(missing_ok=True)
-        self._refuse_removed_folder(self.model.num_timesteps)
-        return TrainingResult(self.job, self.run, self.model, seconds)
+            self._save_interrupted()
+        else:
+            save_model(self.model, self.run.model)
+            self.run.resume_state.unlink(missing_ok=True)
+            self._refuse_removed_folder()
+        return TrainingResult(self.job, self.run, self.model, seconds, self.signals.exit_code)
 
     def _callbacks(self, user_callbacks: list[BaseCallback]) -> list[BaseCallback]:
         """Return all callbacks; they are called in this order."""
@@ -321,13 +313,8 @@ class _Training:
         if self.job.save_freq > 0:
             path = str(self.run.checkpoint("{steps}"))
             callbacks.append(Checkpoint(self.job.save_freq, path))
-        return [
-            *callbacks,
-            *user_callbacks,
-            ProgressBarCallback() if self.job.progress else ProgressLine(self.report),
-            # A signal ends the training where the snapshot can still be completed.
-            ConvertCallback(lambda *_: not (self.signals.received and self.snapshots.is_fresh)),
-        ]
+        progress = ProgressBarCallback() if self.job.progress else ProgressLine(self.report)
+        return [*callbacks, *user_callbacks, progress]
 
     def _learn(self, callbacks: list[BaseCallback]) -> None:
         config = self.job.config
@@ -349,27 +336,20 @@ class _Training:
         if best.latest < self.model.num_timesteps:
             best.evaluate()
 
-    def _interrupted(self, seconds: float) -> TrainingResult:
+    def _save_interrupted(self) -> None:
         """Save the model and the snapshot after a signal."""
-        snapshot = self.snapshots.snapshot
-        when = "before the first rollout"
-        if snapshot:
-            when = f"after {snapshot.timesteps:,} timesteps: model saved to {self.run.model}"
-            # The model comes first, since it needs the least room.
-            write_bytes(self.run.model, snapshot.model)
+        # The model comes first, since it needs the least room.
+        where = self.snapshots.save_model()
+        if where:
             try:
                 self.snapshots.write()
             except ConfigError as error:
-                raise ConfigError(f"{error}; interrupted {when}") from error
-            self._refuse_removed_folder(snapshot.timesteps)
-        self.report(
-            f"interrupted by {self.signals.name} {when}; to resume: --resume {self.run.path}"
-        )
-        return TrainingResult(
-            self.job, self.run, self.model, seconds, self.signals.name, self.signals.exit_code
-        )
+                raise ConfigError(f"{error}; interrupted{where}") from error
+            self._refuse_removed_folder()
+        name = self.signals.name + (where or " before the first rollout")
+        self.report(f"interrupted by {name}; to resume: --resume {self.run.path}")
 
-    def _refuse_removed_folder(self, timesteps: int) -> None:
+    def _refuse_removed_folder(self) -> None:
         """:raises TrainingError: the run folder was removed while it was trained.
 
         It has been made again for the model alone.
@@ -377,7 +357,7 @@ class _Training:
         if not self.run.arguments.is_file():
             raise TrainingError(
                 f"run folder {self.run.path}: was removed while the training wrote to it; "
-                f"the model after {timesteps:,} timesteps is in {self.run.model}, "
+                f"the model is in {self.run.model}, "
                 "the run's settings and its records until then are lost"
             )
 
@@ -386,11 +366,7 @@ class _Training:
 
         An error that has an explanation is raised again; the message says where they are.
         """
-        where = ""
-        snapshot = self.snapshots.snapshot
-        if snapshot:
-            write_bytes(self.run.model, snapshot.model)
-            where = f"; the model after {snapshot.timesteps:,} timesteps is in {self.run.model}"
+        where = self.snapshots.save_model()
         # An error of this package says what is wrong; the place in the code adds nothing.
         if isinstance(error, SB3QuadError):
             raise type(error)(f"{error}{where}") from error
