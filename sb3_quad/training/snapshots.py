@@ -22,7 +22,6 @@ from sb3_quad.base.files import model_bytes, one_line, read_arrays, write_arrays
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.types import Arrays, Report, StrDict
 from sb3_quad.controllers.zips import load_zip
-from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.runs import RunFolder
 
@@ -167,7 +166,7 @@ def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) 
     # The model comes first: what else is expected depends on it.
     _check(state, {"model": NO_BYTES})
     model: Any = load_zip(
-        get_algorithm(job.config.algo),
+        job.config.algorithm,
         io.BytesIO(state["model"].tobytes()),
         where="model",
         env=env,

@@ -6,7 +6,6 @@ that was not interrupted; elsewhere the episodes start again.
 """
 
 import copy
-import inspect
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -37,7 +36,7 @@ from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import get_algorithm, instance, takes_expert
+from sb3_quad.training.algorithms import instance, takes_expert
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
@@ -165,7 +164,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
 
 def _expert(config: TrainingConfig) -> StrDict:
     """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
-    if not takes_expert(get_algorithm(config.algo)):
+    if not takes_expert(config.algorithm):
         return {}
     vehicle = config.env_kwargs.get("vehicle", "itm")
     layout = config.env_kwargs.get("rotor_layout")
@@ -190,8 +189,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
-    for name in ("seed", "device", "verbose", "tensorboard_log"):
-        keywords[name] = getattr(job, name)
+    keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
     model = _construct(config, env, keywords)
     # An expert that fails does so before there is a run folder.
     will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
@@ -213,15 +211,10 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
 def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAlgorithm:
     """Call the algorithm's constructor; errors that do not concern its arguments stay as they are.
 
-    :raises ConfigError: arguments that it does not take or refuses, or too little memory.
+    :raises ConfigError: arguments that it refuses, or too little memory.
     """
-    algorithm = get_algorithm(config.algo)
     try:
-        inspect.signature(algorithm).bind(config.policy, env, **keywords)
-    except TypeError as error:
-        raise ConfigError(f"{config.algo}: {one_line(error)}") from None
-    try:
-        return algorithm(config.policy, env, **keywords)
+        return config.algorithm(config.policy, env, **keywords)
     except SB3QuadError:
         raise
     except (ValueError, AssertionError) as error:

@@ -62,7 +62,6 @@ KEPT_BY_RESUME = (
     "env",
     "conf_file",
     "hyperparams",
-    "eval_env_kwargs",
     "trained_agent",
     "log_folder",
     "seed",
@@ -89,7 +88,7 @@ SETTINGS_FLAGS: Flags = {
     **TRUST,
     **PROGRESS,
     **field_flags(SettingsOptions),
-    **field_flags(JobOptions, "eval_env_kwargs", "trained_agent", "n_eval_envs", "device"),
+    **field_flags(JobOptions, "trained_agent", "n_eval_envs", "device"),
 }
 # The flags of rl-zoo's ``train.py``, with their meanings.
 FLAGS: Flags = {

@@ -111,17 +111,12 @@ def _make_search(options: Namespace) -> Any:
     its results.
     """
     from sb3_quad.base.validate import validate
-    from sb3_quad.training.config import TrainingJob, build_config
+    from sb3_quad.training.config import TrainingJob
     from sb3_quad.training.runs import claim_folder, file_name
     from sb3_quad.tuning.search import Search
     from sb3_quad.tuning.space import load_space
 
     config = make_config(options)
-    if options.eval_env_kwargs is not None:
-        # As a part of the settings, so that the best settings have it, too.
-        evaluation = {**config.eval_env_kwargs, **options.eval_env_kwargs}
-        settings = {**config.settings, "eval_env_kwargs": evaluation}
-        config = build_config(config.algo, config.env_id, settings)
     space = load_space(config.algo, config.settings, options.search_space)
     episodes = options.eval_episodes
     if episodes is None:
