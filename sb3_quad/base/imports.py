@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, MissingExtra
+from sb3_quad.base.errors import ConfigError, MissingExtra, SB3QuadError
 
 
 def lazy_names(
@@ -32,10 +32,23 @@ def lazy_names(
     return get, names
 
 
-def import_name(text: str) -> Any:
-    """Import ``package.module:name`` or ``package.module.name``, as given by the user."""
-    search_present_folder(text.partition(":")[0])
-    return pkgutil.resolve_name(text)
+def import_name(text: str, where: str) -> Any:
+    """Import ``package.module:name``, ``package.module.name`` or a module, as given by the user.
+
+    :param where: The flag or key that names it, for the error message.
+    :raises ConfigError: It cannot be imported.
+    :raises MissingExtra: It needs a package that is not installed.
+    """
+    try:
+        search_present_folder(text.partition(":")[0])
+        return pkgutil.resolve_name(text)
+    except SB3QuadError:
+        raise
+    except (Exception, SystemExit) as error:
+        # The module's own code may raise anything.
+        raise ConfigError(
+            f"{where} {text}: cannot be imported ({type(error).__name__}: {error})"
+        ) from error
 
 
 def search_present_folder(module: str) -> None:
@@ -55,14 +68,7 @@ def import_packages(packages: Iterable[str], where: str) -> None:
     :raises ConfigError: A module cannot be imported.
     """
     for package in packages:
-        try:
-            search_present_folder(package)
-            importlib.import_module(package)
-        except (Exception, SystemExit) as error:
-            # The module's own code may raise anything.
-            raise ConfigError(
-                f"{where} {package}: cannot be imported ({type(error).__name__}: {error})"
-            ) from None
+        import_name(package, where)
 
 
 def require(module: str, extra: str, what: str) -> Any:

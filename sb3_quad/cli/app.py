@@ -110,12 +110,9 @@ def _parse(arguments: list[str]) -> Namespace | None:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise ConfigError(unknown("command", arguments[0], COMMANDS))
     try:
-        options = parser.parse_args(arguments)
+        options = parser.parse_args(arguments or ["--help"])
     except SystemExit:
         # argparse has printed the help or the version.
-        return None
-    if options.command is None:
-        parser.print_help()
         return None
     # A missing file is refused at once, since the imports of a command take seconds.
     agent = getattr(options, "trained_agent", None)

@@ -73,14 +73,12 @@ class Parser(ArgumentParser):
         """
         options, rest = super().parse_known_args(args, namespace)
         if rest:
-            option, _, value = rest[0].partition("=")
-            if not value and len(rest) > 1:
-                value = rest[1]
+            option = rest[0].partition("=")[0]
             kind = "option" if option.startswith("-") else "argument"
-            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option, value)}")
+            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option)}")
         return options, rest
 
-    def _advice(self, option: str, value: str) -> str:
+    def _advice(self, option: str) -> str:
         """Say what the user may want instead of an unknown option."""
         valid = self._option_string_actions
         if option in SEARCH_FLAGS:
@@ -92,9 +90,7 @@ class Parser(ArgumentParser):
         if commands:
             return "it belongs to " + " and ".join(f"sb3-quad {name}" for name in commands)
         if "--hyperparams" in valid and option.startswith("--"):
-            if value.startswith("-") or not value:
-                value = "VALUE"
-            pair = f"{option.strip('-').replace('-', '_')}:{value}"
+            pair = f"{option.strip('-').replace('-', '_')}:VALUE"
             return (
                 f"a hyperparameter is given as --hyperparams {pair}, "
                 f"a keyword of the environment as --env-kwargs {pair}"

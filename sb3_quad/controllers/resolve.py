@@ -72,11 +72,4 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         raise ConfigError(
             unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory"
         )
-    try:
-        return import_name(location)
-    except SB3QuadError:
-        raise
-    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-        raise ConfigError(
-            f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})"
-        ) from error
+    return import_name(location, kind)

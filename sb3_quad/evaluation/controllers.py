@@ -132,13 +132,7 @@ def load_reward(reward: OwnReward) -> Reward | None:
     """
     if not isinstance(reward, str):
         return reward
-    try:
-        function = import_name(reward)
-    except (Exception, SystemExit) as error:  # the module may do anything when it is imported
-        raise ConfigError(
-            f"reward {reward}: cannot be imported as package.module:function"
-            f" ({type(error).__name__}: {error})"
-        ) from error
+    function = import_name(reward, "reward")
     if not callable(function):
         raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
     return function  # type: ignore[no-any-return]

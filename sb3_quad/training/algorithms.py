@@ -214,11 +214,7 @@ def import_class(path: str, where: str) -> Any:
     :raises ConfigError: a module or a name that does not exist, or anything but a class of the kind
         that the key is for.
     """
-    try:
-        named = import_name(path)
-    except (Exception, SystemExit) as error:  # the module may do anything when it is imported
-        reason = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{where}: {path} cannot be imported ({reason})") from None
+    named = import_name(path, where)
     base = BASES[where]
     if not (isinstance(named, type) and issubclass(named, base)):
         raise ConfigError(

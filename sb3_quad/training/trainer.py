@@ -389,15 +389,20 @@ class HyperparameterLog(BaseCallback):
     def __init__(self, job: TrainingJob) -> None:
         super().__init__()
         config = job.config
-        shown = {"algo": config.algo, "env": config.env_id, "seed": job.seed, **config.settings}
-        # TensorBoard takes plain values alone.
         self._shown = {
-            name: value if isinstance(value, (bool, int, float)) else str(value)
-            for name, value in shown.items()
+            "algo": config.algo,
+            "env": config.env_id,
+            "seed": job.seed,
+            **config.settings,
         }
 
     def _on_training_start(self) -> None:
-        parameters = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
+        # TensorBoard takes plain values alone.
+        shown = {
+            name: value if isinstance(value, (bool, int, float)) else str(value)
+            for name, value in self._shown.items()
+        }
+        parameters = HParam(shown, dict.fromkeys(METRICS, 0.0))
         self.logger.record("hparams", parameters, exclude=("stdout", "log", "json", "csv"))
 
     def _on_step(self) -> bool:
