@@ -113,7 +113,7 @@ def test_any_text_on_the_command_line_is_a_value(text):
         ({"n_steps": 2.5}, "n_steps is 2.5, must be a whole number"),
         ({"n_steps": "lin_100"}, "takes no schedule"),
         ({"learning_rate": "fast"}, "must be a number or lin_<number>"),
-        ({"learning_rate": "lin_fast"}, "must be lin_ and a number"),
+        ({"learning_rate": "lin_fast"}, "the number after lin_ is 'fast', must be a number"),
         ({"learning_rate": float("nan")}, "must be finite"),
         ({"n_steps": True}, "n_steps is True, must be a whole number"),
         ({"bc_loss": "mae"}, "'mse', 'nll'"),

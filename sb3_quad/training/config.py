@@ -250,12 +250,12 @@ class TrainingJob(JobOptions):
 
         The settings are in config.yml.
         """
-        names = {
+        return {
             "algo": self.config.algo,
             "env": self.config.env_id,
             "env_kwargs": self.for_evaluation().env_kwargs,
+            **self.model_dump(exclude={"config"}),
         }
-        return {**names, **self.model_dump(exclude={"config"})}
 
 
 def describe(job: TrainingJob) -> str:

@@ -309,25 +309,20 @@ def _write_status(folder: Path, content: StrDict) -> None:
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
     """Return the zip that a stage passes on, after the offset correction where it has one."""
     if not stage.correct_offset:
-        return _passed_on(stage, job, run)
+        return _passed_on(stage, run)
     if not run.corrected_model.is_file():
-        _correct(stage.correct_offset, job, run, _passed_on(stage, job, run), report)
+        _correct(stage.correct_offset, job, run, _passed_on(stage, run), report)
     return run.corrected_model
 
 
-def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
+def _passed_on(stage: Stage, run: RunFolder) -> Path:
     """Return the zip that a stage passes on, before the offset correction.
 
     :raises TrainingError: it misses what the stage requires.
     """
     if run.evaluations.is_file():
-        curve = read_curve(run.path)
-        index = -1
-        if stage.pass_on == "best":
-            # Ordered as BestModel orders models: by the rate, then by the reward.
-            rate = np.nan_to_num(curve.values(job.config.best_by))
-            index = np.lexsort((curve.reward, rate))[-1]
-        success = np.nan_to_num(curve.values("success"))[index]
+        rates = np.nan_to_num(read_curve(run.path).values("success"))
+        success = rates.max() if stage.pass_on == "best" else rates[-1]
         if success < stage.require.success_rate:
             raise TrainingError(
                 f"stage {stage.name!r}: success {success:.3f} "

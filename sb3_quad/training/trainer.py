@@ -90,8 +90,10 @@ def train(
             with locked(run.path, "run folder"):
                 run.write_yaml(job.config.settings, job.arguments() | made_with())
                 on_start(run)
-                training = _Training(job, run, model, eval_envs, signals, report, should_continue)
-                return training.run_to_end(callbacks)
+                training = _Training(
+                    job, run, model, eval_envs, callbacks, signals, report, should_continue
+                )
+                return training.run_to_end()
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -130,9 +132,10 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
             model = load_snapshot(run, job, env, **_expert(config))
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"resuming after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
+        callbacks = _user_callbacks(config)
         with tracked(job):
-            training = _Training(job, run, model, eval_envs, signals, report)
-            return training.run_to_end(_user_callbacks(config))
+            training = _Training(job, run, model, eval_envs, callbacks, signals, report)
+            return training.run_to_end()
 
 
 @contextmanager
@@ -237,37 +240,51 @@ class _Training:
     """The training of a model in a run folder: what watches it, and how it ends.
 
     :param eval_envs: by task, the job's own under OWN_TASK; empty: no evaluations.
+    :param user_callbacks: those of the settings.
     """
 
     job: TrainingJob
     run: RunFolder
     model: BaseAlgorithm
     eval_envs: dict[str, VecEnv]
+    user_callbacks: list[BaseCallback]
     signals: StopSignals
     report: Report
     should_continue: ShouldContinue = lambda success, reward: True
 
     def __post_init__(self) -> None:
-        self.snapshots = SnapshotFile(self.run, self.job.snapshot_every, self.report, self.signals)
+        job = self.job
+        run = self.run
+        self.snapshots = SnapshotFile(run, job.snapshot_every, self.report, self.signals)
+        # They are called in this order.
+        self.callbacks: list[BaseCallback] = [
+            self.snapshots,
+            EpisodeLog(run.episodes, job.config.env_id),
+            HyperparameterLog(job),
+        ]
         self.best: BestModel | None = None
         others = dict(self.eval_envs)
         own = others.pop(OWN_TASK, None)
         if own is not None:
-            job = self.job
             self.best = BestModel(
                 own,
                 job.eval_freq if job.eval_freq > 0 else NEVER,
                 job.eval_episodes,
                 seed_for("evaluation", job.seed),
-                self.run.best_model,
-                self.run.evaluations,
+                run.best_model,
+                run.evaluations,
                 self.report,
                 others,
                 self.should_continue,
                 job.config.best_by,
             )
+            self.callbacks.append(self.best)
+        if job.save_freq > 0:
+            self.callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint("{steps}"))))
+        self.callbacks += self.user_callbacks
+        self.callbacks.append(ProgressBarCallback() if job.progress else ProgressLine(self.report))
 
-    def run_to_end(self, user_callbacks: list[BaseCallback]) -> TrainingResult:
+    def run_to_end(self) -> TrainingResult:
         """Train until the job is done, or a signal or an error ends it, and save the model."""
         config = self.job.config
         # A zip says how its agent flies, but a flight cannot have the user's wrappers.
@@ -277,7 +294,7 @@ class _Training:
         start = time.perf_counter()
         try:
             try:
-                self._learn(self._callbacks(user_callbacks))
+                self._learn()
             finally:
                 # From here on, no signal interrupts what is saved.
                 self.signals.hold()
@@ -294,22 +311,7 @@ class _Training:
             self._refuse_removed_folder()
         return TrainingResult(self.job, self.run, self.model, seconds, self.signals.exit_code)
 
-    def _callbacks(self, user_callbacks: list[BaseCallback]) -> list[BaseCallback]:
-        """Return all callbacks; they are called in this order."""
-        callbacks: list[BaseCallback] = [
-            self.snapshots,
-            EpisodeLog(self.run.episodes, self.job.config.env_id),
-            HyperparameterLog(self.job),
-        ]
-        if self.best:
-            callbacks.append(self.best)
-        if self.job.save_freq > 0:
-            path = str(self.run.checkpoint("{steps}"))
-            callbacks.append(Checkpoint(self.job.save_freq, path))
-        progress = ProgressBarCallback() if self.job.progress else ProgressLine(self.report)
-        return [*callbacks, *user_callbacks, progress]
-
-    def _learn(self, callbacks: list[BaseCallback]) -> None:
+    def _learn(self) -> None:
         config = self.job.config
         log_interval = self.job.log_interval
         # An off-policy algorithm counts episodes here; n_envs of them end at about the same time.
@@ -317,7 +319,7 @@ class _Training:
             log_interval *= config.n_envs
         self.model.learn(
             config.n_timesteps - self.model.num_timesteps,
-            callback=callbacks,
+            callback=self.callbacks,
             log_interval=log_interval,
             tb_log_name=f"{config.algo}_{self.run.path.name}",
             reset_num_timesteps=self.model.num_timesteps == 0,
