@@ -110,10 +110,16 @@ def _parse(arguments: list[str]) -> Namespace | None:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise ConfigError(unknown("command", arguments[0], COMMANDS))
     try:
-        return parser.parse_args(arguments or ["--help"])
+        options = parser.parse_args(arguments or ["--help"])
     except SystemExit:
         # argparse has printed the help or the version.
         return None
+    # A missing file is refused at once, since the imports of a command take seconds.
+    agent = getattr(options, "trained_agent", None)
+    # SB3 adds the suffix, too.
+    if agent and not (Path(agent).is_file() or Path(f"{agent}.zip").is_file()):
+        raise ConfigError(f"-i {agent}: no such file")
+    return options
 
 
 def _unexpected(error: BaseException) -> str:

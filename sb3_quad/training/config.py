@@ -28,7 +28,7 @@ from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
-from sb3_quad.controllers.resolve import DEFAULT_EXPERT
+from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
@@ -136,6 +136,15 @@ class TrainingConfig(Frozen):
     def flight_settings(self) -> FlightSettings:
         """How an agent of this job flies, in an environment of this package."""
         return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
+
+    def make_expert(self) -> Any:
+        """Return the expert, or the default one, for the vehicle of the environments.
+
+        :raises SB3QuadError: see :func:`~sb3_quad.controllers.resolve.resolve_expert`.
+        """
+        vehicle = self.env_kwargs.get("vehicle", "itm")
+        layout = self.env_kwargs.get("rotor_layout")
+        return resolve_expert(self.expert or DEFAULT_EXPERT, vehicle, layout=layout)
 
     def keyword(self, name: str) -> Any:
         """Return what the algorithm's constructor is given as ``name``, or its default."""
@@ -418,7 +427,7 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     observed = own.observed
     del observed["rotor_layout"]
     integral = observed.pop("position_integral")
-    merged = {
+    adopted = {
         **changes,
         "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
         # The changes to these are in the settings already.
@@ -427,10 +436,10 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
         policy: Any = load_model(path).policy
-        merged["policy_kwargs"] = {
+        adopted["policy_kwargs"] = {
             **config.policy_kwargs,
             "net_arch": policy.net_arch,
             # As config.yml names it.
             "activation_fn": f"nn.{policy.activation_fn.__name__}",
         }
-    return merged
+    return adopted

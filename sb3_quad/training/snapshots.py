@@ -287,19 +287,20 @@ def _fill(name: str, store: Any, state: Arrays) -> None:
 
 def _roll_back(run: RunFolder, state: Arrays) -> None:
     """Roll logs and best model back to the snapshot, so that resuming does not duplicate rows."""
-    evaluations = {path: read_arrays(path) for path in run.path.glob("evaluations*.npz")}
-    for path, rows in evaluations.items():
-        lengths = {array.shape[:1] for array in rows.values()}
-        is_table = "timesteps" in rows and len(lengths) == 1
-        if not is_table or rows["timesteps"].dtype.kind != "i":
-            raise _misfit(path, "holds no evaluations")
+    kept = {}
+    for path in run.path.glob("evaluations*.npz"):
+        rows = read_arrays(path)
+        try:
+            is_earlier = rows["timesteps"] <= state["timesteps"]
+            kept[path] = {name: array[is_earlier] for name, array in rows.items()}
+        except (KeyError, IndexError, TypeError):
+            raise _misfit(path, "holds no evaluations") from None
     # Only when all files are known to be good is any of them changed.
-    for path, rows in evaluations.items():
-        is_earlier = rows["timesteps"] <= state["timesteps"]
-        if not is_earlier.any():
+    for path, rows in kept.items():
+        if rows["timesteps"].size:
+            write_arrays(path, **rows)
+        else:
             path.unlink()
-        elif not is_earlier.all():
-            write_arrays(path, **{name: array[is_earlier] for name, array in rows.items()})
     if state["best_model"].size:
         write_bytes(run.best_model, state["best_model"].tobytes())
     else:

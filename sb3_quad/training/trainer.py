@@ -33,7 +33,6 @@ from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.controllers.controller import Controller
-from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.training.algorithms import instance, takes_expert
@@ -167,11 +166,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
 
 def _expert(config: TrainingConfig) -> StrDict:
     """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
-    if not takes_expert(config.algorithm):
-        return {}
-    vehicle = config.env_kwargs.get("vehicle", "itm")
-    layout = config.env_kwargs.get("rotor_layout")
-    return {"expert": resolve_expert(config.expert, vehicle, layout=layout)}
+    return {"expert": config.make_expert()} if takes_expert(config.algorithm) else {}
 
 
 def _user_callbacks(config: TrainingConfig) -> list[BaseCallback]:
