@@ -121,7 +121,7 @@ class SnapshotFile(BaseCallback):
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
-        arrays = dict(self._state)
+        arrays: StrDict = dict(self._state)
         for name, store in _stores(self.model).items():
             arrays |= _filled(name, store)
         write_arrays(self._run.resume_state, **arrays)

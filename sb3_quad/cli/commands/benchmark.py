@@ -79,8 +79,8 @@ def run(options: Namespace) -> int:
         rates = np.median(_measure(subjects, options.seconds), axis=0)
     lines = []
     for subject, rate in zip(subjects, rates, strict=True):
-        cells = (f"{subject.rows:,}", f"{rate:,.0f}", f"{rate / rates[0]:,.1f} x")
-        lines.append((subject.name, *cells))
+        relative = f"{rate / rates[0]:,.1f} x"
+        lines.append((subject.name, f"{subject.rows:,}", f"{rate:,.0f}", relative))
     title = f"control steps per second (median of {REPETITIONS})"
     screen.print(text_table(title, ("", "rows", "steps/s", "to the first line"), lines))
     return 0

@@ -118,11 +118,11 @@ def _make_search(options: Namespace) -> Any:
 
     config = make_config(options)
     space = load_space(config.algo, config.settings, options.search_space)
-    episodes = options.eval_episodes
-    if episodes is None:
-        episodes = EPISODES[config.vec_env]
-    arguments = given(options, "device", "trained_agent", "n_eval_envs", "seed")
-    arguments |= {"config": config, "eval_episodes": episodes}
+    arguments = {
+        "config": config,
+        "eval_episodes": EPISODES[config.vec_env],
+        **given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes"),
+    }
     job = validate(TrainingJob, arguments, "command line")
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     try:
