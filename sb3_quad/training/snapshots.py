@@ -292,9 +292,12 @@ def _roll_back(run: RunFolder, state: Arrays) -> None:
         rows = read_arrays(path)
         try:
             is_earlier = rows["timesteps"] <= state["timesteps"]
-            kept[path] = {name: array[is_earlier] for name, array in rows.items()}
+            earlier = {name: array[is_earlier] for name, array in rows.items()}
         except (KeyError, IndexError, TypeError):
             raise _misfit(path, "holds no evaluations") from None
+        # A file that lacks nothing needs no room on the disk.
+        if not is_earlier.all():
+            kept[path] = earlier
     # Only when all files are known to be good is any of them changed.
     for path, rows in kept.items():
         if rows["timesteps"].size:
