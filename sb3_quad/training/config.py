@@ -144,7 +144,8 @@ class TrainingConfig(Frozen):
         """
         vehicle = self.env_kwargs.get("vehicle", "itm")
         layout = self.env_kwargs.get("rotor_layout")
-        return resolve_expert(self.expert or DEFAULT_EXPERT, vehicle, layout=layout)
+        expert = DEFAULT_EXPERT if self.expert is None else self.expert
+        return resolve_expert(expert, vehicle, layout=layout)
 
     def keyword(self, name: str) -> Any:
         """Return what the algorithm's constructor is given as ``name``, or its default."""
