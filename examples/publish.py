@@ -42,7 +42,7 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli import app
-from sb3_quad.cli.parser import OVERWRITE, TRUST, Parser, add_flags, positive
+from sb3_quad.cli.parser import OVERWRITE, SWITCH, TRUST, Flags, positive
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
@@ -78,36 +78,30 @@ TIMES = (settling_row(0.1), LIMIT, time_row(0.1))
 SHOWN = (SUCCESS, SURVIVAL, REWARD, *TIMES, MEDIAN, QUANTILE)
 
 
-def add_arguments(parser: Parser) -> None:
-    """Add the flags."""
-    add = parser.add_argument
-    model = (
+FLAGS: Flags = {
+    "model MODEL": (
+        agent_path,
+        None,
         "an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy: "
-        "a zip or a run folder"
-    )
-    add("model", type=agent_path, metavar="MODEL", help=model)
-    add("--name", required=True, metavar="NAME", help="name of the files, NAME.zip and NAME.md")
-    add("-o", metavar="FOLDER", dest="folder", default=".", help="folder for both (here)")
-    add(
-        "--command",
-        metavar="TEXT",
-        dest="made_by",
-        help="the command that trained it (command.txt of the run)",
-    )
-    add(
-        "--episodes",
-        type=positive,
-        default=960,
-        metavar="N",
-        help="episodes of each task (960; recoveries: 4 times as many)",
-    )
-    add(
-        "--hub",
-        action="store_true",
-        help="lay out a folder NAME as huggingface_sb3 does, instead of the two files",
-    )
-    add("--push", metavar="USER/REPO", help="also upload that folder to the Hugging Face Hub")
-    add_flags(parser, {**TRUST, **OVERWRITE})
+        "a zip or a run folder",
+    ),
+    "--name NAME": ({"required": True}, None, "name of the files, NAME.zip and NAME.md"),
+    "-o FOLDER": ({"dest": "folder"}, ".", "folder for both (here)"),
+    "--command TEXT": (
+        {"dest": "made_by"},
+        None,
+        "the command that trained it (command.txt of the run)",
+    ),
+    "--episodes N": (positive, 960, "episodes of each task (960; recoveries: 4 times as many)"),
+    "--hub": (
+        SWITCH,
+        False,
+        "lay out a folder NAME as huggingface_sb3 does, instead of the two files",
+    ),
+    "--push USER/REPO": "also upload that folder to the Hugging Face Hub",
+    **TRUST,
+    **OVERWRITE,
+}
 
 
 def run(options: argparse.Namespace) -> int:

@@ -114,9 +114,9 @@ def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
 
 
 def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
-    with pytest.raises(TrainingError, match=r"stage 'one'.*mean_reward=1.0.*logs/dagger"):
+    with pytest.raises(TrainingError, match=r"stage 'one'.*success_rate=1.0.*logs/dagger"):
         run_pipeline(
-            tiny(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]]),
+            tiny(tmp_path, [{**STAGES[0], "require": {"success_rate": 1.0}}, STAGES[1]]),
             job,
             "stages",
             quiet,

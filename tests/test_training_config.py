@@ -113,7 +113,7 @@ def test_any_text_on_the_command_line_is_a_value(text):
         ({"n_steps": 2.5}, "n_steps is 2.5, must be a whole number"),
         ({"n_steps": "lin_100"}, "takes no schedule"),
         ({"learning_rate": "fast"}, "must be a number or lin_<number>"),
-        ({"learning_rate": "lin_fast"}, "must be lin_ and a number"),
+        ({"learning_rate": "lin_fast"}, "the number after lin_ is 'fast', must be a number"),
         ({"learning_rate": float("nan")}, "must be finite"),
         ({"n_steps": True}, "n_steps is True, must be a whole number"),
         ({"bc_loss": "mae"}, "'mse', 'nll'"),
@@ -144,16 +144,8 @@ class Broken(PPO):
         eval(bug)
 
 
-class Demanding(PPO):
-    def __init__(self, policy, env, seed, device, verbose, tensorboard_log, needed):
-        raise AssertionError
-
-
-def test_arguments_are_checked_before_a_constructor_is_called_and_its_bugs_are_no_bad_settings(
-    monkeypatch,
-):
-    for name in ("Broken", "Demanding"):
-        monkeypatch.setitem(ALGORITHMS, name, f"test_training_config:{name}")
+def test_the_bugs_of_a_constructor_are_no_bad_settings(monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, "Broken", "test_training_config:Broken")
 
     def make(algo, **settings):
         return build_model(TrainingJob(config=build(algo, **settings)), QuadcopterVecEnv(2))
@@ -166,8 +158,6 @@ def test_arguments_are_checked_before_a_constructor_is_called_and_its_bugs_are_n
         with pytest.raises(kind) as raised:
             make("Broken", bug=bug)
         assert type(raised.value) is kind
-    with pytest.raises(ConfigError, match="Demanding: missing a required argument: 'needed'"):
-        make("Demanding")
     with pytest.raises(ConfigError, match="did you mean 'bug'"):
         make("Broken", bugg="")
     with pytest.raises(ConfigError, match="more than this machine's memory"):
@@ -191,7 +181,6 @@ def test_a_budget_of_less_than_a_rollout_shortens_it_and_the_line_says_what_is_t
     line = describe(TrainingJob(config=config))
     assert f": {trained:,} timesteps" in line
     assert (f"({n_timesteps:,} were asked for)" in line) == (trained != n_timesteps)
-    assert ("will not learn" in line) == (algo == "ppo_bc" and trained <= 4 * rollout)
 
 
 def test_unknown_names_come_with_the_nearest():

@@ -20,6 +20,7 @@ import yaml
 
 from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS
+from sb3_quad.cli.parser import add_flags
 from sb3_quad.training.runs import open_run
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -85,7 +86,7 @@ def table():
 
 def our_flags(command):
     parser = argparse.ArgumentParser()
-    COMMANDS[command].add_arguments(parser)
+    add_flags(parser, COMMANDS[command].FLAGS)
     return {flag for action in parser._actions for flag in action.option_strings} - {"-h", "--help"}
 
 

@@ -13,7 +13,7 @@ from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.base.process import interrupts_leave, trusting
 from sb3_quad.cli import commands
-from sb3_quad.cli.parser import Parser
+from sb3_quad.cli.parser import TRACEBACK, Parser, add_flags
 
 EPILOG = """examples:
   # imitation, then PPO, with domain randomization
@@ -46,9 +46,7 @@ COMMANDS = {
     module.name.replace("_", "-"): importlib.import_module(f"{commands.__name__}.{module.name}")
     for module in pkgutil.iter_modules(commands.__path__)
 }
-"""The module of each command by its name: ``--help`` as its docstring, ``add_arguments`` and
-``run``.
-"""
+"""The module of each command by its name: ``--help`` as its docstring, ``FLAGS`` and ``run``."""
 
 
 def make_parser() -> Parser:
@@ -63,10 +61,7 @@ def make_parser() -> Parser:
         subparser = subparsers.add_parser(
             name, help=summary, description=text, epilog=heading + rest
         )
-        command.add_arguments(subparser)
-        subparser.add_argument(
-            "--traceback", action="store_true", help="print the traceback of an error, too"
-        )
+        add_flags(subparser, {**command.FLAGS, **TRACEBACK})
         subparser.siblings = siblings
         siblings[name] = subparser._option_string_actions
     return parser
@@ -115,12 +110,9 @@ def _parse(arguments: list[str]) -> Namespace | None:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise ConfigError(unknown("command", arguments[0], COMMANDS))
     try:
-        options = parser.parse_args(arguments)
+        options = parser.parse_args(arguments or ["--help"])
     except SystemExit:
         # argparse has printed the help or the version.
-        return None
-    if options.command is None:
-        parser.print_help()
         return None
     # A missing file is refused at once, since the imports of a command take seconds.
     agent = getattr(options, "trained_agent", None)

@@ -11,7 +11,6 @@ from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrMapping
 from sb3_quad.cli.output import console
 from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.tables import Table
@@ -51,7 +50,7 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     :param job: of an environment of this package.
     """
     how = dict(job.flight_settings)
-    controllers = {"agent": model, "expert": _expert(job)}
+    controllers = {"agent": model, "expert": job.for_evaluation().make_expert()}
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
     result = compare(
         controllers,
@@ -62,13 +61,6 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
         **how,
     )
     return result.tables[0]
-
-
-def _expert(job: TrainingJob) -> Any:
-    """Return the expert of a training, or the default one, for the vehicle that the agent flies."""
-    settings = job.flight_settings
-    expert = job.config.expert or DEFAULT_EXPERT
-    return resolve_expert(expert, settings.vehicle, layout=settings.rotor_layout)
 
 
 def close_run(result: TrainingResult) -> int:
@@ -93,7 +85,7 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     """
     if result.exit_code != 0:
         return result.exit_code
-    controllers = {"expert": _expert(result.job)}
+    controllers = {"expert": result.job.for_evaluation().make_expert()}
     for name, stage in result.stages.items():
         controllers[name] = stage.agent
     print_tables(

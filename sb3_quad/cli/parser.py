@@ -12,13 +12,14 @@ from argparse import (
     RawDescriptionHelpFormatter,
 )
 from collections.abc import Container, Iterable, Mapping
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 from pydantic import BaseModel
 
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict
+from sb3_quad.controllers.pretrained import agent_path
 
 SHORT_FLAGS = {
     "n_timesteps": "-n",
@@ -72,14 +73,12 @@ class Parser(ArgumentParser):
         """
         options, rest = super().parse_known_args(args, namespace)
         if rest:
-            option, _, value = rest[0].partition("=")
-            if not value and len(rest) > 1:
-                value = rest[1]
+            option = rest[0].partition("=")[0]
             kind = "option" if option.startswith("-") else "argument"
-            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option, value)}")
+            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option)}")
         return options, rest
 
-    def _advice(self, option: str, value: str) -> str:
+    def _advice(self, option: str) -> str:
         """Say what the user may want instead of an unknown option."""
         valid = self._option_string_actions
         if option in SEARCH_FLAGS:
@@ -91,9 +90,7 @@ class Parser(ArgumentParser):
         if commands:
             return "it belongs to " + " and ".join(f"sb3-quad {name}" for name in commands)
         if "--hyperparams" in valid and option.startswith("--"):
-            if value.startswith("-") or not value:
-                value = "VALUE"
-            pair = f"{option.strip('-').replace('-', '_')}:{value}"
+            pair = f"{option.strip('-').replace('-', '_')}:VALUE"
             return (
                 f"a hyperparameter is given as --hyperparams {pair}, "
                 f"a keyword of the environment as --env-kwargs {pair}"
@@ -166,15 +163,23 @@ def above_zero(text: str) -> float:
     return number
 
 
-Flags = Mapping[str, str | tuple[Any, Any, str]]
+KINDS: dict[Any, Any] = {bool: SWITCH, StrDict: PAIRS, float: float, str: str}
+"""The types (or keywords of ``add_argument``) of flags by those of their fields; else ``whole``."""
+OWN_KINDS: StrDict = {"trained_agent": agent_path, "wandb_tags": SEVERAL}
+"""Those of single fields."""
+Flags: TypeAlias = "Mapping[str, str | tuple[Any, Any, str] | Flags]"
 """A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
-default, and the help; the help alone for a text without a default.
+default, and the help; the help alone for a text without a default. A table in it holds flags that
+exclude each other.
 """
 
 
 def add_flags(parser: Any, flags: Flags) -> None:
     """Add the arguments of a table to a parser or a group of one."""
     for words, entry in flags.items():
+        if isinstance(entry, Mapping):
+            add_flags(parser.add_mutually_exclusive_group(), entry)
+            continue
         kind, default, text = (str, None, entry) if isinstance(entry, str) else entry
         arguments = kind if isinstance(kind, dict) else {"type": kind}
         names = words.split()
@@ -183,36 +188,29 @@ def add_flags(parser: Any, flags: Flags) -> None:
         parser.add_argument(*names, default=default, help=text, **arguments)
 
 
-def add_fields(parser: ArgumentParser, model: type[BaseModel], *names: str, **changes: Any) -> None:
-    """Add a flag for each field of a model, from the field's name, type, docstring and default.
+def field_flags(model: type[BaseModel], *names: str) -> StrDict:
+    """Return a table with a flag for each field of a model.
 
-    A flag that is not given is None.
+    The flag follows from the field's name, type, docstring and default. A flag that is not given is
+    None.
 
-    :param names: The fields; without any, all of them.
-    :param changes: Types (or keywords of ``add_argument``) of fields, in place of their own.
+    :param names: the fields; without any, all of them.
     """
+    flags: StrDict = {}
     for name in names or model.model_fields:
         field = model.model_fields[name]
         # The alternatives of a union such as `int | None`, or the type itself.
-        kinds = {field.annotation, *typing.get_args(field.annotation)}
-        kind: Any = whole
-        if name in changes:
-            kind = changes[name]
-        elif bool in kinds:
-            kind = SWITCH
-        elif StrDict in kinds:
-            kind = PAIRS
-        elif float in kinds:
-            kind = float
-        elif str in kinds:
-            kind = str
+        alternatives = (field.annotation, *typing.get_args(field.annotation))
+        kinds = (kind for of, kind in KINDS.items() if of in alternatives)
+        kind = OWN_KINDS.get(name) or next(kinds, whole)
         text = str(field.description)
         if field.default not in (None, False):
             text += f" ({field.default})"
-        words = f"{SHORT_FLAGS.get(name, '')} --{name.replace('_', '-')}"
+        words = f"{SHORT_FLAGS.get(name, '')} --{name.replace('_', '-')}".strip()
         if not isinstance(kind, dict):
             words += f" {METAVARS.get(name, 'N')}"
-        add_flags(parser, {words: (kind, None, text)})
+        flags[words] = (kind, None, text)
+    return flags
 
 
 EXECUTOR: Flags = {
@@ -232,6 +230,7 @@ TRUST: Flags = {
         "let zips run code that is pickled in them; only for files you trust (docs/security.md)",
     )
 }
+TRACEBACK: Flags = {"--traceback": (SWITCH, False, "print the traceback of an error, too")}
 OVERWRITE: Flags = {"--overwrite": (SWITCH, False, "replace existing files")}
 PROGRESS: Flags = {"-P --progress": (YES_OR_NO, None, "show a progress bar (yes in a terminal)")}
 

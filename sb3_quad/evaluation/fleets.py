@@ -7,9 +7,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 
 from sb3_quad.base.types import Float32Array, FloatArray
-from sb3_quad.simulation.batch import AnyArray, QuadcopterBatch, StepResult
+from sb3_quad.simulation.batch import QuadcopterBatch, StepResult
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, TARGET, row_slices
 
@@ -69,7 +70,7 @@ class PyBulletFleet(Fleet):
             self._read(row)
         return self.observe()
 
-    def step(self, actions: AnyArray) -> StepResult:
+    def step(self, actions: npt.NDArray[Any]) -> StepResult:
         # The others have ended; their environments may not be stepped.
         for row in np.flatnonzero(self.outcome["truncated"]).tolist():
             env = self._envs[row]

@@ -22,7 +22,7 @@ from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings, known_layout
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.state import TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
@@ -281,7 +281,7 @@ def _fly_fleet(
             # Whoever has reached a waypoint sees the next one from the next step on.
             onward = course.see(time, distance, flying)
             if onward.size:
-                fleet.set_target(course.targets(onward), onward)
+                fleet.state[TARGET, onward] = course.targets(onward).T
                 observation = fleet.observe()
 
     # A flight that was lost, or that did not get to its last target, has no success and no time

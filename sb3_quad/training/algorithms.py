@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_quad.base.errors import ConfigError, raised_as, unknown
 from sb3_quad.base.imports import import_name
-from sb3_quad.base.literals import parse_mapping, parse_number, parse_value
+from sb3_quad.base.literals import parse_mapping, parse_value
 from sb3_quad.base.types import StrDict
 
 # Imported when first needed.
@@ -51,6 +51,13 @@ _SET_BY_JOB = (
     "seed",
 )
 _LINEAR = "lin_"
+EXPECTED = {
+    "greater": "at least 1",
+    "callable": "a number or lin_<number>",
+    "float": "a number",
+    "int": "a whole number",
+}
+"""What a value must be by the kind of pydantic's error; the first that applies."""
 _CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -115,9 +122,8 @@ def convert(
     """
     is_linear = isinstance(value, str) and value.startswith(_LINEAR)
     if is_linear:
-        converted = parse_number(value.removeprefix(_LINEAR))
-        if isinstance(converted, str) or not math.isfinite(converted):
-            raise ConfigError(f"{where} is {value!r}, must be lin_ and a number, such as lin_1e-3")
+        start = value.removeprefix(_LINEAR)
+        converted = check(float, start, f"{where}: the number after {_LINEAR}")
     else:
         if isinstance(value, str):
             value = parse_value(value)
@@ -129,7 +135,7 @@ def convert(
             raise ConfigError(f"{where} is {value!r}, must be at most {most:g}")
     if not is_linear:
         return converted
-    schedule = LinearSchedule(float(converted), 0.0, 1.0)
+    schedule = LinearSchedule(converted, 0.0, 1.0)
     if not _takes(parameter.annotation, schedule):
         raise ConfigError(f"{where} is {value!r}, but it takes no schedule")
     return schedule
@@ -156,14 +162,9 @@ def check(kind: Any, value: Any, where: str) -> Any:
     # rl_zoo3 imports classes by their names, so a string may stand for a class.
     if isinstance(value, str) and "is" in messages:
         return value
-    if "greater" in messages:
-        expected = "at least 1"
-    elif "float" in messages:
-        expected = "a number or lin_<number>" if "callable" in messages else "a number"
-    elif "int" in messages:
-        expected = "a whole number"
-    else:
-        expected = next(iter(messages.values())).removeprefix("Input should be ")
+    known = [text for kind, text in EXPECTED.items() if kind in messages]
+    # Pydantic says the others well.
+    expected = [*known, *messages.values()][0].removeprefix("Input should be ")
     raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 
@@ -202,8 +203,8 @@ def qualified_classes(value: Any, where: str) -> list[tuple[str, StrDict]]:
                 "or {package.module.Class: {…}}"
             )
         for name, keywords in form.items():
-            import_class(str(name), where)
-            classes.append((str(name), parse_mapping(keywords, f"{where}.{name}")))
+            import_class(name, where)
+            classes.append((name, parse_mapping(keywords, f"{where}.{name}")))
     return classes
 
 

@@ -18,16 +18,17 @@ from pydantic import (
     PositiveInt,
     model_validator,
 )
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.process import print_once
-from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
-from sb3_quad.controllers.resolve import DEFAULT_EXPERT
+from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
@@ -127,20 +128,35 @@ class TrainingConfig(Frozen):
         return ENVIRONMENTS.get(self.env_id)
 
     @property
+    def algorithm(self) -> type[BaseAlgorithm]:
+        """The class of the algorithm."""
+        return get_algorithm(self.algo)
+
+    @property
     def flight_settings(self) -> FlightSettings:
         """How an agent of this job flies, in an environment of this package."""
         return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
+
+    def make_expert(self) -> Any:
+        """Return the expert, or the default one, for the vehicle of the environments.
+
+        :raises SB3QuadError: see :func:`~sb3_quad.controllers.resolve.resolve_expert`.
+        """
+        vehicle = self.env_kwargs.get("vehicle", "itm")
+        layout = self.env_kwargs.get("rotor_layout")
+        expert = DEFAULT_EXPERT if self.expert is None else self.expert
+        return resolve_expert(expert, vehicle, layout=layout)
 
     def keyword(self, name: str) -> Any:
         """Return what the algorithm's constructor is given as ``name``, or its default."""
         if name in self.hyperparams:
             return self.hyperparams[name]
-        return constructor_parameters(get_algorithm(self.algo))[name].default
+        return constructor_parameters(self.algorithm)[name].default
 
     @property
     def is_off_policy(self) -> bool:
         """Whether the algorithm learns from a replay buffer."""
-        return is_off_policy(get_algorithm(self.algo))
+        return is_off_policy(self.algorithm)
 
     @property
     def rollout_steps(self) -> int:
@@ -192,7 +208,7 @@ class TrainingConfig(Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
-        aliases = get_algorithm(self.algo).policy_aliases
+        aliases = self.algorithm.policy_aliases
         _refuse_unknown("policy", [self.policy], aliases)
         # The constructor of the policy takes these, not that of the algorithm.
         policy = aliases[self.policy]
@@ -214,11 +230,13 @@ class TrainingConfig(Frozen):
             )
         if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
-        if self.expert and not takes_expert(get_algorithm(self.algo)):
+        if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
 
 
+# Keys of a settings file that hold keywords of environments.
+ENV_KEYS = {"env_kwargs", "eval_env_kwargs"}
 # Keys of a settings file that are not the algorithm's.
 JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams", "settings"}
 
@@ -234,12 +252,7 @@ class TrainingJob(JobOptions):
 
         :param changes: to the keywords of the environments.
         """
-        keywords = {
-            **self.config.env_kwargs,
-            **self.config.eval_env_kwargs,
-            **(self.eval_env_kwargs or {}),
-            **changes,
-        }
+        keywords = {**self.config.env_kwargs, **self.config.eval_env_kwargs, **changes}
         return self.config.model_copy(update={"env_kwargs": keywords})
 
     @property
@@ -252,12 +265,12 @@ class TrainingJob(JobOptions):
 
         The settings are in config.yml.
         """
-        names = {
+        return {
             "algo": self.config.algo,
             "env": self.config.env_id,
             "env_kwargs": self.for_evaluation().env_kwargs,
+            **self.model_dump(exclude={"config"}),
         }
-        return {**names, **self.model_dump(exclude={"config"})}
 
 
 def describe(job: TrainingJob) -> str:
@@ -265,12 +278,7 @@ def describe(job: TrainingJob) -> str:
     config = job.config
     rollout = config.rollout
     # The last rollout is flown whole.
-    n_updates = -(-config.n_timesteps // rollout)
-    timesteps = n_updates * rollout
-    if config.is_off_policy:
-        # -1 stands for as many as there are timesteps in a rollout.
-        gradient_steps = config.keyword("gradient_steps")
-        n_updates *= rollout if gradient_steps < 0 else gradient_steps
+    timesteps = -(-config.n_timesteps // rollout) * rollout
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
     if timesteps != config.n_timesteps:
         line += f" ({config.n_timesteps:,} were asked for)"
@@ -284,8 +292,6 @@ def describe(job: TrainingJob) -> str:
     line += f", seed {job.seed}"
     if job.trained_agent:
         line += f", from {job.trained_agent}"
-    if n_updates <= config.hyperparams.get("critic_warmup", 0):
-        line += "; critic_warmup lasts all of it, so that the policy will not learn"
     return line
 
 
@@ -297,7 +303,7 @@ def load_config(
 ) -> TrainingConfig:
     """Read the settings of ``env_id`` from a YAML file and put ``overrides`` over them.
 
-    ``env_kwargs`` are merged key by key. Where ``n_timesteps`` is less than a rollout, ``n_steps``
+    They are merged as by :func:`merged`. Where ``n_timesteps`` is less than a rollout, ``n_steps``
     is shortened to it, and ``batch_size`` to no more than that; ``train_freq`` for an off-policy
     algorithm.
 
@@ -316,15 +322,24 @@ def load_config(
     settings = content[env_id]
     if not isinstance(settings, dict):
         raise ConfigError(f"{where}: {env_id} must hold keys and values, such as 'n_envs: 8'")
-    changes = dict(overrides or {})
-    if "env_kwargs" in changes:
-        base = parse_mapping(settings.get("env_kwargs"), f"{where}: env_kwargs")
-        changes["env_kwargs"] = {**base, **parse_mapping(changes["env_kwargs"], "env_kwargs")}
-    config = build_config(algo, env_id, {**settings, **changes}, where, changes)
+    changes = overrides or {}
+    config = build_config(algo, env_id, merged(settings, changes, where), where, changes)
     shorter = config.shorter_rollout()
     if shorter:
         config = build_config(algo, env_id, {**config.settings, **shorter}, where, changes)
     return config
+
+
+def merged(settings: StrMapping, changes: StrMapping, where: str) -> StrDict:
+    """Return ``changes`` put over ``settings``; keywords of environments are merged key by key.
+
+    :param where: what the messages call the source of the settings.
+    """
+    result = {**settings, **changes}
+    for key in ENV_KEYS & changes.keys():
+        own = parse_mapping(settings.get(key), f"{where}: {key}")
+        result[key] = {**own, **parse_mapping(changes[key], key)}
+    return result
 
 
 def build_config(
@@ -344,9 +359,8 @@ def build_config(
     parameters = constructor_parameters(algorithm)
     check_environment(env_id)
     settings = dict(settings)
-    for key in ("env_kwargs", "eval_env_kwargs"):
-        if key in settings:
-            settings[key] = with_vehicle_path(settings[key])
+    for key in ENV_KEYS & settings.keys():
+        settings[key] = with_vehicle_path(settings[key])
     # The default is written out, so that config.yml names the expert.
     if takes_expert(algorithm) and settings.get("expert") is None:
         settings["expert"] = DEFAULT_EXPERT
@@ -374,17 +388,14 @@ def with_vehicle_path(env_kwargs: Any) -> Any:
 
     A run may be flown and resumed later, from another folder.
     """
-    if not isinstance(env_kwargs, dict) or "vehicle" not in env_kwargs:
-        return env_kwargs
-    vehicle = env_kwargs["vehicle"]
-    if isinstance(vehicle, (list, tuple)):
-        vehicle = [_absolute(entry) for entry in vehicle]
-    else:
-        vehicle = _absolute(vehicle)
-    return {**env_kwargs, "vehicle": vehicle}
+    if isinstance(env_kwargs, dict) and "vehicle" in env_kwargs:
+        return {**env_kwargs, "vehicle": _absolute(env_kwargs["vehicle"])}
+    return env_kwargs
 
 
 def _absolute(vehicle: Any) -> Any:
+    if isinstance(vehicle, (list, tuple)):
+        return [_absolute(entry) for entry in vehicle]
     if isinstance(vehicle, (str, Path)) and VEHICLES.is_path(vehicle):
         return str(Path(vehicle).absolute())
     return vehicle
@@ -422,7 +433,7 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     observed = own.observed
     del observed["rotor_layout"]
     integral = observed.pop("position_integral")
-    merged = {
+    adopted = {
         **changes,
         "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
         # The changes to these are in the settings already.
@@ -431,10 +442,10 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
         policy: Any = load_model(path).policy
-        merged["policy_kwargs"] = {
+        adopted["policy_kwargs"] = {
             **config.policy_kwargs,
             "net_arch": policy.net_arch,
             # As config.yml names it.
             "activation_fn": f"nn.{policy.activation_fn.__name__}",
         }
-    return merged
+    return adopted

@@ -47,13 +47,13 @@ class SettingsOptions(Frozen):
     """pid, geometric, path/to/model.zip or package.module:factory"""
     env_kwargs: StrDict | None = None
     """environment keywords, such as noise:0"""
+    eval_env_kwargs: StrDict | None = None
+    """environment keywords for evaluations only"""
 
 
 class RunOptions(Frozen):
     """Run options outside the settings file; the configurations of a sweep may override them."""
 
-    eval_env_kwargs: StrDict | None = None
-    """environment keywords for evaluations only"""
     trained_agent: str | None = None
     """agent to start from: an SB3 zip, a run folder or a name"""
     n_eval_envs: PositiveInt | None = None

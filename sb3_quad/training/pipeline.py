@@ -25,7 +25,6 @@ from pydantic import (
 from sb3_quad.algorithms.offset_correction import correct_hover, correct_offset
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
-from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
@@ -33,14 +32,15 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.arrival_correction import OVERSHOOT_COST, correct_arrival
 from sb3_quad.training.config import (
+    ENV_KEYS,
     SETTINGS,
     TrainingConfig,
     TrainingJob,
     describe,
     load_config,
+    merged,
     with_vehicle_path,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
@@ -55,7 +55,6 @@ class Requirement(Frozen):
     """The least that a stage must reach in its best evaluation before the next stage begins."""
 
     success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
-    mean_reward: float | None = None
 
 
 class OffsetCorrection(Frozen):
@@ -183,16 +182,14 @@ def load_pipeline(conf_file: StrPath) -> Pipeline:
 def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
     """Return the pipeline with ``changes`` put over the settings of every stage.
 
-    ``env_kwargs`` are merged key by key.
+    They are merged as by :func:`~sb3_quad.training.config.merged`.
     """
     stages = []
     for stage in pipeline.stages:
-        settings = {**stage.settings, **changes}
-        where = f"{stage.name}: env_kwargs"
-        env_kwargs = parse_mapping(stage.settings.get("env_kwargs"), where)
-        env_kwargs |= parse_mapping(changes.get("env_kwargs"), where)
-        if env_kwargs:
-            settings["env_kwargs"] = with_vehicle_path(env_kwargs)
+        settings = merged(stage.settings, changes, stage.name)
+        # The pipeline may be resumed from another folder.
+        for key in ENV_KEYS & settings.keys():
+            settings[key] = with_vehicle_path(settings[key])
         stages.append(stage.model_copy(update={"settings": settings}))
     return pipeline.model_copy(update={"stages": tuple(stages)})
 
@@ -214,20 +211,11 @@ def run_pipeline(
         missed.
     """
     status = Status(stages=pipeline.stages, job=dict(job), runs=())
-    jobs = stage_jobs(status, status.job)
-    return _train_stages(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
-
-
-def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:
-    """Resume an interrupted or killed pipeline within its present stage, then train the others.
-
-    :param changes: options of the jobs to change, as for
-        :func:`~sb3_quad.training.trainer.resume`.
-    :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
-    """
-    status = validate(Status, *SETTINGS.read(folder / STATUS_FILE))
-    status = status.model_copy(update={"job": {**status.job, **changes}})
-    return _train_stages(folder, status, stage_jobs(status, status.job), report, **changes)
+    jobs = stage_jobs(pipeline, job)
+    folder = claim_folder(Path(jobs[0].log_folder) / name, name)
+    # The stages are written, too, since the settings file may change before a resume.
+    _write_status(folder, status.model_dump(mode="json", exclude_defaults=True))
+    return resume_pipeline(folder, report)
 
 
 def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
@@ -265,31 +253,27 @@ def _check_correction(correction: OffsetCorrection | None, config: TrainingConfi
         )
 
 
-def _train_stages(
-    folder: Path,
-    status: Status,
-    jobs: list[TrainingJob],
-    report: Report,
-    **changes: Any,
-) -> PipelineResult:
-    """Train the stages that are not complete."""
-    # The stages are written, too, since the settings file may change before a resume.
-    content = status.model_dump(mode="json", exclude_defaults=True)
-    runs = content["runs"]
+def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:
+    """Resume an interrupted or killed pipeline within its present stage, then train the others.
+
+    :param changes: options of the jobs to change, as for
+        :func:`~sb3_quad.training.trainer.resume`.
+    :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
+    """
+    content, where = SETTINGS.read(folder / STATUS_FILE)
+    status = validate(Status, content, where)
+    jobs = stage_jobs(status, {**status.job, **changes})
+    runs = list(status.runs)
     results: dict[str, StageResult] = {}
     agent = ""
-
-    def write() -> None:
-        write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
 
     def note(number: int, run: RunFolder) -> None:
         """Note a stage's run folder before its training begins."""
         runs[number:] = [str(run.path)]
-        write()
+        _write_status(folder, {**content, "runs": runs})
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
         try:
-            write()
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
                 run = open_run(runs[number]) if number < len(runs) else None
                 if run and run.timesteps >= job.config.n_timesteps:
@@ -318,35 +302,31 @@ def _train_stages(
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
+def _write_status(folder: Path, content: StrDict) -> None:
+    write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
+
+
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
     """Return the zip that a stage passes on, after the offset correction where it has one."""
     if not stage.correct_offset:
-        return _passed_on(stage, job, run)
+        return _passed_on(stage, run)
     if not run.corrected_model.is_file():
-        _correct(stage.correct_offset, job, run, _passed_on(stage, job, run), report)
+        _correct(stage.correct_offset, job, run, _passed_on(stage, run), report)
     return run.corrected_model
 
 
-def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
+def _passed_on(stage: Stage, run: RunFolder) -> Path:
     """Return the zip that a stage passes on, before the offset correction.
 
     :raises TrainingError: it misses what the stage requires.
     """
     if run.evaluations.is_file():
-        curve = read_curve(run.path)
-        index = -1
-        if stage.pass_on == "best":
-            # Ordered as BestModel orders models: by the rate, then by the reward.
-            rate = np.nan_to_num(curve.values(job.config.best_by))
-            index = np.lexsort((curve.reward, rate))[-1]
-        success = np.nan_to_num(curve.values("success"))[index]
-        reward = curve.reward[index]
-        required = stage.require
-        misses_reward = required.mean_reward is not None and reward < required.mean_reward
-        if success < required.success_rate or misses_reward:
+        rates = np.nan_to_num(read_curve(run.path).values("success"))
+        success = rates.max() if stage.pass_on == "best" else rates[-1]
+        if success < stage.require.success_rate:
             raise TrainingError(
-                f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} "
-                f"miss what it requires ({required}); its run is {run.path}"
+                f"stage {stage.name!r}: success {success:.3f} "
+                f"misses what it requires ({stage.require}); its run is {run.path}"
             )
     if stage.pass_on == "best" and run.best_model.is_file():
         return run.best_model
@@ -361,7 +341,7 @@ def _correct(
     report: Report,
 ) -> None:
     """Write the corrected agent of a run."""
-    model = load_zip(get_algorithm(job.config.algo), agent, device=job.device)
+    model = load_zip(job.config.algorithm, agent, device=job.device)
     report(f"correcting the agent's offset ({correction.kind}), which may take minutes")
     settings = job.flight_settings
     seed = seed_for("correction", job.seed)

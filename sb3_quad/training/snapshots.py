@@ -5,14 +5,12 @@ import json
 import os
 import random
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
 from pydantic import TypeAdapter
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -21,9 +19,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
+from sb3_quad.base.process import StopSignals
 from sb3_quad.base.types import Arrays, Report, StrDict
 from sb3_quad.controllers.zips import load_zip
-from sb3_quad.training.algorithms import get_algorithm
+from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.runs import RunFolder
 
 # Prefix of the environments' arrays.
@@ -41,74 +40,52 @@ SHARE = 0.03
 PAUSE = 1.0
 
 
-class Snapshot(NamedTuple):
-    """A model between two rollouts.
-
-    :param model: the zip.
-    """
-
-    timesteps: int
-    model: bytes
-
-
 class SnapshotFile(BaseCallback):
-    """Takes a :class:`Snapshot` whenever a rollout starts, and writes some of them to the file.
+    """Takes a snapshot whenever a rollout starts, and writes some of them to the file.
 
     That is the first one, then one in so many seconds. Where writing takes long, as it does for a
     large dataset on a slow disk, fewer are written.
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
     :param report: called with one line if a snapshot cannot be written; the training continues.
-    :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
+    :param signals: one that was received ends the training where the snapshot can be completed.
     :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from
         before that update.
     """
 
-    snapshot: Snapshot | None = None
-
-    def __init__(
-        self, run: RunFolder, every: float, report: Report, hurry: Callable[[], bool]
-    ) -> None:
+    def __init__(self, run: RunFolder, every: float, report: Report, signals: StopSignals) -> None:
         super().__init__()
         self._run = run
         self._every = every
         self._report = report
-        self._hurry = hurry
+        self._signals = signals
         self._state: Arrays = {}
         self._next_taken = -np.inf  # s
         self._next_write = -np.inf  # s
-
-    @property
-    def is_fresh(self) -> bool:
-        """Whether the rollout is in its first step after the snapshot.
-
-        No buffer holds more than the snapshot then.
-        """
-        if not self.snapshot or not isinstance(self.model, OffPolicyAlgorithm):
-            return True
-        return self.snapshot.timesteps == self.num_timesteps - self.training_env.num_envs
 
     def _on_training_start(self) -> None:
         path = self._run.resume_state
         # The log of a resumed run is to say what it would have said without the interruption.
         if not path.is_file():
             return
-        try:
-            records = LOG.validate_json(str(read_arrays(path, "log").get("log")))
-        except ValueError as error:
-            raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
+        records = LOG.validate_json(str(read_arrays(path, "log")["log"]))
         for name, (value, count, excluded) in records.items():
             self.logger.name_to_value[name] = value
             self.logger.name_to_count[name] = count
             self.logger.name_to_excluded[name] = excluded
 
     def _on_step(self) -> bool:
-        return True
+        if not self._signals.received:
+            return True
+        # In its first step after the snapshot, a replay buffer holds nothing more that would be
+        # lost. Until then, the training continues.
+        first_step = self._state["timesteps"] + self.training_env.num_envs
+        return isinstance(self.model, OffPolicyAlgorithm) and self.num_timesteps != first_step
 
     def _on_rollout_start(self) -> None:
         start = time.monotonic()
         is_off_policy = isinstance(self.model, OffPolicyAlgorithm)
-        if is_off_policy and start < self._next_taken and not self._hurry():
+        if is_off_policy and start < self._next_taken and not self._signals.received:
             return
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
@@ -119,12 +96,15 @@ class SnapshotFile(BaseCallback):
         self._next_taken = start + PAUSE
         model = io.BytesIO()
         self.model.save(model)
-        self.snapshot = Snapshot(self.model.num_timesteps, model.getvalue())
         # The stores' rows are read when the snapshot is written. A rollout later they hold more,
         # and the oldest of a full store are replaced; the resumed training adds the same rows again
         # before it reads any.
-        self._state = _surroundings(self.training_env, self.model)
-        self._state["log"] = log_state(self.logger)
+        self._state = {
+            **_surroundings(self.training_env, self.model),
+            "timesteps": np.array(self.model.num_timesteps),
+            "model": np.frombuffer(model.getvalue(), np.uint8),
+            "log": log_state(self.logger),
+        }
         if self._run.episodes.is_file():
             self._state["episodes"] = np.array(self._run.episodes.stat().st_size)
         if self._run.best_model.is_file():
@@ -143,25 +123,27 @@ class SnapshotFile(BaseCallback):
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
-        assert self.snapshot is not None
-        arrays: StrDict = {
-            "timesteps": np.array(self.snapshot.timesteps),
-            "model": np.frombuffer(self.snapshot.model, np.uint8),
-            **self._state,
-        }
+        arrays: StrDict = dict(self._state)
         for name, store in _stores(self.model).items():
             arrays |= _filled(name, store)
         write_arrays(self._run.resume_state, **arrays)
 
+    def save_model(self) -> str:
+        """Write the model of the latest snapshot, and return where it is; empty without one."""
+        if not self._state:
+            return ""
+        write_bytes(self._run.model, self._state["model"].tobytes())
+        timesteps = int(self._state["timesteps"])
+        return f"; the model after {timesteps:,} timesteps is in {self._run.model}"
 
-def load_snapshot(
-    run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any
-) -> BaseAlgorithm:
+
+def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: Any) -> Any:
     """Load the model of a run's snapshot, ready for ``learn(…, reset_num_timesteps=False)``.
 
     The run's files are rolled back to the snapshot.
 
-    :param attributes: given to ``load``: what the zip does not hold, such as ``expert``.
+    :param attributes: given to ``load``: what neither the zip nor the job holds, such as
+        ``expert``.
     :raises ConfigError: a file that is missing or damaged, or of other settings; then nothing has
         been rolled back.
     """
@@ -173,37 +155,32 @@ def load_snapshot(
         raise ConfigError(message)
     state = read_arrays(path)
     try:
-        model: BaseAlgorithm = _restore(state, algo, env, device, attributes)
+        model = _restore(state, job, env, attributes)
     except ConfigError as error:
         raise _misfit(path, error) from None
     _roll_back(run, state)
-    # What was loaded since then may have sampled.
-    set_random_state(state)
     return model
 
 
-def _restore(state: Arrays, algo: str, env: VecEnv, device: str, attributes: StrDict) -> Any:
+def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) -> Any:
     """Return the model of a snapshot, with its stores, environments and random numbers."""
     batch = _batch(env)
     # The model comes first: what else is expected depends on it.
     _check(state, {"model": NO_BYTES})
     model: Any = load_zip(
-        get_algorithm(algo),
+        job.config.algorithm,
         io.BytesIO(state["model"].tobytes()),
         where="model",
         env=env,
-        device=device,
+        device=job.device,
+        tensorboard_log=job.tensorboard_log,
+        verbose=job.verbose,
         force_reset=batch is None,
         **attributes,
     )
     _check(state, {"timesteps": np.array(0), **_surroundings(env, model)})
     _require(int(state["episodes"]) >= 0, "episodes is negative")
     _require(model.num_timesteps == state["timesteps"], "timesteps is not that of model")
-    try:
-        set_random_state(state)
-    except Exception as error:  # a damaged state may raise anything
-        problem = f"random and torch are not states of random numbers ({one_line(error)})"
-        raise ConfigError(problem) from None
     for name, store in _stores(model).items():
         _fill(name, store, state)
     environment = {
@@ -215,6 +192,12 @@ def _restore(state: Arrays, algo: str, env: VecEnv, device: str, attributes: Str
         batch.restore(environment)
     else:
         _require(not environment, f"{ENVIRONMENT}… is of environments of another kind")
+    # The random numbers come last, since loading may sample.
+    try:
+        LOG.validate_json(str(state["log"]))
+        set_random_state(state)
+    except Exception as error:  # a damaged text may raise anything
+        raise ConfigError(f"log, random or torch cannot be read ({one_line(error)})") from None
     return model
 
 
@@ -306,19 +289,23 @@ def _fill(name: str, store: Any, state: Arrays) -> None:
 
 def _roll_back(run: RunFolder, state: Arrays) -> None:
     """Roll logs and best model back to the snapshot, so that resuming does not duplicate rows."""
-    evaluations = {path: read_arrays(path) for path in run.path.glob("evaluations*.npz")}
-    for path, rows in evaluations.items():
-        lengths = {array.shape[:1] for array in rows.values()}
-        is_table = "timesteps" in rows and len(lengths) == 1
-        if not is_table or rows["timesteps"].dtype.kind != "i":
-            raise _misfit(path, "holds no evaluations")
+    kept = {}
+    for path in run.path.glob("evaluations*.npz"):
+        rows = read_arrays(path)
+        try:
+            is_earlier = rows["timesteps"] <= state["timesteps"]
+            earlier = {name: array[is_earlier] for name, array in rows.items()}
+        except (KeyError, IndexError, TypeError):
+            raise _misfit(path, "holds no evaluations") from None
+        # A file that lacks nothing needs no room on the disk.
+        if not is_earlier.all():
+            kept[path] = earlier
     # Only when all files are known to be good is any of them changed.
-    for path, rows in evaluations.items():
-        is_earlier = rows["timesteps"] <= state["timesteps"]
-        if not is_earlier.any():
+    for path, rows in kept.items():
+        if rows["timesteps"].size:
+            write_arrays(path, **rows)
+        else:
             path.unlink()
-        elif not is_earlier.all():
-            write_arrays(path, **{name: array[is_earlier] for name, array in rows.items()})
     if state["best_model"].size:
         write_bytes(run.best_model, state["best_model"].tobytes())
     else:
@@ -345,9 +332,8 @@ def random_state() -> Arrays:
 
     They are torch's, Python's and NumPy's.
     """
-    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
-    numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
-    text = json.dumps([random.getstate(), numpy_state])
+    states = [random.getstate(), np.random.get_state(legacy=False)]  # noqa: NPY002
+    text = json.dumps(states, default=np.ndarray.tolist)
     return {"torch": th.get_rng_state().numpy().copy(), "random": np.array(text)}
 
 

@@ -6,7 +6,6 @@ that was not interrupted; elsewhere the episodes start again.
 """
 
 import copy
-import inspect
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -18,7 +17,7 @@ import numpy as np
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import HParam
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -26,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
+from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_text
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
@@ -34,10 +33,9 @@ from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.controllers.controller import Controller
-from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import get_algorithm, instance, takes_expert
+from sb3_quad.training.algorithms import instance, takes_expert
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
@@ -55,7 +53,6 @@ class TrainingResult:
     """How a run ended.
 
     :param seconds: wall-clock time of the training, evaluations included.
-    :param signal: the name of the signal that interrupted it, empty if none did.
     :param exit_code: 0; 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP.
     """
 
@@ -63,7 +60,6 @@ class TrainingResult:
     run: RunFolder
     model: BaseAlgorithm
     seconds: float
-    signal: str = ""
     exit_code: int = 0
 
 
@@ -93,8 +89,10 @@ def train(
             with locked(run.path, "run folder"):
                 run.write_yaml(job.config.settings, job.arguments() | made_with())
                 on_start(run)
-                training = _Training(job, run, model, eval_envs, signals, report, should_continue)
-                return training.run_to_end(callbacks)
+                training = _Training(
+                    job, run, model, eval_envs, callbacks, signals, report, should_continue
+                )
+                return training.run_to_end()
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -130,14 +128,13 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         if run.not_begun:
             model = build_model(job, env)
         else:
-            attributes = {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
-            attributes |= _expert(config)
-            model = load_snapshot(run, config.algo, env, job.device, **attributes)
+            model = load_snapshot(run, job, env, **_expert(config))
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"resuming after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
+        callbacks = _user_callbacks(config)
         with tracked(job):
-            training = _Training(job, run, model, eval_envs, signals, report)
-            return training.run_to_end(_user_callbacks(config))
+            training = _Training(job, run, model, eval_envs, callbacks, signals, report)
+            return training.run_to_end()
 
 
 @contextmanager
@@ -169,11 +166,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
 
 def _expert(config: TrainingConfig) -> StrDict:
     """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
-    if not takes_expert(get_algorithm(config.algo)):
-        return {}
-    vehicle = config.env_kwargs.get("vehicle", "itm")
-    layout = config.env_kwargs.get("rotor_layout")
-    return {"expert": resolve_expert(config.expert, vehicle, layout=layout)}
+    return {"expert": config.make_expert()} if takes_expert(config.algorithm) else {}
 
 
 def _user_callbacks(config: TrainingConfig) -> list[BaseCallback]:
@@ -194,8 +187,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
-    for name in ("seed", "device", "verbose", "tensorboard_log"):
-        keywords[name] = getattr(job, name)
+    keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
     model = _construct(config, env, keywords)
     # An expert that fails does so before there is a run folder.
     will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
@@ -217,15 +209,10 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
 def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAlgorithm:
     """Call the algorithm's constructor; errors that do not concern its arguments stay as they are.
 
-    :raises ConfigError: arguments that it does not take or refuses, or too little memory.
+    :raises ConfigError: arguments that it refuses, or too little memory.
     """
-    algorithm = get_algorithm(config.algo)
     try:
-        inspect.signature(algorithm).bind(config.policy, env, **keywords)
-    except TypeError as error:
-        raise ConfigError(f"{config.algo}: {one_line(error)}") from None
-    try:
-        return algorithm(config.policy, env, **keywords)
+        return config.algorithm(config.policy, env, **keywords)
     except SB3QuadError:
         raise
     except (ValueError, AssertionError) as error:
@@ -248,42 +235,51 @@ class _Training:
     """The training of a model in a run folder: what watches it, and how it ends.
 
     :param eval_envs: by task, the job's own under OWN_TASK; empty: no evaluations.
+    :param user_callbacks: those of the settings.
     """
 
     job: TrainingJob
     run: RunFolder
     model: BaseAlgorithm
     eval_envs: dict[str, VecEnv]
+    user_callbacks: list[BaseCallback]
     signals: StopSignals
     report: Report
     should_continue: ShouldContinue = lambda success, reward: True
 
     def __post_init__(self) -> None:
-        self.snapshots = SnapshotFile(
-            self.run,
-            self.job.snapshot_every,
-            self.report,
-            lambda: self.signals.received is not None,
-        )
+        job = self.job
+        run = self.run
+        self.snapshots = SnapshotFile(run, job.snapshot_every, self.report, self.signals)
+        # They are called in this order.
+        self.callbacks: list[BaseCallback] = [
+            self.snapshots,
+            EpisodeLog(run.episodes, job.config.env_id),
+            HyperparameterLog(job),
+        ]
         self.best: BestModel | None = None
         others = dict(self.eval_envs)
         own = others.pop(OWN_TASK, None)
         if own is not None:
-            job = self.job
             self.best = BestModel(
                 own,
                 job.eval_freq if job.eval_freq > 0 else NEVER,
                 job.eval_episodes,
                 seed_for("evaluation", job.seed),
-                self.run.best_model,
-                self.run.evaluations,
+                run.best_model,
+                run.evaluations,
                 self.report,
                 others,
                 self.should_continue,
                 job.config.best_by,
             )
+            self.callbacks.append(self.best)
+        if job.save_freq > 0:
+            self.callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint("{steps}"))))
+        self.callbacks += self.user_callbacks
+        self.callbacks.append(ProgressBarCallback() if job.progress else ProgressLine(self.report))
 
-    def run_to_end(self, user_callbacks: list[BaseCallback]) -> TrainingResult:
+    def run_to_end(self) -> TrainingResult:
         """Train until the job is done, or a signal or an error ends it, and save the model."""
         config = self.job.config
         # A zip says how its agent flies, but a flight cannot have the user's wrappers.
@@ -293,7 +289,7 @@ class _Training:
         start = time.perf_counter()
         try:
             try:
-                self._learn(self._callbacks(user_callbacks))
+                self._learn()
             finally:
                 # From here on, no signal interrupts what is saved.
                 self.signals.hold()
@@ -303,33 +299,14 @@ class _Training:
                 raise
         seconds = time.perf_counter() - start
         if self.signals.received:
-            return self._interrupted(seconds)
-        save_model(self.model, self.run.model)
-        self.run.resume_state.unlink(missing_ok=True)
-        self._refuse_removed_folder(self.model.num_timesteps)
-        return TrainingResult(self.job, self.run, self.model, seconds)
+            self._save_interrupted()
+        else:
+            save_model(self.model, self.run.model)
+            self.run.resume_state.unlink(missing_ok=True)
+            self._refuse_removed_folder()
+        return TrainingResult(self.job, self.run, self.model, seconds, self.signals.exit_code)
 
-    def _callbacks(self, user_callbacks: list[BaseCallback]) -> list[BaseCallback]:
-        """Return all callbacks; they are called in this order."""
-        callbacks: list[BaseCallback] = [
-            self.snapshots,
-            EpisodeLog(self.run.episodes, self.job.config.env_id),
-            HyperparameterLog(self.job),
-        ]
-        if self.best:
-            callbacks.append(self.best)
-        if self.job.save_freq > 0:
-            path = str(self.run.checkpoint("{steps}"))
-            callbacks.append(Checkpoint(self.job.save_freq, path))
-        return [
-            *callbacks,
-            *user_callbacks,
-            ProgressBarCallback() if self.job.progress else ProgressLine(self.report),
-            # A signal ends the training where the snapshot can still be completed.
-            ConvertCallback(lambda *_: not (self.signals.received and self.snapshots.is_fresh)),
-        ]
-
-    def _learn(self, callbacks: list[BaseCallback]) -> None:
+    def _learn(self) -> None:
         config = self.job.config
         log_interval = self.job.log_interval
         # An off-policy algorithm counts episodes here; n_envs of them end at about the same time.
@@ -337,7 +314,7 @@ class _Training:
             log_interval *= config.n_envs
         self.model.learn(
             config.n_timesteps - self.model.num_timesteps,
-            callback=callbacks,
+            callback=self.callbacks,
             log_interval=log_interval,
             tb_log_name=f"{config.algo}_{self.run.path.name}",
             reset_num_timesteps=self.model.num_timesteps == 0,
@@ -349,27 +326,20 @@ class _Training:
         if best.latest < self.model.num_timesteps:
             best.evaluate()
 
-    def _interrupted(self, seconds: float) -> TrainingResult:
+    def _save_interrupted(self) -> None:
         """Save the model and the snapshot after a signal."""
-        snapshot = self.snapshots.snapshot
-        when = "before the first rollout"
-        if snapshot:
-            when = f"after {snapshot.timesteps:,} timesteps: model saved to {self.run.model}"
-            # The model comes first, since it needs the least room.
-            write_bytes(self.run.model, snapshot.model)
+        # The model comes first, since it needs the least room.
+        where = self.snapshots.save_model()
+        if where:
             try:
                 self.snapshots.write()
             except ConfigError as error:
-                raise ConfigError(f"{error}; interrupted {when}") from error
-            self._refuse_removed_folder(snapshot.timesteps)
-        self.report(
-            f"interrupted by {self.signals.name} {when}; to resume: --resume {self.run.path}"
-        )
-        return TrainingResult(
-            self.job, self.run, self.model, seconds, self.signals.name, self.signals.exit_code
-        )
+                raise ConfigError(f"{error}; interrupted{where}") from error
+            self._refuse_removed_folder()
+        name = self.signals.name + (where or " before the first rollout")
+        self.report(f"interrupted by {name}; to resume: --resume {self.run.path}")
 
-    def _refuse_removed_folder(self, timesteps: int) -> None:
+    def _refuse_removed_folder(self) -> None:
         """:raises TrainingError: the run folder was removed while it was trained.
 
         It has been made again for the model alone.
@@ -377,7 +347,7 @@ class _Training:
         if not self.run.arguments.is_file():
             raise TrainingError(
                 f"run folder {self.run.path}: was removed while the training wrote to it; "
-                f"the model after {timesteps:,} timesteps is in {self.run.model}, "
+                f"the model is in {self.run.model}, "
                 "the run's settings and its records until then are lost"
             )
 
@@ -386,11 +356,7 @@ class _Training:
 
         An error that has an explanation is raised again; the message says where they are.
         """
-        where = ""
-        snapshot = self.snapshots.snapshot
-        if snapshot:
-            write_bytes(self.run.model, snapshot.model)
-            where = f"; the model after {snapshot.timesteps:,} timesteps is in {self.run.model}"
+        where = self.snapshots.save_model()
         # An error of this package says what is wrong; the place in the code adds nothing.
         if isinstance(error, SB3QuadError):
             raise type(error)(f"{error}{where}") from error
@@ -420,15 +386,20 @@ class HyperparameterLog(BaseCallback):
     def __init__(self, job: TrainingJob) -> None:
         super().__init__()
         config = job.config
-        shown = {"algo": config.algo, "env": config.env_id, "seed": job.seed, **config.settings}
-        # TensorBoard takes plain values alone.
         self._shown = {
-            name: value if isinstance(value, (bool, int, float)) else str(value)
-            for name, value in shown.items()
+            "algo": config.algo,
+            "env": config.env_id,
+            "seed": job.seed,
+            **config.settings,
         }
 
     def _on_training_start(self) -> None:
-        parameters = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
+        # TensorBoard takes plain values alone.
+        shown = {
+            name: value if isinstance(value, (bool, int, float)) else str(value)
+            for name, value in self._shown.items()
+        }
+        parameters = HParam(shown, dict.fromkeys(METRICS, 0.0))
         self.logger.record("hparams", parameters, exclude=("stdout", "log", "json", "csv"))
 
     def _on_step(self) -> bool:

@@ -159,7 +159,7 @@ def test_without_room_for_the_snapshot_the_model_is_saved_and_the_snapshot_befor
 
     Trouble.what = fill_the_disk
     with pytest.raises(
-        ConfigError, match=r"resume\.npz.*No space.*after 800 timesteps: model saved to"
+        ConfigError, match=r"resume\.npz.*No space.*the model after 800 timesteps is in"
     ):
         train(job(tmp_path), quiet)
     path = tmp_path / "dagger" / f"{ENV}_1"
@@ -206,7 +206,7 @@ def test_two_signals_within_the_update_leave_the_dataset_of_the_snapshot(
 
     monkeypatch.setattr(DAgger, "train", interrupted)
     result = train(job(tmp_path), quiet)
-    assert result.signal == "SIGINT" and the_same(resume(str(result.run.path), quiet).run, whole)
+    assert result.exit_code == 130 and the_same(resume(str(result.run.path), quiet).run, whole)
 
 
 def test_a_complete_run_says_so_and_shows_its_table(whole, capsys):
@@ -233,7 +233,7 @@ def test_a_run_folder_that_is_removed_costs_what_was_in_it_and_no_more(tmp_path,
     steps = 800 if pressed else 1600
     with pytest.raises(
         TrainingError,
-        match=rf"{run.name}: was removed .* the model after {steps:,} timesteps is in",
+        match=rf"{run.name}: was removed .* the model is in",
     ):
         train(job(tmp_path), quiet)
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == steps

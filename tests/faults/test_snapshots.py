@@ -102,13 +102,13 @@ def resuming(broken):
     def load(state):
         np.savez(run.resume_state, **state)
         with pytest.raises(ConfigError) as raised:
-            load_snapshot(run, config.algo, env, "cpu", expert=None)
+            load_snapshot(run, TrainingJob(config=config), env, expert=None)
         assert {path: path.read_bytes() for path in files} == files
         return str(raised.value)
 
     yield load
     run.resume_state.write_bytes(whole)
-    load_snapshot(run, config.algo, env, "cpu", expert=None)
+    load_snapshot(run, TrainingJob(config=config), env, expert=None)
 
 
 WRONG = {
@@ -179,9 +179,8 @@ def test_rows_that_a_buffer_had_more_when_it_was_written_are_left_out(broken):
         if name.startswith("replay_buffer.") and array.ndim
     }
     np.savez(run.resume_state, **{**state, **more})
-    model = load_snapshot(
-        run, config.algo, make_environments(config, config.n_envs, 0), "cpu", expert=None
-    )
+    env = make_environments(config, config.n_envs, 0)
+    model = load_snapshot(run, TrainingJob(config=config), env, expert=None)
     for name in more:
         rows = getattr(model.replay_buffer, name.partition(".")[2])[: len(state[name])]
         np.testing.assert_array_equal(rows, state[name])

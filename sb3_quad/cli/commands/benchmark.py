@@ -20,7 +20,13 @@ from timeit import Timer
 from typing import Any, NamedTuple
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.cli.parser import SEVERAL, YES_OR_NO, Flags, Parser, above_zero, add_flags, positive
+from sb3_quad.cli.parser import (
+    SEVERAL,
+    YES_OR_NO,
+    Flags,
+    above_zero,
+    positive,
+)
 
 ENV_ID = "QuadTargetTracking-v0"
 # The environment of the training loops.
@@ -55,10 +61,6 @@ FLAGS: Flags = {
 }
 
 
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
-
-
 def run(options: Namespace) -> int:
     """Measure and print. Returns the exit code."""
     import numpy as np
@@ -77,8 +79,8 @@ def run(options: Namespace) -> int:
         rates = np.median(_measure(subjects, options.seconds), axis=0)
     lines = []
     for subject, rate in zip(subjects, rates, strict=True):
-        cells = (f"{subject.rows:,}", f"{rate:,.0f}", f"{rate / rates[0]:,.1f} x")
-        lines.append((subject.name, *cells))
+        relative = f"{rate / rates[0]:,.1f} x"
+        lines.append((subject.name, f"{subject.rows:,}", f"{rate:,.0f}", relative))
     title = f"control steps per second (median of {REPETITIONS})"
     screen.print(text_table(title, ("", "rows", "steps/s", "to the first line"), lines))
     return 0

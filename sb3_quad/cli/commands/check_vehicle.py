@@ -20,7 +20,10 @@ from argparse import Namespace
 from typing import TYPE_CHECKING
 
 from sb3_quad.base.errors import CannotHover
-from sb3_quad.cli.parser import Flags, Parser, add_flags, natural
+from sb3_quad.cli.parser import (
+    Flags,
+    natural,
+)
 
 if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import Vehicle
@@ -63,10 +66,6 @@ FLAGS: Flags = {
     ),
     "--seed N": (natural, 0, "seed of the episodes, which no search or training uses (0)"),
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

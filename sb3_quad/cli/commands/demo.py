@@ -23,7 +23,11 @@ of the package.
 from argparse import Namespace
 
 from sb3_quad.base.files import refuse_existing, write_text
-from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, Parser, add_flags
+from sb3_quad.cli.parser import (
+    OVERWRITE,
+    TRUST,
+    Flags,
+)
 
 FLAGS: Flags = {
     "agents CONTROLLER": (
@@ -36,10 +40,6 @@ FLAGS: Flags = {
     **TRUST,
     **OVERWRITE,
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

@@ -43,9 +43,7 @@ from sb3_quad.cli.parser import (
     SWITCH,
     TRUST,
     Flags,
-    Parser,
     above_zero,
-    add_flags,
     natural,
     positive,
     whole,
@@ -68,40 +66,38 @@ def _size(text: str) -> tuple[int, int]:
         ) from None
 
 
-RUN_FLAGS: Flags = {
+# Those of rl-zoo's ``enjoy.py``, with their meanings, and those of this command.
+FLAGS: Flags = {
+    # The run folder, and the agent in it.
     "--algo": "algorithm of a trained agent, which is looked up in the log folder",
     "-f --folder --log-folder DIR": (str, "logs", "folder that holds the run folders (logs)"),
     "--exp-id N": (whole, 0, "number of the run (0: the latest one that has an agent)"),
-}
-"""The flags that name a run folder."""
-AGENT_FLAGS: Flags = {
-    "--load-best": (
-        {"dest": "which", "action": "store_const", "const": "best"},
-        None,
-        "fly the best agent of the evaluations",
-    ),
-    "--load-checkpoint N": (
-        {"dest": "which", "type": whole},
-        None,
-        "fly the checkpoint after N timesteps",
-    ),
-    "--load-last-checkpoint": (
-        {"dest": "which", "action": "store_const", "const": "last"},
-        None,
-        "fly the last checkpoint",
-    ),
-}
-"""The flags that name the agent in it, one at most; likewise the next two tables."""
-EPISODE_FLAGS: Flags = {
-    "--env": f"environment id ({DEFAULT_ENV})",
-    "--task": "a task such as target_tracking, instead of --env",
-    "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
-}
-ACTION_FLAGS: Flags = {
-    "--deterministic": (SWITCH, False, "fly the mean of a policy's actions (default)"),
-    "--stochastic": (SWITCH, False, "sample a policy's actions"),
-}
-FLAGS: Flags = {
+    "agent": {
+        "--load-best": (
+            {"dest": "which", "action": "store_const", "const": "best"},
+            None,
+            "fly the best agent of the evaluations",
+        ),
+        "--load-checkpoint N": (
+            {"dest": "which", "type": whole},
+            None,
+            "fly the checkpoint after N timesteps",
+        ),
+        "--load-last-checkpoint": (
+            {"dest": "which", "action": "store_const", "const": "last"},
+            None,
+            "fly the last checkpoint",
+        ),
+    },
+    "episode": {
+        "--env": f"environment id ({DEFAULT_ENV})",
+        "--task": "a task such as target_tracking, instead of --env",
+        "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
+    },
+    "actions": {
+        "--deterministic": (SWITCH, False, "fly the mean of a policy's actions (default)"),
+        "--stochastic": (SWITCH, False, "sample a policy's actions"),
+    },
     "controllers CONTROLLER": (
         {"nargs": "*"},
         None,
@@ -132,14 +128,6 @@ FLAGS: Flags = {
     **OVERWRITE,
     **PROGRESS,
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of this command."""
-    add_flags(parser, RUN_FLAGS)
-    for flags in (AGENT_FLAGS, EPISODE_FLAGS, ACTION_FLAGS):
-        add_flags(parser.add_mutually_exclusive_group(), flags)
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

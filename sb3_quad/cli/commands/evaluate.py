@@ -47,8 +47,6 @@ from sb3_quad.cli.parser import (
     TRUST,
     YES_OR_NO,
     Flags,
-    Parser,
-    add_flags,
     whole,
 )
 
@@ -78,10 +76,6 @@ FLAGS: Flags = {
     **TRUST,
     **PROGRESS,
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

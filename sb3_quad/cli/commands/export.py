@@ -25,7 +25,11 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, Parser, add_flags
+from sb3_quad.cli.parser import (
+    OVERWRITE,
+    TRUST,
+    Flags,
+)
 from sb3_quad.controllers.pretrained import agent_path
 
 # Facts about an exported policy that are printed, in this order.
@@ -55,10 +59,6 @@ FLAGS: Flags = {
     **TRUST,
     **OVERWRITE,
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

@@ -21,7 +21,11 @@ from pathlib import Path
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.base.types import StrDict
-from sb3_quad.cli.parser import OVERWRITE, SEVERAL, Flags, Parser, add_flags
+from sb3_quad.cli.parser import (
+    OVERWRITE,
+    SEVERAL,
+    Flags,
+)
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 
 PANELS = ("success", "survival", "reward", "losses")
@@ -64,10 +68,6 @@ FLAGS: Flags = {
     "-o --output FILE": (str, "curves.png", "picture to write: .png, .svg or .pdf (curves.png)"),
     **OVERWRITE,
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:

@@ -11,11 +11,12 @@ examples:
 from argparse import Namespace
 
 from sb3_quad.base.types import StrPath
-from sb3_quad.cli.parser import OVERWRITE, Parser, add_flags
+from sb3_quad.cli.parser import (
+    OVERWRITE,
+    Flags,
+)
 
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, {"folder FOLDER": "results folder of evaluate", **OVERWRITE})
+FLAGS: Flags = {"folder FOLDER": "results folder of evaluate", **OVERWRITE}
 
 
 def run(options: Namespace) -> int:

@@ -36,15 +36,12 @@ from sb3_quad.cli.parser import (
     SWITCH,
     TRUST,
     Flags,
-    Parser,
-    add_fields,
-    add_flags,
+    field_flags,
     given,
     positive,
     refuse,
     seed,
 )
-from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 
 FLAGS: Flags = {
@@ -71,14 +68,9 @@ FLAGS: Flags = {
     **EXECUTOR,
     **TRUST,
     **PROGRESS,
+    **field_flags(SettingsOptions),
+    **field_flags(JobOptions, *RunOptions.model_fields, "log_folder"),
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    add_flags(parser, FLAGS)
-    add_fields(parser, SettingsOptions)
-    fields = (*RunOptions.model_fields, "log_folder")
-    add_fields(parser, JobOptions, *fields, trained_agent=agent_path)
 
 
 def run(options: Namespace) -> int:

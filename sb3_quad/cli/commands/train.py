@@ -44,15 +44,12 @@ from sb3_quad.cli.parser import (
     SWITCH,
     TRUST,
     Flags,
-    Parser,
-    add_fields,
-    add_flags,
+    field_flags,
     given,
     positive,
     refuse,
     seed,
 )
-from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import (
     DEFAULT_ALGO,
     DEFAULT_ENV,
@@ -69,7 +66,6 @@ KEPT_BY_RESUME = (
     "env",
     "conf_file",
     "hyperparams",
-    "eval_env_kwargs",
     "trained_agent",
     "log_folder",
     "seed",
@@ -77,6 +73,7 @@ KEPT_BY_RESUME = (
 )
 
 
+# What is trained; tune has these as well.
 SETTINGS_FLAGS: Flags = {
     "--algo": f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})",
     "--env": (
@@ -92,31 +89,19 @@ SETTINGS_FLAGS: Flags = {
     "--gym-packages MODULE": (SEVERAL, [], "modules that register further environments"),
     **TRUST,
     **PROGRESS,
+    **field_flags(SettingsOptions),
+    **field_flags(JobOptions, "trained_agent", "n_eval_envs", "device"),
 }
+# The flags of rl-zoo's ``train.py``, with their meanings.
 FLAGS: Flags = {
+    **SETTINGS_FLAGS,
     "--thesis": (SWITCH, False, f"the thesis's method: --conf-file {THESIS}"),
-    "--seed N": (seed, None, "seed (0); negative: a random one, recorded in args.yml"),
     "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
+    **field_flags(JobOptions),
+    # These replace what the fields say.
+    "--seed N": (seed, None, "seed (0); negative: a random one, recorded in args.yml"),
+    **PROGRESS,
 }
-# Options of a run that tune has, and all others; seed and progress have flags of their own.
-SHARED_FIELDS = ("eval_env_kwargs", "trained_agent", "n_eval_envs", "device")
-TRAIN_FIELDS = [
-    name for name in JobOptions.model_fields if name not in (*SHARED_FIELDS, "seed", "progress")
-]
-
-
-def add_settings(parser: Parser) -> None:
-    """Add the flags for what is trained, which ``tune`` has as well."""
-    add_flags(parser, SETTINGS_FLAGS)
-    add_fields(parser, SettingsOptions)
-    add_fields(parser, JobOptions, *SHARED_FIELDS, trained_agent=agent_path)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the flags of rl-zoo's ``train.py``, with their meanings."""
-    add_settings(parser)
-    add_flags(parser, FLAGS)
-    add_fields(parser, JobOptions, *TRAIN_FIELDS, wandb_tags=SEVERAL)
 
 
 def run(options: Namespace) -> int:

@@ -34,15 +34,17 @@ from typing import Any
 
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.process import StopSignals
-from sb3_quad.cli.commands.train import add_settings, make_config, prepare
-from sb3_quad.cli.parser import Flags, Parser, add_flags, given, natural, positive, seed
+from sb3_quad.cli.commands.train import SETTINGS_FLAGS, make_config, prepare
+from sb3_quad.cli.parser import Flags, given, natural, positive, seed
 
 JOURNAL = "study.log"
 # Episodes per evaluation by --vec-env.
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 
 
+# Those of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings.
 FLAGS: Flags = {
+    **SETTINGS_FLAGS,
     "--n-trials N": (natural, 500, "trials of this process; 0 only writes the results (500)"),
     "--max-total-trials N": (
         positive,
@@ -68,12 +70,6 @@ FLAGS: Flags = {
     "--seed N": (seed, None, "seed of trainings and sampler, negative for a random one (0)"),
     "--eval-episodes N": (positive, None, "episodes per evaluation (batch: 240, else 48)"),
 }
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the flags of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings."""
-    add_settings(parser)
-    add_flags(parser, FLAGS)
 
 
 def run(options: Namespace) -> int:
@@ -108,23 +104,18 @@ def _make_search(options: Namespace) -> Any:
     its results.
     """
     from sb3_quad.base.validate import validate
-    from sb3_quad.training.config import TrainingJob, build_config
+    from sb3_quad.training.config import TrainingJob
     from sb3_quad.training.runs import claim_folder, file_name
     from sb3_quad.tuning.search import Search
     from sb3_quad.tuning.space import load_space
 
     config = make_config(options)
-    if options.eval_env_kwargs is not None:
-        # As a part of the settings, so that the best settings have it, too.
-        evaluation = {**config.eval_env_kwargs, **options.eval_env_kwargs}
-        settings = {**config.settings, "eval_env_kwargs": evaluation}
-        config = build_config(config.algo, config.env_id, settings)
     space = load_space(config, options.search_space)
-    episodes = options.eval_episodes
-    if episodes is None:
-        episodes = EPISODES[config.vec_env]
-    arguments = given(options, "device", "trained_agent", "n_eval_envs", "seed")
-    arguments |= {"config": config, "eval_episodes": episodes}
+    arguments = {
+        "config": config,
+        "eval_episodes": EPISODES[config.vec_env],
+        **given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes"),
+    }
     job = validate(TrainingJob, arguments, "command line")
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     try:
