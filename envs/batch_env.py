@@ -1,22 +1,27 @@
 """The part that all environments share: spaces, keywords, and reading and setting in flight."""
 
 import inspect
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import FloatArray, StrDict
+from sb3_quad.base.types import FloatArray, StrDict, StrMapping
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.batch import QuadcopterBatch, Rows
 from sb3_quad.simulation.checks import per_row
+from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.state import TARGET, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
+from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource
 
 # Keys of an info, and the fields of ``batch.outcome`` that they show.
 INFOS = {
@@ -26,6 +31,27 @@ INFOS = {
     "collision": "collision",
     "out_of_range": "out_of_range",
 }
+
+
+class FlightKeywords(TypedDict, total=False):
+    """Keywords of the environments for editors and type checkers.
+
+    :class:`~sb3_quad.simulation.settings.FlightSettings` declares them, with their defaults and
+    meanings. Each constructor adds ``task``, and a test holds both lists equal.
+    """
+
+    task_kwargs: StrMapping | None
+    vehicle: VehicleSource | Sequence[VehicleSource]
+    rotor_layout: VehicleSource | None
+    noise: npt.ArrayLike | StrMapping | Noise
+    observation_mean: npt.ArrayLike | None
+    observation_std: npt.ArrayLike | None
+    last_action: bool
+    history: Sequence[int] | None
+    position_integral: StrMapping | PositionIntegral | None
+    vehicles: StrMapping | VehicleDistribution | None
+    randomize: StrMapping | Randomization | None
+    max_episode_steps: int | Sequence[int]
 
 
 def quadcopter_spaces(size: int = OBSERVATION_SIZE) -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
@@ -54,7 +80,7 @@ class BatchEnv:
         n_threads: int | None,
         task: TaskSpec,
         autoreset: bool,
-        **keywords: Any,
+        **keywords: Unpack[FlightKeywords],
     ) -> None:
         """Make the batch of n rows that fly as the keywords say.
 

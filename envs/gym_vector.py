@@ -1,16 +1,16 @@
 """``QuadcopterVectorEnv``: n quadcopters as one Gymnasium vector environment."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, BoolArray, Float32Array, StrDict
-from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
 
@@ -46,7 +46,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         seed: int | None = None,
         n_threads: int | None = None,
-        **keywords: Any,
+        **keywords: Unpack[FlightKeywords],
     ) -> None:
         if render_mode is not None:
             raise ConfigError(

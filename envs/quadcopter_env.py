@@ -1,15 +1,16 @@
 """``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import gymnasium
 import numpy as np
+from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, Image, StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.settings import ENDLESS, AsList
@@ -211,7 +212,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         render_width: int = 640,
         render_height: int = 480,
         seed: int | None = None,
-        **keywords: Any,
+        **keywords: Unpack[FlightKeywords],
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))

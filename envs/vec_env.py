@@ -10,11 +10,12 @@ from gymnasium import Wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, StrDict
-from sb3_quad.envs.batch_env import BatchEnv, quadcopter_spaces
+from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
 _OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
@@ -73,7 +74,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         staggered: bool = False,
         seed: int | None = None,
         n_threads: int | None = None,
-        **keywords: Any,
+        **keywords: Unpack[FlightKeywords],
     ) -> None:
         self._make_batch(n_envs, seed, n_threads, task, autoreset=True, **keywords)
         # Only QuadcopterEnv draws.

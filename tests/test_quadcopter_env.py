@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.batch_env import FlightKeywords
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.simulation.settings import FlightSettings
@@ -304,15 +305,15 @@ def test_bad_actions_raise(env: QuadcopterEnv, action: Any, message: str) -> Non
         ),
         (lambda env: QuadcopterEnv(task="target_trackin"), "did you mean 'target_tracking'"),
         (
-            lambda env: QuadcopterEnv(noize=0),
+            lambda env: QuadcopterEnv(noize=0),  # type: ignore[call-arg]
             "QuadcopterEnv: unknown keyword 'noize': did you mean 'noise'",
         ),
         (
-            lambda env: QuadcopterEnv(rendermode="human"),
+            lambda env: QuadcopterEnv(rendermode="human"),  # type: ignore[call-arg]
             "QuadcopterEnv: .* 'rendermode': did you mean 'render_mode'",
         ),
         (
-            lambda env: QuadcopterVecEnv(1, nthreads=1),
+            lambda env: QuadcopterVecEnv(1, nthreads=1),  # type: ignore[call-arg]
             "QuadcopterVecEnv: .* 'nthreads': did you mean 'n_threads'",
         ),
         (lambda env: QuadcopterEnv(vehicle="itn"), "did you mean 'itm'"),
@@ -372,3 +373,8 @@ def test_the_manual_lists_every_argument() -> None:
     drawn = {"render_mode", "render_width", "render_height"}
     # max_episode_steps is an argument of gymnasium.make.
     assert listed == {*FlightSettings.model_fields, *drawn} - {"max_episode_steps"}
+
+
+def test_the_typed_keywords_are_the_flight_settings() -> None:
+    typed = {"task", *FlightKeywords.__annotations__}
+    assert typed == FlightSettings.model_fields.keys()
