@@ -42,6 +42,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         self,
         num_envs: int = 1,
         task: TaskSpec = "target_tracking",
+        *,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         seed: int | None = None,

@@ -208,6 +208,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     def __init__(
         self,
         task: TaskSpec = "target_tracking",
+        *,
         render_mode: str | None = None,
         render_width: int = 640,
         render_height: int = 480,

@@ -71,6 +71,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self,
         n_envs: int,
         task: TaskSpec = "target_tracking",
+        *,
         staggered: bool = False,
         seed: int | None = None,
         n_threads: int | None = None,

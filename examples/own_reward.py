@@ -51,7 +51,11 @@ def make_env(n_envs, seed):
     thesis.
     """
     env = QuadcopterVecEnv(
-        n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed
+        n_envs,
+        "target_tracking",
+        task_kwargs={"tilt_cost": 0.004},
+        max_episode_steps=500,
+        seed=seed,
     )
     # Then ep_rew_mean is that of the new reward; SB3 warns of that.
     return VecMonitor(CalmActions(env, cost=2.0))
