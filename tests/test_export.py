@@ -160,9 +160,7 @@ def test_it_sees_the_frames_of_the_environment_in_whole_flights(
     assert "3000 observations of flights" in exported.metadata["check"]
     file, policy = load(file_format, exported, kind), PPO.load(path, device="cpu")
     near = {"target_distance": 1.5, "nearest_target": 0.3}
-    env = QuadcopterVecEnv(
-        4, "target_tracking", near, noise=0.0, seed=5, max_episode_steps=1000, **sees
-    )
+    env = QuadcopterVecEnv(4, task_kwargs=near, noise=0.0, seed=5, max_episode_steps=1000, **sees)
     seen, state, integrated = env.reset(), None, 0
     for step in range(1000):  # the file flies
         result, state = file(physical_features(env.true_state()), state)

@@ -86,7 +86,7 @@ def assert_it_flies(agent, vehicle, file_format="torchscript"):
         *vehicle.rotor_positions[0], vehicle.rotor_directions[0]
     )
     assert exported.metadata["rotors"].startswith(first[:-1])
-    file = File(load(file_format, exported.content, "own"), vehicle)
+    file = File(load(file_format, exported, "own"), vehicle)
     flights = fly(file, "state_recovery", 8, 3, vehicle, noise=0.0, max_steps=500)
     assert flights.survival.all() and flights.final_error.max() < 0.2
 

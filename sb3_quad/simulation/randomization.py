@@ -82,6 +82,7 @@ class Range(Frozen, Generic[Bounded]):
 
 NonNegativeRange = Range[NonNegativeFloat]
 PositiveRange = Range[Annotated[float, Field(ge=1e-9)]]
+MAX_WEIGHTS = 100.0  # the greatest force or torque in multiples of a weight
 # N, N m or m/s, or multiples of a weight
 Magnitude = Range[Annotated[float, Field(ge=0, le=1e4)]]
 Offset = Range[Annotated[float, Field(ge=-1, le=1)]]  # m
@@ -120,6 +121,11 @@ class RandomVector(Frozen):
     def _for_short(cls, data: Any) -> Any:
         return {"magnitude": data} if isinstance(data, (list, tuple, int, float)) else data
 
+    @model_validator(mode="after")
+    def _can_be(self) -> "RandomVector":
+        _check_weights(self.magnitude, self.unit)
+        return self
+
     @field_validator("direction")
     @classmethod
     def _points_somewhere(cls, value: Vector | None) -> Vector | None:
@@ -156,6 +162,11 @@ class Gusts(Frozen):
     time_constant: PositiveFloat = Field(default=1.0, le=1e6)
     """time after which a gust has faded to 1/e, s"""
 
+    @model_validator(mode="after")
+    def _can_be(self) -> "Gusts":
+        _check_weights(self.std, self.unit)
+        return self
+
     def numbers(self, control_step: float) -> list[float]:
         """Return numbers in the order of ``GUST``.
 
@@ -163,6 +174,11 @@ class Gusts(Frozen):
         """
         keeps = math.exp(-control_step / self.time_constant)
         return [*self.std.numbers(), keeps, self.unit == "weight"]
+
+
+def _check_weights(magnitude: Magnitude, unit: Unit) -> None:
+    if unit == "weight" and magnitude.high > MAX_WEIGHTS:
+        raise ValueError(f"{magnitude.high:g} (weight): must be at most {MAX_WEIGHTS:g}")
 
 
 class Randomization(Frozen):
