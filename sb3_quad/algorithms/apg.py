@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
@@ -16,20 +16,53 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import (
-    ExpertMixin,
-    flight_settings_of,
-    model_of,
-    policy_arguments,
-)
+from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
 from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost
 from sb3_quad.algorithms.networks.gradients import Pullback, mean_actions, network_of
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, TrainingError
-from sb3_quad.simulation.settings import KEY
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.simulation.tape import FlightCost
+
+
+class Tape(Protocol):
+    """Records flights of n environments, and carries gradients back through their steps.
+
+    An environment that ``APG`` can train on has ``record(n_steps, substeps)``, which returns one.
+    A recording is :meth:`reset`, then :meth:`step` once for each step; the way back is
+    :meth:`begin`, then :meth:`backward` once for each step, the last one first.
+    """
+
+    def reset(self, carry_on: bool) -> Float32Array:
+        """Begin a recording; return the observations, (n, ...).
+
+        :param carry_on: whether to continue the flights of the last recording where they can be.
+        """
+
+    def step(self, actions: Float32Array) -> Float32Array:
+        """Take a step by actions (n, a); return the observations after it, (n, ...)."""
+
+    def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return the sum of the rewards, the length, and whether it was lost, of each flight."""
+
+    def begin(self, cost: FlightCost) -> float:
+        """Begin the way back; return the mean cost of a step.
+
+        :param cost: that of a quadcopter's states. An environment with a cost of its own ignores
+            it.
+        """
+
+    def backward(self, step: int, by_observation: Float32Array) -> FloatArray:
+        """Return the gradient of the mean cost by the actions of a step, (n, a).
+
+        It includes what these actions do in later steps, of which the tape keeps account.
+
+        :param by_observation: the gradient by the observations after the step, (n, ...), by way of
+            the actions that the policy took on them.
+        """
 
 
 class APG(ExpertMixin, OnPolicyAlgorithm):
@@ -47,7 +80,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     actor learns; the critic stays as it is.
 
     ``env`` must be differentiable: a :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` with any of
-    its settings, or an environment of your own that has ``record(n_steps)``; docs/apg.md shows one.
+    its settings, or an environment of your own whose ``record(n_steps, substeps)`` returns a
+    :class:`Tape`; docs/apg.md shows one.
     A saved model loads with ``PPO.load``, even where this package is not installed.
 
     Arguments that are not listed here mean what they mean in :class:`stable_baselines3.PPO`.
@@ -117,7 +151,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.carry_on = carry_on
         self.cost = cost
         self.substeps = substeps
-        self._tape: Any = None
+        self._tape: Tape | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -137,18 +171,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ConfigError: an environment that cannot be differentiated.
         """
-        record = getattr(self.env.unwrapped, "record", None) if self.env is not None else None
-        if record is None:
-            raise ConfigError(
-                f"{self.env}: APG differentiates flights, and this environment has no"
-                " record(n_steps); see docs/apg.md"
-            )
-        if flight_settings_of(self.env) is None and self.env.has_attr(KEY):
-            raise ConfigError(
-                "APG flies without the wrappers of its environment, and one of them changes"
-                " observations or actions; remove it"
-            )
-        self._tape = record(self.n_steps, self.substeps)
+        self._tape = self._new_tape()
         with self._threads():
             return super().learn(
                 total_timesteps=total_timesteps,
@@ -158,6 +181,26 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 reset_num_timesteps=reset_num_timesteps,
                 progress_bar=progress_bar,
             )
+
+    def _new_tape(self) -> Tape:
+        """Return a tape of the environment, below its wrappers."""
+        assert self.env is not None
+        env: Any = self.env
+        # The statistics of episodes come from the tape.
+        if isinstance(env, VecMonitor):
+            env = env.venv
+        if env is not env.unwrapped:
+            raise ConfigError(
+                f"{type(env).__name__}: APG differentiates the environment below its wrappers, and"
+                " would leave this one out; remove it, and give an own reward as a cost"
+            )
+        if not hasattr(env, "record"):
+            raise ConfigError(
+                f"{type(env).__name__}: APG differentiates flights, and this environment has no"
+                " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
+            )
+        tape: Tape = env.record(self.n_steps, self.substeps)
+        return tape
 
     def collect_rollouts(
         self,
@@ -170,6 +213,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         network = network_of(self.policy)
         tape = self._tape
+        assert tape is not None
         callback.on_rollout_start()
         observations = tape.reset(self.carry_on)
         self._observations = []
@@ -194,6 +238,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         tape = self._tape
+        assert tape is not None
         cost = tape.begin(partial(cost_and_gradients, self.cost))
 
         # The observation after the last step leads to no action.

@@ -165,6 +165,13 @@ class FlightTape:
         result: FloatArray = self._by_actions[step]
         return result
 
+    @property
+    def by_start(self) -> FloatArray:
+        """The gradient by the state before the step that :meth:`backward` was last called for,
+        (MOVING, n); without what comes through the observation of that state.
+        """
+        return self._gradient
+
 
 @compiled
 def undo(

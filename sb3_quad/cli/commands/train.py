@@ -76,7 +76,7 @@ KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
 
 
 SETTINGS_FLAGS: Flags = {
-    "--algo": f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})",
+    "--algo": f"algorithm: dagger, ppo_bc, sac_bc, apg, ppo, sac or td3 ({DEFAULT_ALGO})",
     "--env": (
         f"environment id ({DEFAULT_ENV}); "
         "any id that Gymnasium knows, with --vec-env dummy or subproc"
