@@ -241,6 +241,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         assert tape is not None
         cost = tape.begin(partial(cost_and_gradients, self.cost))
 
+        # What the critic or an earlier update has left; autograd adds to it.
+        self.policy.optimizer.zero_grad()
         # The observation after the last step leads to no action.
         network = Pullback(self.policy, self.env.num_envs)
         by_observations = np.zeros_like(self._observations[0])
@@ -248,7 +250,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             by_actions = tape.backward(step, by_observations)
             by_observations = network(self._observations[step], by_actions)
 
-        self.policy.optimizer.zero_grad()
         network.set_gradients()
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         if not (np.isfinite(cost) and th.isfinite(norm)):
