@@ -54,7 +54,7 @@ def cost_and_gradients(
     gradients = th.autograd.grad(
         mean, (by_states, by_actions), allow_unused=True, materialize_grads=True
     )
-    return float(mean), gradients[0].numpy(), gradients[1].numpy()
+    return float(mean.detach()), gradients[0].numpy(), gradients[1].numpy()
 
 
 def length(vectors: th.Tensor) -> th.Tensor:
