@@ -16,7 +16,7 @@ from sb3_quad.simulation.kernel import (
     load_vehicles,
     new_block,
 )
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features
+from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features, with_noise
 from sb3_quad.simulation.random import STEP, random_words, standard_normals
 from sb3_quad.simulation.state import STATE_SIZE
 from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
@@ -303,8 +303,8 @@ def _undo_integral(b, lane, i, integral, numbers, frame, by_integral):
     error2 = speed2 = 0.0
     for axis in range(3):
         e, v = F.position + axis, F.velocity + axis
-        error = b.feature[e, lane] * (1.0 + b.noise_level[lane] * b.noise[e, lane])
-        speed = b.feature[v, lane] * (1.0 + b.noise_level[lane] * b.noise[v, lane])
+        error = with_noise(b, e, lane)
+        speed = with_noise(b, v, lane)
         error2 += error * error
         speed2 += speed * speed
     near = error2 < numbers[1] and speed2 < numbers[2]
