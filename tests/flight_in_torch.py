@@ -147,8 +147,12 @@ class Vehicles:
         torque = torque - th.linalg.cross(rates, self.inertia * rates)
         rates = rates + dt * torque / self.inertia
 
-        # Only what PyBullet does not limit is described here.
-        assert velocity.abs().max() < 100 and rates.norm(dim=1).max() < 100
+        # PyBullet's limits, in the world frame. Their derivative is taken as 1.
+        velocity = velocity + (velocity.clamp(-100.0, 100.0) - velocity).detach()
+        limited = turn(to_body, turn(to_world, rates).clamp(-100.0, 100.0))
+        is_fast = rates.norm(dim=1, keepdim=True) > 100.0
+        rates = rates + th.where(is_fast, limited - rates, 0.0).detach()
+
         attitude = product(state.quaternion, exponential(dt / 2 * rates))
         attitude = attitude / attitude.norm(dim=1, keepdim=True)
         return State(state.position + dt * velocity, attitude, velocity, rates, speeds)
