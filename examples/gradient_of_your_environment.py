@@ -150,9 +150,9 @@ def main():
 
     env = Carts(64, arguments.seed)
     model = APG("MlpPolicy", env, n_steps=N_STEPS, learning_rate=3e-3, seed=arguments.seed)
-    print("before: cost %.3f, %.3f m from the mark" % mean_cost(model, seed=1))
+    print("before: cost {:.3f}, {:.3f} m from the mark".format(*mean_cost(model, seed=1)))
     model.learn(arguments.updates * N_STEPS * env.num_envs)
-    print("after: cost %.3f, %.3f m from the mark" % mean_cost(model, seed=1))
+    print("after: cost {:.3f}, {:.3f} m from the mark".format(*mean_cost(model, seed=1)))
 
 
 if __name__ == "__main__":

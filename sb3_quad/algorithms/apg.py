@@ -224,6 +224,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
+        assert self.ep_info_buffer is not None
+        assert self.ep_success_buffer is not None
         for reward, length, is_lost in zip(*tape.episodes(), strict=True):
             self.ep_info_buffer.append({"r": reward, "l": length, "t": 0.0})
             self.ep_success_buffer.append(not is_lost)
@@ -235,9 +237,11 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
         :raises TrainingError: no row has a finite gradient; the parameters stay as they were.
         """
-        self.policy.set_training_mode(True)
+        # Layers such as dropout act as they did in the recorded flight.
+        self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         tape = self._tape
+        assert self.env is not None
         assert tape is not None
         cost = tape.begin(partial(cost_and_gradients, self.cost))
 

@@ -49,7 +49,7 @@ def cost_and_gradients(
     by_states = th.from_numpy(states).requires_grad_()
     by_actions = th.from_numpy(actions).double().requires_grad_()
     parts = [by_states[:, rows].transpose(1, 2) for rows in row_slices(STATE).values()]
-    each = cost(FlownStates(*parts, by_actions))
+    each = cost(FlownStates._make([*parts, by_actions]))
     mean = th.where(th.from_numpy(counts), each, 0.0).mean()
     gradients = th.autograd.grad(
         mean, (by_states, by_actions), allow_unused=True, materialize_grads=True

@@ -1,8 +1,8 @@
-"""The adjoint of a control step: carry the gradient of a flight's cost from the state after the step
-to the state before it.
+"""The adjoint of a control step: carry the gradient of a flight's cost from the state after the
+step to the state before it.
 
-``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost by the first ``MOVING``
-rows of a block's state. Each function here undoes one function of :mod:`.physics` or
+``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost by the first
+``MOVING`` rows of a block's state. Each function here undoes one function of :mod:`.physics` or
 :mod:`.observation`: it turns the gradient by the results into the gradient by the arguments.
 
 The states between the physics steps of a control step are computed again: that costs less than

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numba import float32
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.adjoint import MOVING, undo_features, undo_flight, undo_noise
 from sb3_quad.simulation.batch import QuadcopterBatch
@@ -18,7 +19,7 @@ from sb3_quad.simulation.kernel import (
 )
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features, with_noise
 from sb3_quad.simulation.random import STEP, random_words, standard_normals
-from sb3_quad.simulation.state import STATE_SIZE
+from sb3_quad.simulation.state import STATE_SIZE, P
 from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
 
 FlightCost = Callable[[FloatArray, Float32Array, BoolArray], tuple[float, FloatArray, FloatArray]]
@@ -70,12 +71,24 @@ class FlightTape:
         """
         batch = self.batch
         observations = batch.reset(np.flatnonzero(self.lost) if carry_on else None)
+        self._refuse_fast_motors()
         self._at = 0
         self._streams = batch.streams.copy()
         self._queue = batch.queue.copy()
         self.lengths[:] = self.n_steps
         self.lost[:] = False
         return observations
+
+    def _refuse_fast_motors(self) -> None:
+        """Check that no rotor overshoots its commanded speed because the physics steps are long."""
+        vehicles = self.batch.vehicles
+        gains = np.maximum(vehicles[P.motor_gain_up], vehicles[P.motor_gain_down])
+        fastest = float((gains * (vehicles[P.exact_motors] == 0.0)).max())
+        if fastest * self.physics_step > 1.0:
+            raise ConfigError(
+                f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
+                " give None, which is what the simulation has"
+            )
 
     def step(self, actions: Float32Array) -> Float32Array:
         """Fly a control step; return the observations after it.
