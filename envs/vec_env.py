@@ -16,6 +16,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, StrDict
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
+from sb3_quad.simulation.tape import FlightTape
 from sb3_quad.simulation.tasks import TaskSpec
 
 _OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
@@ -143,6 +144,14 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
                 "collision": collision,
                 "out_of_range": out_of_range,
             }
+
+    def record(self, n_steps: int, substeps: int | None = None) -> FlightTape:
+        """Return a tape that records flights of this environment and differentiates them.
+
+        :param n_steps: control steps of a recording.
+        :param substeps: physics steps in a control step of a recording; None: as in :meth:`step`.
+        """
+        return FlightTape(self.batch, n_steps, substeps)
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""

@@ -1,5 +1,5 @@
-"""Quadcopter environments, experts, DAgger, and PPO and SAC with behavioural cloning for
-Stable-Baselines3.
+"""Quadcopter environments, experts, DAgger, PPO and SAC with behavioural cloning, and training by
+the gradient of the model, for Stable-Baselines3.
 """
 
 from pathlib import Path
@@ -16,6 +16,7 @@ from sb3_quad.base.imports import lazy_names  # noqa: E402
 from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:
+    from sb3_quad.algorithms.apg import APG
     from sb3_quad.algorithms.dagger import DAgger
     from sb3_quad.algorithms.ppo_bc import PPOBC
     from sb3_quad.algorithms.sac_bc import SACBC
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import load_vehicle
 
 __all__ = [
+    "APG",
     "PPOBC",
     "SACBC",
     "DAgger",
@@ -52,6 +54,7 @@ __all__ = [
 
 # Imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
 _LAZY = {
+    "APG": "sb3_quad.algorithms.apg",
     "DAgger": "sb3_quad.algorithms.dagger",
     "GeometricExpert": "sb3_quad.experts.geometric",
     "PIDExpert": "sb3_quad.experts.pid",

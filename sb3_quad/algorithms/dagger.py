@@ -427,8 +427,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             clip_range_vf=math.inf if clip_range_vf is None else clip_range_vf,
             ent_coef=self.ent_coef,
             l2_coef=self.l2_coef,
-            aux_coef=self.aux_coef,
-            aux_layer=self._aux_layer,
         )
         actor_parameters, critic_parameters = actor_and_critic_parameters(self.policy)
 

@@ -31,6 +31,7 @@ _OURS = {
     "PPOBC": ("PPO", "bc_coef"),
     "DAgger": ("PPO", "beta"),
     "SACBC": ("SAC", "bc_coef"),
+    "APG": ("PPO", "carry_on"),
 }
 # Of the pickles of an agent, ``predict`` needs only these.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")
@@ -65,7 +66,7 @@ def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
 def saved_algorithm(path: StrPath) -> str:
     """Return the name of the algorithm that made an SB3 ``.zip``.
 
-    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, SACBC or DAgger of this package.
+    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, SACBC, DAgger or APG of this package.
     A zip does not name its algorithm. The policy class and the settings in it tell.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an

@@ -77,7 +77,7 @@ class QuadcopterBatch:
         say.
     """
 
-    _arrays: list[Any]
+    _arguments: dict[str, Any]
 
     def __init__(
         self,
@@ -213,6 +213,17 @@ class QuadcopterBatch:
         """
         return self._run(FLY, actions, np.zeros(self.n, np.bool_))
 
+    def step_on(self, actions: AnyArray, substeps: int) -> StepResult:
+        """Like :meth:`step`, but no row begins another episode, and there is no time limit.
+
+        :param substeps: physics steps in this control step, which lasts as long as any.
+        """
+        physics_step = self.physics_step * self.substeps / substeps
+        dones = np.zeros(self.n, np.bool_)
+        return self._run(
+            FLY, actions, dones, physics_step=physics_step, substeps=substeps, autoreset=False
+        )
+
     def score(self, actions: AnyArray) -> StepResult:
         """Score a control step that another simulator has flown and written into ``state``; else
         like :meth:`step`.
@@ -221,8 +232,11 @@ class QuadcopterBatch:
         """
         return self._run(SCORE, actions, np.zeros(self.n, np.bool_))
 
-    def _run(self, mode: int, actions: AnyArray, dones: BoolArray) -> StepResult:
-        """Call the compiled step with fresh arrays for its results."""
+    def _run(self, mode: int, actions: AnyArray, dones: BoolArray, **changes: Any) -> StepResult:
+        """Call the compiled step with fresh arrays for its results.
+
+        :param changes: arguments of the compiled step in this call, instead of the batch's own.
+        """
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):
             raise ValueError(
@@ -233,7 +247,8 @@ class QuadcopterBatch:
         results = observations, rewards, dones
         # A thread pays off from two chunks on.
         helpers = min(self.threads, self.n // (2 * CHUNK)) - 1
-        if not share_out(step, helpers, mode, array, *results, *self._arrays):
+        arguments = self._arguments if not changes else self._arguments | changes
+        if not share_out(step, helpers, mode, array, *results, *arguments.values()):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(
                 f"actions: row {row} is {array[row].tolist()}; every number must be finite"
@@ -380,7 +395,7 @@ class QuadcopterBatch:
         self.mean = self.scaling[:OBSERVATION_SIZE]
         self.std = self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
         self.noise_level, self.additive_level = self.scaling[-2:]
-        self._arrays = [getattr(self, name) for name in BATCH_ARGUMENTS]
+        self._arguments = {name: getattr(self, name) for name in BATCH_ARGUMENTS}
 
 
 def _kind(array: AnyArray | None) -> str:

@@ -100,6 +100,18 @@ def features(b):
         store(out[F.velocity :], lane, float32(vx), float32(vy), float32(vz))
 
 
+@inlined
+def with_noise(b, k, lane):
+    """Return feature k of a lane with its noise, in its unit. Relative noise alone has its sign."""
+    feature = b.feature[k, lane]
+    noise = b.noise[k, lane]
+    relative = b.noise_level[lane] * feature
+    fixed = b.additive[lane] / b.inverse_std[k, lane]
+    both = feature + math.sqrt(relative * relative + fixed * fixed) * noise
+    alone = feature * (float32(1.0) + b.noise_level[lane] * noise)
+    return both if b.additive[lane] > float32(0.0) else alone
+
+
 @fast
 def _disturb_and_scale(b):
     """Add noise to ``b.feature`` and scale it by Eq. 3.16, in place."""
@@ -113,10 +125,7 @@ def _disturb_and_scale(b):
                 # Relative noise alone, the usual case, needs no square root.
                 noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * b.noise[k, lane])
             else:
-                relative = b.noise_level[lane] * feature[k, lane]
-                fixed = b.additive[lane] / b.inverse_std[k, lane]
-                spread = math.sqrt(relative * relative + fixed * fixed)
-                noisy = feature[k, lane] + spread * b.noise[k, lane]
+                noisy = with_noise(b, k, lane)
             feature[k, lane] = (noisy - b.mean[k, lane]) * b.inverse_std[k, lane]
 
 

@@ -189,6 +189,8 @@ class TrainingConfig(Frozen):
             return {}
         if self.is_off_policy:
             return {"train_freq": n_steps}
+        if "batch_size" not in constructor_parameters(get_algorithm(self.algo)):
+            return {"n_steps": n_steps}
         rollout = n_steps * self.n_envs
         # PPOBC chooses a batch size of its own unless it is given one.
         batch_size = min(self.keyword("batch_size") or rollout, rollout)

@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from sb3_quad.algorithms.networks import losses
 from sb3_quad.algorithms.networks.losses import Loss
 from sb3_quad.algorithms.networks.perceptron import Perceptron
-from sb3_quad.base.types import Float32Array, IntArray
+from sb3_quad.base.types import Float32Array, FloatArray, IntArray
 
 Terms = dict[str, float]
 """The terms of a loss without their weights, and ``loss``, their weighted sum, by logged name."""
@@ -92,8 +92,6 @@ class Perceptrons(NamedTuple):
         terms: Terms = {}
         if loss.bc_coef != 0.0:
             terms["bc_loss"] = sums[losses.CLONING] / n
-        if loss.aux_layer:
-            terms["aux_loss"] = sums[losses.AUXILIARY] / n
         if loss.policy_coef != 0.0:
             terms["policy_gradient_loss"] = sums[losses.POLICY] / n
             terms["approx_kl"] = sums[losses.KL] / n
@@ -157,6 +155,36 @@ def act(network: Perceptrons, observations: th.Tensor) -> tuple[th.Tensor, th.Te
     log_std = network.log_std
     actions = mean + th.exp(log_std) * th.normal(th.zeros_like(mean), th.ones_like(mean))
     return actions, values, -losses.gaussian_nll(mean, log_std, actions)
+
+
+class Pullback:
+    """Carries gradients by a policy's mean actions back to observations, and adds up those by its
+    parameters.
+
+    :param n: rows of each call.
+    """
+
+    def __init__(self, policy: ActorCriticPolicy, n: int) -> None:
+        self._network = network_of(policy)
+        self._policy = policy
+        if isinstance(self._network, Perceptrons):
+            self._sums = self._network.actor.new_sums(n)
+
+    def __call__(self, observations: npt.NDArray[Any], by_actions: FloatArray) -> Float32Array:
+        """Return the gradient by observations (n, ...), given that by the mean actions (n, a)."""
+        given = by_actions.astype(np.float32)
+        if isinstance(self._network, Perceptrons):
+            return self._network.actor.pullback(_flat(observations), given, self._sums)
+        inputs = th.as_tensor(observations, device=self._policy.device).requires_grad_()
+        means = self._policy.get_distribution(inputs).mode()
+        means.backward(th.as_tensor(given, device=means.device))  # type: ignore[no-untyped-call]
+        assert inputs.grad is not None
+        return np.asarray(inputs.grad.cpu().numpy())
+
+    def set_gradients(self) -> None:
+        """Set ``.grad`` of the actor's parameters; of other policies autograd has done so."""
+        if isinstance(self._network, Perceptrons):
+            self._network.actor.set_gradients(self._sums)
 
 
 def _add(parameter: th.nn.Parameter, gradient: th.Tensor) -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import float32, uint64
 
-from sb3_quad.algorithms.networks.losses import actor_loss, auxiliary_loss, critic_loss
+from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
 from sb3_quad.base.types import Float32Array, IntArray
 from sb3_quad.simulation.compiled import compiled
 
@@ -203,15 +203,18 @@ def _forward(scratch, x, index, first, count, layers):
 
 
 @compiled
-def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, terms):
+def _backward(scratch, at, layers, sums, last_layer):
     """Add the gradient of a block by the parameters to ``sums``.
 
     The block's outputs begin at ``at``, and their gradient lies behind the layers. From there on,
-    two layers' gradients take turns. That of an actor's auxiliary loss is added on the way.
+    two layers' gradients take turns.
+
+    :param last_layer: 1: stop at the parameters of the first layer; 0: go on to the inputs.
+    :return: where the gradient of that layer begins.
     """
     widths, kinds, _, transposed = layers
     here = widths.sum() * ROWS
-    there = (widths.sum() + widths.max()) * ROWS
+    there = here + widths.max() * ROWS
     place = len(sums)
     for layer in range(len(widths) - 1, 0, -1):
         rows = widths[layer]
@@ -223,15 +226,12 @@ def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, 
         middle = place + rows * columns
         _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows])
         _add_products(g, _layer(scratch, at, columns), sums[place:middle].reshape(rows, columns))
-        if layer > 1:
+        if layer > last_layer:
             _multiply(
                 transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns)
             )
-            if a > 0 and layer - 1 == loss.aux_layer:
-                hidden = _layer(scratch, at, columns)
-                g_hidden = _layer(scratch, there, columns)
-                auxiliary_loss(hidden, index, first, count, targets, loss, a, g_hidden, terms)
             here, there = there, here
+    return here
 
 
 @compiled
@@ -294,6 +294,32 @@ def gradient(
                 )
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
-            own = sums[chunk, :size]
-            a = len(log_std)
-            _backward(scratch, at, layers, own, index, first, count, targets, loss, a, terms[chunk])
+            _backward(scratch, at, layers, sums[chunk, :size], 1)
+
+
+@compiled
+def pullback(
+    first_chunk, last_chunk, chunks, scratch, layers, x, index, by_outputs, by_inputs, sums
+):
+    """Carry a gradient by the outputs back to the inputs, and add that by all parameters.
+
+    Arguments are as for :func:`forward`, and:
+
+    :param by_outputs: (m, outputs), of the same rows as x.
+    :param by_inputs: float32 (m, inputs), is written.
+    :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
+    """
+    blocks = (len(index) + ROWS - 1) // ROWS
+    behind = layers.widths.sum() * ROWS
+    for chunk in range(first_chunk, last_chunk):
+        for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
+            first = block * ROWS
+            count = min(ROWS, len(index) - first)
+            at = _forward(scratch, x, index, first, count, layers)
+            g = _layer(scratch, behind, layers.widths[-1])
+            _load(by_outputs, index, first, count, g)
+            here = _backward(scratch, at, layers, sums[chunk], 0)
+            g = _layer(scratch, here, layers.widths[0])
+            for i in range(count):
+                for k in range(by_inputs.shape[1]):
+                    by_inputs[index[first + i], k] = g[k, i]

@@ -4,8 +4,7 @@ In shapes, ``b`` is the mini-batch, ``a`` the action dimension. Compiled losses 
 from rows of numbers. A row for an actor holds, as far as the loss has such a term:
 
 - the cloning term: the expert's action (a);
-- the policy term: the action flown (a), its log-probability then, its advantage;
-- the auxiliary term: what the first units of a hidden layer should predict.
+- the policy term: the action flown (a), its log-probability then, its advantage.
 
 A row for a critic holds V from when the rollout was flown, and the return.
 """
@@ -33,7 +32,7 @@ HUBER_DELTA = 0.05
 MSE_WEIGHT = 3.0
 # "agreement" clones up to this root mean squared difference of actions.
 NEAR = 0.3
-CLONING, POLICY, KL, CLIPPED, AUXILIARY, TERMS = range(6)
+CLONING, POLICY, KL, CLIPPED, TERMS = range(5)
 """The sums that a compiled actor's loss adds up to. A critic's has one only, ``VALUE``."""
 VALUE = 0
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -43,9 +42,8 @@ class Loss(NamedTuple):
     """Weights and constants of a compiled loss, under the names of the algorithms' arguments.
 
     ``policy_coef`` weighs PPO's clipped surrogate. ``bc_loss`` and ``bc_filter`` are indices of
-    ``CLONING_LOSSES`` and ``BC_FILTERS``. ``aux_layer`` counts hidden layers from 1; 0: no
-    auxiliary term. An infinite ``clip_range_vf`` clips nothing. A normalised advantage is
-    (advantage - ``advantage_shift``) * ``advantage_scale``.
+    ``CLONING_LOSSES`` and ``BC_FILTERS``. An infinite ``clip_range_vf`` clips nothing. A normalised
+    advantage is (advantage - ``advantage_shift``) * ``advantage_scale``.
     """
 
     policy_coef: float = 0.0
@@ -59,8 +57,6 @@ class Loss(NamedTuple):
     max_clipped_value: bool = True
     ent_coef: float = 0.0
     l2_coef: float = 0.0
-    aux_coef: float = 0.0
-    aux_layer: int = 0
     advantage_shift: float = 0.0
     advantage_scale: float = 1.0
 
@@ -70,7 +66,6 @@ def weighted_sum(loss: Loss, terms: dict[str, float]) -> float:
     return (
         loss.policy_coef * terms.get("policy_gradient_loss", 0.0)
         + loss.bc_coef * terms.get("bc_loss", 0.0)
-        + loss.aux_coef * terms.get("aux_loss", 0.0)
         + loss.vf_coef * terms.get("value_loss", 0.0)
         + loss.ent_coef * terms.get("entropy_loss", 0.0)
         + loss.l2_coef * terms.get("l2_loss", 0.0)
@@ -211,23 +206,6 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
                     z = (np.float64(target[flown + k]) - mean[k, i]) * math.exp(-log_std[k])
                     g[k, i] += float32(slope * z * math.exp(-log_std[k]))
                     g_log_std[k] += slope * (z * z - 1.0)
-
-
-@compiled
-def auxiliary_loss(hidden, index, first, count, targets, loss, a, g, terms):
-    """Add the auxiliary loss, as :func:`actor_loss` does.
-
-    The first units of a hidden layer (width, ROWS) should predict the targets behind the action.
-    """
-    k = targets.shape[1] - a
-    for i in range(count):
-        target = targets[index[first + i]]
-        for j in range(k):
-            value, slope, _ = cloning_error(
-                HUBER_MSE, np.float64(hidden[j, i]) - target[a + j], 0.0
-            )
-            terms[AUXILIARY] += value / k
-            g[j, i] += float32(loss.aux_coef / len(index) * slope / k)
 
 
 @compiled

@@ -9,7 +9,16 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, Layers, forward, gradient
+from sb3_quad.algorithms.networks.kernel import (
+    LINEAR,
+    RELU,
+    ROWS,
+    TANH,
+    Layers,
+    forward,
+    gradient,
+    pullback,
+)
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
 from sb3_quad.base.types import Float32Array, FloatArray, IntArray
 
@@ -118,13 +127,35 @@ class Perceptron:
         terms = np.empty((chunks, TERMS))
         typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
         self._compute(gradient, len(index), x, index, targets, typed, stds, sums, terms)
+        total = self.set_gradients(sums)
+        if log_std is not None:
+            log_std.grad = total[self._size :]
+        result: FloatArray = terms.sum(axis=0)
+        return result
+
+    def new_sums(self, n: int) -> Float32Array:
+        """Return zeros that :meth:`pullback` of n rows adds the parameters' gradients to."""
+        return np.zeros((_chunks(n), self._size), np.float32)
+
+    def pullback(
+        self, x: Float32Array, by_outputs: Float32Array, sums: Float32Array
+    ) -> Float32Array:
+        """Carry a gradient by the outputs (n, outputs) back to the inputs.
+
+        :param x: (n, inputs).
+        :param sums: :meth:`new_sums`, the gradient by the parameters is added to it.
+        :return: the gradient by x, (n, inputs).
+        """
+        by_inputs = np.empty_like(x)
+        self._compute(pullback, len(x), x, np.arange(len(x)), by_outputs, by_inputs, sums)
+        return by_inputs
+
+    def set_gradients(self, sums: Float32Array) -> th.Tensor:
+        """Set ``.grad`` of all parameters, given sums (chunks, size); return their sum."""
         total = sums.sum(axis=0)
         for parameter, view in zip(self.parameters(), self._views(total, False), strict=True):
             parameter.grad = th.from_numpy(view).contiguous()
-        if log_std is not None:
-            log_std.grad = th.from_numpy(total[self._size :])
-        result: FloatArray = terms.sum(axis=0)
-        return result
+        return th.from_numpy(total)
 
     def parameters(self) -> list[nn.Parameter]:
         """Return PyTorch's parameters, by layers."""

@@ -1,0 +1,159 @@
+"""Train with the gradient of an environment of your own, written in PyTorch.
+
+    python examples/gradient_of_your_environment.py
+
+``APG`` asks its environment for a tape, ``env.record(n_steps, substeps)``. A tape records flights
+step by step and then carries gradients back, the last step first: see
+``sb3_quad.algorithms.apg.Tape``. Here PyTorch differentiates each step. Code of your own that
+returns a vector-Jacobian product does as well.
+
+The environment is a row of carts, each of which a force pushes to its mark, where it should stop.
+"""
+
+import argparse
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_quad import APG
+
+DT = 0.05  # s
+N_STEPS = 80
+
+
+def move(state, action):
+    """Return the state after a step, (n, 2): distance from the mark, m, and velocity, m/s."""
+    force = 2.0 * action[:, 0].clamp(-1.0, 1.0)  # N, on a cart of 1 kg
+    velocity = state[:, 1] + DT * (force - 0.1 * state[:, 1])
+    return th.stack([state[:, 0] + DT * velocity, velocity], dim=1)
+
+
+def cost_of(state, action):
+    """Return the cost of each step, (n,)."""
+    return state[:, 0].abs() + 0.05 * state[:, 1].square() + 0.01 * action[:, 0].square()
+
+
+class CartTape:
+    """The tape of :class:`Carts`."""
+
+    def __init__(self, env, n_steps):
+        self.env = env
+        self.n_steps = n_steps
+
+    def reset(self, carry_on):
+        """Begin a recording; return the observations (n, 2)."""
+        self.steps = []
+        return self.env.state if carry_on else self.env.reset()
+
+    def step(self, actions):
+        """Move the carts; return the observations (n, 2)."""
+        before = th.from_numpy(self.env.state).requires_grad_()
+        action = th.from_numpy(actions).requires_grad_()
+        after = move(before, action)
+        self.steps.append((before, action, after, cost_of(after, action)))
+        self.env.state = after.detach().numpy()
+        return self.env.state
+
+    def episodes(self):
+        """Return the reward of each cart's flight, its length, and whether it was lost."""
+        costs = th.stack([cost for *_, cost in self.steps]).sum(dim=0)
+        n = self.env.num_envs
+        return -costs.detach().numpy(), np.full(n, self.n_steps), np.zeros(n, dtype=bool)
+
+    def begin(self, cost):
+        """Begin the way back; return the mean cost. The environment has a cost of its own."""
+        self.by_state = th.zeros(self.env.num_envs, 2)
+        return float(th.stack([cost for *_, cost in self.steps]).detach().mean())
+
+    def backward(self, step, by_observation):
+        """Return the gradient by the actions of a step, (n, 1)."""
+        before, action, after, cost = self.steps[step]
+        # The observation is the state.
+        by_after = self.by_state + th.from_numpy(by_observation)
+        by_cost = th.full_like(cost, 1.0 / (self.n_steps * self.env.num_envs))
+        self.by_state, by_action = th.autograd.grad(
+            (after, cost), (before, action), (by_after, by_cost)
+        )
+        return by_action.numpy()
+
+
+class Carts(VecEnv):
+    """A row of carts; an observation is the distance and the velocity of one."""
+
+    def __init__(self, n_envs, seed):
+        observations = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        super().__init__(n_envs, observations, spaces.Box(-1.0, 1.0, (1,), np.float32))
+        self.random = np.random.default_rng(seed)
+        self.state = np.zeros((n_envs, 2), np.float32)
+
+    def record(self, n_steps, substeps):
+        """Return a tape; the carts have no substeps."""
+        return CartTape(self, n_steps)
+
+    def reset(self):
+        """Put the carts at random distances."""
+        self.state = self.random.normal(0.0, 2.0, (self.num_envs, 2)).astype(np.float32)
+        return self.state
+
+    def step_async(self, actions):
+        """Keep the actions."""
+        self.actions = actions
+
+    def step_wait(self):
+        """Move the carts; their episodes do not end."""
+        action = th.from_numpy(self.actions)
+        state = move(th.from_numpy(self.state), action)
+        self.state = state.numpy()
+        dones = np.zeros(self.num_envs, dtype=bool)
+        return self.state, -cost_of(state, action).numpy(), dones, [{}] * self.num_envs
+
+    def close(self):
+        """Do nothing."""
+
+    def get_attr(self, attr_name, indices=None):
+        """Return an attribute, once for each cart."""
+        return [getattr(self, attr_name)] * self.num_envs
+
+    def set_attr(self, attr_name, value, indices=None):
+        """Set an attribute."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
+        """Refuse: carts have no methods."""
+        raise AttributeError(method_name)
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        """Return that nothing is wrapped."""
+        return [False] * self.num_envs
+
+
+def mean_cost(model, seed):
+    """Return the mean cost of a step and the median distance at the end, of fresh carts."""
+    env = Carts(256, seed)
+    observations = env.reset()
+    costs = []
+    for _ in range(N_STEPS):
+        env.step_async(model.predict(observations, deterministic=True)[0])
+        observations, rewards, _, _ = env.step_wait()
+        costs.append(-rewards.mean())
+    return float(np.mean(costs)), float(np.median(np.abs(observations[:, 0])))
+
+
+def main():
+    """Train, and print what it brought."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--updates", type=int, default=150)
+    arguments = parser.parse_args()
+
+    env = Carts(64, arguments.seed)
+    model = APG("MlpPolicy", env, n_steps=N_STEPS, learning_rate=3e-3, seed=arguments.seed)
+    print("before: cost {:.3f}, {:.3f} m from the mark".format(*mean_cost(model, seed=1)))
+    model.learn(arguments.updates * N_STEPS * env.num_envs)
+    print("after: cost {:.3f}, {:.3f} m from the mark".format(*mean_cost(model, seed=1)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,273 @@
+"""Analytic policy gradient: an agent learns from the exact gradient of its flights' cost."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from typing_extensions import Self
+
+from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
+from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost
+from sb3_quad.algorithms.networks.gradients import Pullback, mean_actions, network_of
+from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.simulation.tape import FlightCost
+
+
+class Tape(Protocol):
+    """Records flights of n environments, and carries gradients back through their steps.
+
+    An environment that ``APG`` can train on has ``record(n_steps, substeps)``, which returns one.
+    A recording is :meth:`reset`, then :meth:`step` once for each step; the way back is
+    :meth:`begin`, then :meth:`backward` once for each step, the last one first.
+    """
+
+    def reset(self, carry_on: bool) -> Float32Array:
+        """Begin a recording; return the observations, (n, ...).
+
+        :param carry_on: whether to continue the flights of the last recording where they can be.
+        """
+
+    def step(self, actions: Float32Array) -> Float32Array:
+        """Take a step by actions (n, a); return the observations after it, (n, ...)."""
+
+    def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return the sum of the rewards, the length, and whether it was lost, of each flight."""
+
+    def begin(self, cost: FlightCost) -> float:
+        """Begin the way back; return the mean cost of a step.
+
+        :param cost: that of a quadcopter's states. An environment with a cost of its own ignores
+            it.
+        """
+
+    def backward(self, step: int, by_observation: Float32Array) -> FloatArray:
+        """Return the gradient of the mean cost by the actions of a step, (n, a).
+
+        It includes what these actions do in later steps, of which the tape keeps account.
+
+        :param by_observation: the gradient by the observations after the step, (n, ...), by way of
+            the actions that the policy took on them.
+        """
+
+
+class APG(ExpertMixin, OnPolicyAlgorithm):
+    """Analytic policy gradient (APG): differentiate whole flights, and descend.
+
+    The equations of motion are known and smooth, so the gradient of a flight's cost by the policy's
+    weights can be computed exactly: the flight is recorded, then the derivative is carried back
+    through policy, observation, delay, rotors and rigid body. There is no critic, no teacher and no
+    exploration. Relatives are backpropagation through time (Werbos, 1990), SHAC (Xu et al., 2022),
+    which adds a critic to short windows, and Heeg, Song and Scaramuzza, "Learning Quadrotor Control
+    From Visual Features Using Differentiable Simulation" (2024).
+
+    In each update every environment flies ``n_steps`` control steps by the mean action of the
+    policy. The optimiser, Adam, then takes one step along the gradient of the mean cost. Only the
+    actor learns; the critic stays as it is.
+
+    ``env`` must be differentiable: a :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` with any of
+    its settings, or an environment of your own whose ``record(n_steps, substeps)`` returns a
+    :class:`Tape`; docs/apg.md shows one.
+    A saved model loads with ``PPO.load``, even where this package is not installed.
+
+    Arguments that are not listed here mean what they mean in :class:`stable_baselines3.PPO`.
+
+    :param learning_rate: of Adam; a schedule of the remaining progress. The default falls to
+        a fiftieth.
+    :param n_steps: Control steps of each flight in an update. Whole flights take some 300.
+    :param max_grad_norm: The gradient is scaled down to this length where it is longer.
+    :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
+        shipped agent. From scratch, whole flights learn badly: clone an expert first (DAgger), or
+        fly short windows with ``carry_on``.
+    :param carry_on: Let each update continue the flights of the one before; what crashed begins
+        again.
+    :param cost: The cost of each control step, (steps, n), as a function of
+        :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved.
+    :param substeps: Physics steps in a control step of the training; None: those of the vehicle.
+    :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
+    :raises TrainingError: a gradient that is not finite, in every environment.
+    """
+
+    policy_aliases = PPO.policy_aliases
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = LinearSchedule(5e-4, 1e-5, 1.0),  # noqa: B008
+        n_steps: int = 300,
+        max_grad_norm: float = 1.0,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        *,
+        initial_policy: BaseAlgorithm | str | Path | None = None,
+        carry_on: bool = False,
+        cost: Callable[[FlownStates], th.Tensor] = flight_cost,
+        substeps: int | None = 2,
+        _init_setup_model: bool = True,
+    ):
+        initial = model_of(initial_policy)
+        own_kwargs = policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0)
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=1.0,
+            gae_lambda=1.0,
+            ent_coef=0.0,
+            vf_coef=0.0,
+            max_grad_norm=max_grad_norm,
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            # Gradients of whole flights change quickly: a short memory of their size.
+            policy_kwargs={"optimizer_kwargs": {"betas": (0.9, 0.99)}} | own_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            supported_action_spaces=(spaces.Box,),
+            _init_setup_model=False,
+        )
+        self.carry_on = carry_on
+        self.cost = cost
+        self.substeps = substeps
+        self._tape: Tape | None = None
+
+        if _init_setup_model:
+            self._setup_model()
+            if initial is not None:
+                transfer_policy(initial, self)
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 10,
+        tb_log_name: str = "APG",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for ``total_timesteps``; all arguments are those of SB3's ``learn``.
+
+        :raises ConfigError: an environment that cannot be differentiated.
+        """
+        self._tape = self._new_tape()
+        with self._threads():
+            return super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+
+    def _new_tape(self) -> Tape:
+        """Return a tape of the environment, below its wrappers."""
+        assert self.env is not None
+        env: Any = self.env
+        # The statistics of episodes come from the tape.
+        if isinstance(env, VecMonitor):
+            env = env.venv
+        if env is not env.unwrapped:
+            raise ConfigError(
+                f"{type(env).__name__}: APG differentiates the environment below its wrappers, and"
+                " would leave this one out; remove it, and give an own reward as a cost"
+            )
+        if not hasattr(env, "record"):
+            raise ConfigError(
+                f"{type(env).__name__}: APG differentiates flights, and this environment has no"
+                " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
+            )
+        tape: Tape = env.record(self.n_steps, self.substeps)
+        return tape
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fly ``n_rollout_steps`` steps by the mean action of the policy, and record them."""
+        self.policy.set_training_mode(False)
+        network = network_of(self.policy)
+        tape = self._tape
+        assert tape is not None
+        callback.on_rollout_start()
+        observations = tape.reset(self.carry_on)
+        self._observations = []
+        for _ in range(n_rollout_steps):
+            self._observations.append(observations)
+            observations = tape.step(mean_actions(network, observations))
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+        assert self.ep_info_buffer is not None
+        assert self.ep_success_buffer is not None
+        for reward, length, is_lost in zip(*tape.episodes(), strict=True):
+            self.ep_info_buffer.append({"r": reward, "l": length, "t": 0.0})
+            self.ep_success_buffer.append(not is_lost)
+        callback.on_rollout_end()
+        return True
+
+    def train(self) -> None:
+        """Carry the gradient of the mean cost back through the recorded flights, and descend.
+
+        :raises TrainingError: no row has a finite gradient; the parameters stay as they were.
+        """
+        # Layers such as dropout act as they did in the recorded flight.
+        self.policy.set_training_mode(False)
+        self._update_learning_rate(self.policy.optimizer)
+        tape = self._tape
+        assert self.env is not None
+        assert tape is not None
+        cost = tape.begin(partial(cost_and_gradients, self.cost))
+
+        # What the critic or an earlier update has left; autograd adds to it.
+        self.policy.optimizer.zero_grad()
+        # The observation after the last step leads to no action.
+        network = Pullback(self.policy, self.env.num_envs)
+        by_observations = np.zeros_like(self._observations[0])
+        for step in reversed(range(self.n_steps)):
+            by_actions = tape.backward(step, by_observations)
+            by_observations = network(self._observations[step], by_actions)
+
+        network.set_gradients()
+        norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        if not (np.isfinite(cost) and th.isfinite(norm)):
+            self.policy.optimizer.zero_grad()
+            raise TrainingError(
+                f"the gradient is not finite after {self.num_timesteps} timesteps (cost"
+                f" {cost:.3g}): try a smaller learning_rate or shorter flights (n_steps)"
+            )
+        self.policy.optimizer.step()
+        self._n_updates += 1
+
+        self.logger.record("train/cost", cost)
+        self.logger.record("train/gradient_norm", float(norm))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "cost", "_tape", "_observations"]

@@ -1,0 +1,78 @@
+"""Costs of flights that :class:`~sb3_quad.algorithms.apg.APG` can differentiate."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch as th
+
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.simulation.state import STATE, row_slices
+
+# Distances, m, at which half of the coarse and of the fine part of the position's cost is due.
+COARSE, FINE = 0.5, 0.05
+# Below this height, m, a flight is in danger.
+LOW = 1.0
+
+
+class FlownStates(NamedTuple):
+    """The states after each of some control steps, and the actions that led there.
+
+    Shapes begin with (steps, n). Vectors are in the world frame unless noted.
+    """
+
+    position: th.Tensor  # (..., 3), m
+    quaternion: th.Tensor  # (..., 4), body to world, (w, x, y, z)
+    velocity: th.Tensor  # (..., 3), m/s
+    body_rates: th.Tensor  # (..., 3), body frame, rad/s
+    rotor_speeds: th.Tensor  # (..., 4), rad/s
+    target: th.Tensor  # (..., 3), m
+    actions: th.Tensor  # (..., 4), before they are clipped to [-1, 1]
+
+    @property
+    def distance(self) -> th.Tensor:
+        """|r - r_T|, m."""
+        return length(self.position - self.target)
+
+    @property
+    def r33(self) -> th.Tensor:
+        """The cosine of the tilt."""
+        return 1.0 - 2.0 * self.quaternion[..., 1:3].square().sum(dim=-1)
+
+
+def cost_and_gradients(
+    cost: Callable[[FlownStates], th.Tensor],
+    states: FloatArray,
+    actions: Float32Array,
+    counts: BoolArray,
+) -> tuple[float, FloatArray, FloatArray]:
+    """Evaluate a cost as :data:`~sb3_quad.simulation.tape.FlightCost` says, by autograd."""
+    by_states = th.from_numpy(states).requires_grad_()
+    by_actions = th.from_numpy(actions).double().requires_grad_()
+    parts = [by_states[:, rows].transpose(1, 2) for rows in row_slices(STATE).values()]
+    each = cost(FlownStates._make([*parts, by_actions]))
+    mean = th.where(th.from_numpy(counts), each, 0.0).mean()
+    gradients = th.autograd.grad(
+        mean, (by_states, by_actions), allow_unused=True, materialize_grads=True
+    )
+    return float(mean.detach()), gradients[0].numpy(), gradients[1].numpy()
+
+
+def length(vectors: th.Tensor) -> th.Tensor:
+    """Return the length of vectors (..., 3), smooth at zero."""
+    return (vectors.square().sum(dim=-1) + 1e-8).sqrt()
+
+
+def flight_cost(flown: FlownStates) -> th.Tensor:
+    """Return the default cost of each control step, (steps, n).
+
+    The distance costs d / (d + 0.5) + d / (2 (d + 0.05)), which is steep in the last metre and flat
+    far away, so that no target is too far to matter. Small terms calm the body rates, the tilt and
+    actions beyond their limits. Below a height of 1 m the ground costs, since the crash itself has
+    no gradient.
+    """
+    d = flown.distance
+    cost = d / (d + COARSE) + 0.5 * d / (d + FINE)
+    cost = cost + 0.002 * length(flown.body_rates) + 0.001 * (1.0 - flown.r33)
+    beyond = flown.actions - flown.actions.clamp(-1.0, 1.0)
+    cost = cost + 0.01 * beyond.square().sum(dim=-1)
+    return cost + 0.05 * (LOW - flown.position[..., 2]).clamp(min=0.0)

@@ -1,0 +1,271 @@
+"""The adjoint of a control step: carry the gradient of a flight's cost from the state after the
+step to the state before it.
+
+``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost by the first
+``MOVING`` rows of a block's state. Each function here undoes one function of :mod:`.physics` or
+:mod:`.observation`: it turns the gradient by the results into the gradient by the arguments.
+
+The states between the physics steps of a control step are computed again: that costs less than
+keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as 1.
+"""
+
+import math
+
+from sb3_quad.simulation.compiled import LANES, compiled
+from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
+from sb3_quad.simulation.physics import (
+    accelerate,
+    limit_velocities,
+    move,
+    quaternion_product,
+    rotation,
+    sinc_and_cosine,
+    to_body,
+    to_world,
+    total_thrust,
+    vector,
+)
+from sb3_quad.simulation.state import X
+
+MOVING = X.target  # the rows of the state that a flight changes
+
+
+@compiled(inline="always")
+def _add_rotation(quaternion, gradient, lane, x, y, z):
+    """Add the gradient by a quaternion, given that by its rotation matrix, row by row."""
+    qw, qx, qy, qz = (
+        quaternion[0, lane],
+        quaternion[1, lane],
+        quaternion[2, lane],
+        quaternion[3, lane],
+    )
+    (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = x, y, z
+    k = X.quaternion
+    gradient[k, lane] += 2.0 * (qz * (y0 - x1) + qy * (x2 - z0) + qx * (z1 - y2))
+    gradient[k + 1, lane] += 2.0 * (
+        qy * (x1 + y0) + qz * (x2 + z0) - 2.0 * qx * (y1 + z2) + qw * (z1 - y2)
+    )
+    gradient[k + 2, lane] += 2.0 * (
+        qx * (x1 + y0) + qz * (y2 + z1) - 2.0 * qy * (x0 + z2) + qw * (x2 - z0)
+    )
+    gradient[k + 3, lane] += 2.0 * (
+        qx * (x2 + z0) + qy * (y2 + z1) - 2.0 * qz * (x0 + y1) + qw * (y0 - x1)
+    )
+
+
+@compiled(inline="always")
+def _add(gradient, row, lane, x, y, z):
+    gradient[row, lane] += x
+    gradient[row + 1, lane] += y
+    gradient[row + 2, lane] += z
+
+
+@compiled(fastmath=True)
+def undo_move(before, after, gradient, dt):
+    """Undo :func:`.physics.move`, in place.
+
+    :param before: the state before the physics step, (MOVING, LANES), of which the attitude counts.
+    :param after: the state after it, of which the body rates count.
+    """
+    half_step = 0.5 * dt
+    k = X.quaternion
+    for lane in range(LANES):
+        px, py, pz = vector(gradient[X.position :], lane)
+        _add(gradient, X.velocity, lane, dt * px, dt * py, dt * pz)
+
+        # The new quaternion is n = q a, with a = (cos |h|, h sin |h| / |h|) and h = dt ω / 2.
+        wx, wy, wz = vector(after[X.body_rates :], lane)
+        hx, hy, hz = half_step * wx, half_step * wy, half_step * wz
+        h2 = hx * hx + hy * hy + hz * hz
+        sinc, cosine = sinc_and_cosine(h2)
+        ax, ay, az = sinc * hx, sinc * hy, sinc * hz
+        qw, qx, qy, qz = (
+            before[k, lane],
+            before[k + 1, lane],
+            before[k + 2, lane],
+            before[k + 3, lane],
+        )
+        nw, nx, ny, nz = quaternion_product(qw, qx, qy, qz, cosine, ax, ay, az)
+
+        # n is scaled by s = 1.5 - |n|² / 2, so the gradient g becomes s g - n (n g).
+        gw, gx, gy, gz = (
+            gradient[k, lane],
+            gradient[k + 1, lane],
+            gradient[k + 2, lane],
+            gradient[k + 3, lane],
+        )
+        scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
+        along = nw * gw + nx * gx + ny * gy + nz * gz
+        gw = scale * gw - along * nw
+        gx = scale * gx - along * nx
+        gy = scale * gy - along * ny
+        gz = scale * gz - along * nz
+
+        # A product with a quaternion is undone by one with its conjugate: g a* for q, q* g for a.
+        tw, tx, ty, tz = quaternion_product(qw, -qx, -qy, -qz, gw, gx, gy, gz)
+        gw, gx, gy, gz = quaternion_product(gw, gx, gy, gz, cosine, -ax, -ay, -az)
+        gradient[k, lane] = gw
+        gradient[k + 1, lane] = gx
+        gradient[k + 2, lane] = gy
+        gradient[k + 3, lane] = gz
+
+        # (cos |h| - sin |h| / |h|) / |h|², the slope of the sinc over |h|, by Horner's scheme.
+        slope = 1.0 - h2 / 88.0
+        slope = 1.0 - h2 / 54.0 * slope
+        slope = 1.0 - h2 / 28.0 * slope
+        slope = 1.0 - h2 / 10.0 * slope
+        slope = -slope / 3.0
+        along = slope * (hx * tx + hy * ty + hz * tz) - sinc * tw
+        _add(
+            gradient,
+            X.body_rates,
+            lane,
+            half_step * (sinc * tx + along * hx),
+            half_step * (sinc * ty + along * hy),
+            half_step * (sinc * tz + along * hz),
+        )
+
+
+@compiled(fastmath=True)
+def undo_accelerate(b, before, after, gradient, by_wanted):
+    """Undo :func:`.physics.accelerate`, in place.
+
+    :param b: a block whose vehicle, wrench, wind and wanted speeds are loaded.
+    :param before: the state before the physics step, (MOVING, LANES), and ``after`` that after it.
+    :param by_wanted: (4, LANES), the gradient by the wanted rotor speeds is added to it.
+    """
+    for lane in range(LANES):
+        r = rotation(before[X.quaternion :], lane)
+
+        # The force in the body frame, as it was: drag of the airspeed u, and the thrusts.
+        vx, vy, vz = vector(before[X.velocity :], lane)
+        wind_x, wind_y, wind_z = vector(b.wind, lane)
+        ux, uy, uz = vx - wind_x, vy - wind_y, vz - wind_z
+        bx, by, bz = to_body(r, ux, uy, uz)
+        for k in range(4):
+            new = after[X.rotor_speeds + k, lane]
+            old = before[X.rotor_speeds + k, lane]
+            b.thrust[k, lane] = b.lift[lane] * new * (new + b.exact[lane] * (old - new))
+        dx, dy, dz = vector(b.drag, lane)
+        fx = b.force_body[0, lane] - dx * bx
+        fy = b.force_body[1, lane] - dy * by
+        fz = b.force_body[2, lane] - dz * bz + total_thrust(b, lane)
+
+        # By the torque in the body frame, and through the gyroscopic terms by the body rates.
+        gain = b.rates_gain
+        tx, ty, tz = vector(gradient[X.body_rates :], lane)
+        tx, ty, tz = gain[0, lane] * tx, gain[1, lane] * ty, gain[2, lane] * tz
+        wx, wy, wz = vector(before[X.body_rates :], lane)
+        gx, gy, gz = b.gyro[0, lane] * tx, b.gyro[1, lane] * ty, b.gyro[2, lane] * tz
+        _add(
+            gradient,
+            X.body_rates,
+            lane,
+            -(gy * wz + gz * wy),
+            -(gx * wz + gz * wx),
+            -(gx * wy + gy * wx),
+        )
+
+        # By the force: p in the world frame, c in the body frame.
+        px, py, pz = vector(gradient[X.velocity :], lane)
+        gain = b.velocity_gain[lane]
+        px, py, pz = gain * px, gain * py, gain * pz
+        cx, cy, cz = to_body(r, px, py, pz)
+
+        # By the rotors: each thrust acts along the body's z axis and about all three axes.
+        for k in range(4):
+            old, new = before[X.rotor_speeds + k, lane], after[X.rotor_speeds + k, lane]
+            by_thrust = (
+                cz + b.arm[0, k, lane] * tx + b.arm[1, k, lane] * ty + b.arm[2, k, lane] * tz
+            )
+            by_thrust *= b.lift[lane]
+            exact = b.exact[lane]
+            by_new = gradient[X.rotor_speeds + k, lane]
+            by_new += by_thrust * (2.0 * new * (1.0 - exact) + exact * old)
+            speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
+            factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
+            by_wanted[k, lane] += factor * by_new
+            gradient[X.rotor_speeds + k, lane] = (1.0 - factor) * by_new + by_thrust * exact * new
+
+        # By the velocity, through the drag, and by the attitude: forces, drag and torques turn.
+        cx, cy, cz = -dx * cx, -dy * cy, -dz * cz
+        x, y, z = to_world(r, cx, cy, cz)
+        _add(gradient, X.velocity, lane, x, y, z)
+        ox, oy, oz = vector(b.torque_world, lane)
+        _add_rotation(
+            before[X.quaternion :],
+            gradient,
+            lane,
+            (px * fx + ux * cx + ox * tx, px * fy + ux * cy + ox * ty, px * fz + ux * cz + ox * tz),
+            (py * fx + uy * cx + oy * tx, py * fy + uy * cy + oy * ty, py * fz + uy * cz + oy * tz),
+            (pz * fx + uz * cx + oz * tx, pz * fy + uz * cy + oz * ty, pz * fz + uz * cz + oz * tz),
+        )
+
+
+@compiled
+def undo_flight(b, passed, gradient, by_wanted, dt, substeps):
+    """Undo :func:`.physics.fly`: the physics steps of a control step, the last one first.
+
+    :param b: a block with the state before the control step; its flight is computed again.
+    :param passed: room for the states in between, (substeps + 1, MOVING, LANES).
+    :param by_wanted: (4, LANES), is set to the gradient by the wanted rotor speeds.
+    """
+    for substep in range(substeps):
+        passed[substep] = b.state[:MOVING]
+        if accelerate(b):
+            limit_velocities(b)
+        move(b, dt)
+    passed[substeps] = b.state[:MOVING]
+    by_wanted[:, :] = 0.0
+    for substep in range(substeps - 1, -1, -1):
+        undo_move(passed[substep], passed[substep + 1], gradient, dt)
+        undo_accelerate(b, passed[substep], passed[substep + 1], gradient, by_wanted)
+
+
+@compiled(fastmath=True)
+def undo_noise(b, by_feature):
+    """Undo noise and scaling of the features (Eq. 3.16), in place.
+
+    :param b: a block whose features without noise, noise and scaling are computed.
+    :param by_feature: float64 (OBSERVATION_SIZE, LANES), by the scaled features.
+    """
+    for k in range(OBSERVATION_SIZE):
+        for lane in range(LANES):
+            level, noise = b.noise_level[lane], b.noise[k, lane]
+            slope = 1.0 + level * noise
+            if b.additive[lane] > 0.0:
+                relative = level * b.feature[k, lane]
+                fixed = b.additive[lane] / b.inverse_std[k, lane]
+                both = math.sqrt(relative * relative + fixed * fixed)
+                slope = 1.0 + noise * level * relative / both
+            by_feature[k, lane] *= slope * b.inverse_std[k, lane]
+
+
+@compiled(fastmath=True)
+def undo_features(b, by_feature, gradient):
+    """Undo :func:`.observation.features`: add to the gradient by the state of a loaded block.
+
+    :param by_feature: float64 (OBSERVATION_SIZE, LANES), by the features in their units.
+    """
+    f = by_feature
+    for lane in range(LANES):
+        r = rotation(b.quaternion, lane)
+        px, py, pz = vector(f[F.position :], lane)
+        _add(gradient, X.position, lane, px, py, pz)
+        wx, wy, wz = vector(f[F.body_rates :], lane)
+        _add(gradient, X.body_rates, lane, wx, wy, wz)
+        # The observed velocity is Rᵀ v.
+        gx, gy, gz = vector(f[F.velocity :], lane)
+        x, y, z = to_world(r, gx, gy, gz)
+        _add(gradient, X.velocity, lane, x, y, z)
+        vx, vy, vz = vector(b.velocity, lane)
+        # The observed matrix is Rᵀ, row by row: its columns are the rows of R.
+        m = F.rotation
+        _add_rotation(
+            b.quaternion,
+            gradient,
+            lane,
+            (f[m, lane] + vx * gx, f[m + 3, lane] + vx * gy, f[m + 6, lane] + vx * gz),
+            (f[m + 1, lane] + vy * gx, f[m + 4, lane] + vy * gy, f[m + 7, lane] + vy * gz),
+            (f[m + 2, lane] + vz * gx, f[m + 5, lane] + vz * gy, f[m + 8, lane] + vz * gz),
+        )

@@ -1,0 +1,330 @@
+"""Flights of a batch, recorded so that their cost can be differentiated by every action."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import float32
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.simulation.adjoint import MOVING, undo_features, undo_flight, undo_noise
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
+from sb3_quad.simulation.kernel import (
+    CHUNK,
+    load_rows,
+    load_scaling,
+    load_vehicles,
+    new_block,
+)
+from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features, with_noise
+from sb3_quad.simulation.random import STEP, random_words, standard_normals
+from sb3_quad.simulation.state import STATE_SIZE, P
+from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
+
+FlightCost = Callable[[FloatArray, Float32Array, BoolArray], tuple[float, FloatArray, FloatArray]]
+"""A cost and its gradients, of the states after each step (steps, STATE_SIZE, n), the actions
+(steps, n, 4), and whether each counts (steps, n): the mean, the gradient by states, by actions.
+"""
+
+
+class FlightTape:
+    """The flights of a batch for some control steps, and the way back through these steps.
+
+    Record with :meth:`reset` and a :meth:`step` for each control step. Then :meth:`begin` takes the
+    cost, and :meth:`backward` is called for each step, the last one first.
+
+    A row that crashes or leaves the range costs nothing from there on and has no gradient.
+
+    :param batch: flies. Its episodes have no time limit here.
+    :param n_steps: control steps of a recording.
+    :param substeps: physics steps in a control step; None: those of the batch. Two take half the
+        time of four, and differ little.
+    """
+
+    def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
+        n = batch.n
+        self.substeps = batch.substeps if substeps is None else substeps
+        self.physics_step = batch.physics_step * batch.substeps / self.substeps
+        self.batch = batch
+        self.n_steps = n_steps
+        # The states before each control step and after the last one
+        self.states = np.zeros((n_steps + 1, STATE_SIZE, n))
+        self.actions = np.zeros((n_steps, n, 4), np.float32)
+        self.rewards = np.zeros((n_steps, n), np.float32)
+        # Control steps that each row has flown, and whether it crashed or left the range then
+        self.lengths = np.full(n, n_steps)
+        self.lost = np.ones(n, np.bool_)
+        self._at = 0
+        self._integrals = np.zeros((n_steps, *batch.integral.shape))
+        # Without gusts, wrench and wind are the same at all steps.
+        n_wrenches = 1 if batch.randomize.gusts is None else n_steps
+        n_winds = 1 if batch.randomize.wind_gusts is None else n_steps
+        self._wrenches = np.zeros((n_wrenches, *batch.wrench.shape))
+        self._winds = np.zeros((n_winds, *batch.wind.shape))
+        self._helpers = min(batch.threads, n // (2 * CHUNK)) - 1
+
+    def reset(self, carry_on: bool = False) -> Float32Array:
+        """Begin a recording; return the observations, float32 (n, size).
+
+        :param carry_on: let the rows that still fly continue their episodes.
+        """
+        batch = self.batch
+        observations = batch.reset(np.flatnonzero(self.lost) if carry_on else None)
+        self._refuse_fast_motors()
+        self._at = 0
+        self._streams = batch.streams.copy()
+        self._queue = batch.queue.copy()
+        self.lengths[:] = self.n_steps
+        self.lost[:] = False
+        return observations
+
+    def _refuse_fast_motors(self) -> None:
+        """Check that no rotor overshoots its commanded speed because the physics steps are long."""
+        vehicles = self.batch.vehicles
+        gains = np.maximum(vehicles[P.motor_gain_up], vehicles[P.motor_gain_down])
+        fastest = float((gains * (vehicles[P.exact_motors] == 0.0)).max())
+        if fastest * self.physics_step > 1.0:
+            raise ConfigError(
+                f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
+                " give None, which is what the simulation has"
+            )
+
+    def step(self, actions: Float32Array) -> Float32Array:
+        """Fly a control step; return the observations after it.
+
+        :param actions: float32 (n, 4); in flight they are clipped to [-1, 1], here they are not.
+        """
+        batch, t = self.batch, self._at
+        self.states[t] = batch.state
+        self.actions[t] = actions
+        self._integrals[t] = batch.integral
+        if t < len(self._wrenches):
+            self._wrenches[t] = batch.total_wrench()
+        if t < len(self._winds):
+            self._winds[t] = batch.total_wind()
+        observations, self.rewards[t], _ = batch.step_on(actions, self.substeps)
+        self._at = t + 1
+        self.states[self._at] = batch.state
+        newly_lost = ~batch.outcome["truncated"] & ~self.lost
+        self.lengths[newly_lost] = self._at
+        self.lost |= newly_lost
+        return observations
+
+    @property
+    def counts(self) -> BoolArray:
+        """Whether the state after each control step counts, (n_steps, n).
+
+        The one that a crash ends in does not: it lies beyond what the model describes.
+        """
+        after = np.arange(1, self.n_steps + 1)[:, None]
+        return (after < self.lengths) | ~self.lost
+
+    @property
+    def acts(self) -> BoolArray:
+        """Whether each row has flown each control step, (n_steps, n)."""
+        return np.arange(self.n_steps)[:, None] < self.lengths
+
+    def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return the sum of each row's rewards, its length, and whether it was lost, (n,) each."""
+        rewards = np.where(self.acts, self.rewards, 0.0).sum(axis=0)
+        return rewards, self.lengths, self.lost
+
+    def begin(self, cost: FlightCost) -> float:
+        """Begin the way back; return the mean cost of a control step."""
+        value, by_states, by_actions = cost(self.states[1:], self.actions, self.counts)
+        batch = self.batch
+        self._by_states = by_states
+        self._by_actions = by_actions
+        self._gradient = np.zeros((MOVING, batch.n))
+        ages = batch.observation.ages
+        self._ages = np.array(ages)
+        self._by_frames = np.zeros((max(ages) + 1, batch.n, batch.observation.frame_size))
+        self._by_integral = np.zeros(batch.integral.shape)
+        return value
+
+    def backward(self, step: int, by_observation: Float32Array) -> FloatArray:
+        """Return the gradient by the actions of a control step, (n, 4).
+
+        :param by_observation: the gradient by the observations after it, float32 (n, size), which
+            comes from the later actions.
+        """
+        batch = self.batch
+        share_out(
+            undo,
+            self._helpers,
+            step,
+            self.lengths,
+            self.states,
+            self.actions,
+            self._queue,
+            self._streams,
+            self._wrenches[step % len(self._wrenches)],
+            self._winds[step % len(self._winds)],
+            batch.vehicles,
+            batch.scaling,
+            self._ages,
+            self._integrals,
+            batch.integral_numbers,
+            by_observation,
+            self._by_states,
+            self._by_frames,
+            self._by_integral,
+            self._gradient,
+            self._by_actions,
+            self.physics_step,
+            self.substeps,
+        )
+        result: FloatArray = self._by_actions[step]
+        return result
+
+    @property
+    def by_start(self) -> FloatArray:
+        """The gradient by the state before the step that :meth:`backward` was last called for,
+        (MOVING, n); without what comes through the observation of that state.
+        """
+        return self._gradient
+
+
+@compiled
+def undo(
+    control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
+    ages, integrals, integral_numbers, by_observation, by_states, by_frames, by_integral, gradient,
+    by_actions, physics_step, substeps,
+):  # fmt: skip
+    """Undo a control step and the observation after it; see :class:`FlightTape`.
+
+    The arguments are as in :func:`.kernel.step`, with a leading axis for the control steps, and:
+
+    :param by_frames: (depth, n, frame size), by the frames of the latest control steps, step s in
+        slot s % depth.
+    :param by_integral: (0 or 3, n), by the position integral.
+    :param gradient: (MOVING, n), by the state after the step; becomes that by the state before.
+    :param by_actions: (steps, n, 4), is added to where an earlier action acts late or is observed.
+    """
+    n = states.shape[2]
+    chunks = (n + CHUNK - 1) // CHUNK
+    if leads:
+        control[LEFT] = chunks
+    blocks = new_block()
+    passed = np.empty((substeps + 1, MOVING, LANES))
+    own = np.empty((MOVING, LANES))
+    by_feature = np.empty((OBSERVATION_SIZE, LANES))
+    by_wanted = np.empty((4, LANES))
+    taken = 0
+    while True:
+        left = atomic_add(control, LEFT, -1)
+        if left <= 0:
+            break
+        taken += 1
+        chunk = (chunks - left) * CHUNK
+        for first in range(chunk, min(chunk + CHUNK, n), LANES):
+            b = blocks[0]
+            count = min(LANES, n - first)
+            for lane in range(LANES):
+                b.row[lane] = first + min(lane, count - 1)
+            load_vehicles(b, vehicles, first, count, physics_step)
+            load_rows(gradient, first, count, own)
+            for k in range(MOVING):
+                for lane in range(count):
+                    own[k, lane] += by_states[step, k, first + lane]
+            if step + 1 < len(actions):
+                load_scaling(b, scaling)
+                load_rows(states[step + 1], first, count, b.state)
+                load_rows(streams, first, count, b.stream)
+                b.stream[STEP] += np.uint32(step + 1)
+                features(b)
+                random_words(b)
+                standard_normals(b)
+                _undo_frames(
+                    b, first, count, step + 1, lengths, actions, ages, integrals, integral_numbers,
+                    by_observation, by_frames, by_integral, by_feature, by_actions,
+                )  # fmt: skip
+                undo_noise(b, by_feature)
+                undo_features(b, by_feature, own)
+
+            load_rows(states[step], first, count, b.state)
+            load_rows(wrench, first, count, b.wrench)
+            load_rows(wind, first, count, b.wind)
+            for lane in range(LANES):
+                i = b.row[lane]
+                late = np.int64(b.delay[lane])
+                for k in range(4):
+                    if step >= late:
+                        b.wanted_speeds[k, lane] = _speed(b, lane, actions[step - late, i, k])
+                    else:
+                        b.wanted_speeds[k, lane] = queue[step, k, i]
+                if step >= lengths[i]:
+                    own[:, lane] = 0.0
+            undo_flight(b, passed, own, by_wanted, physics_step, substeps)
+            for lane in range(count):
+                i = first + lane
+                for k in range(MOVING):
+                    gradient[k, i] = own[k, lane]
+                acted = step - np.int64(b.delay[lane])
+                for k in range(4):
+                    if acted >= 0 and abs(actions[acted, i, k]) < float32(1.0):
+                        slope = b.thrust_half_range[lane] / (2.0 * b.wanted_speeds[k, lane])
+                        by_actions[acted, i, k] += slope * by_wanted[k, lane]
+    atomic_add(control, DONE, taken)
+    if leads:
+        finish(control, chunks)
+    return True
+
+
+@compiled
+def _speed(b, lane, action):
+    """Return the rotor speed that an action commands (Eqs. 3.18 and 2.4)."""
+    bounded = min(max(np.float64(action), -1.0), 1.0)
+    return np.sqrt(b.thrust_middle[lane] + b.thrust_half_range[lane] * bounded)
+
+
+@compiled
+def _undo_frames(
+    b, first, count, step, lengths, actions, ages, integrals, numbers, by_observation, by_frames,
+    by_integral, by_feature, by_actions,
+):  # fmt: skip
+    """Carry the gradient by an observation to the frames in it, and that by the present frame to
+    its features, the last action and the position integral.
+    """
+    by_feature[:, :] = 0.0
+    depth, size = by_frames.shape[0], by_frames.shape[2]
+    for lane in range(count):
+        i = first + lane
+        if step >= lengths[i]:
+            continue
+        at = 0
+        for age in ages:
+            if age <= step:
+                for k in range(size):
+                    by_frames[(step - age) % depth, i, k] += by_observation[i, at + k]
+            at += size
+        frame = by_frames[step % depth, i]
+        for k in range(size - OBSERVATION_SIZE):
+            if abs(actions[step - 1, i, k]) < float32(1.0):
+                by_actions[step - 1, i, k] += frame[OBSERVATION_SIZE + k]
+        if by_integral.shape[0] > 0:
+            _undo_integral(b, lane, i, integrals[step], numbers, frame, by_integral)
+        for k in range(OBSERVATION_SIZE):
+            by_feature[k, lane] = frame[k]
+        frame[:] = 0.0
+
+
+@compiled
+def _undo_integral(b, lane, i, integral, numbers, frame, by_integral):
+    """Undo :func:`.frames.integrate_position` of a row; ``frame`` is the gradient by its frame."""
+    error2 = speed2 = 0.0
+    for axis in range(3):
+        e, v = F.position + axis, F.velocity + axis
+        error = with_noise(b, e, lane)
+        speed = with_noise(b, v, lane)
+        error2 += error * error
+        speed2 += speed * speed
+    near = error2 < numbers[1] and speed2 < numbers[2]
+    for axis in range(3):
+        k = F.position + axis
+        by_integral[axis, i] += frame[k] * b.inverse_std[k, lane]
+        if abs(integral[axis, i]) >= numbers[3]:
+            by_integral[axis, i] = 0.0
+        elif near:
+            frame[k] += by_integral[axis, i] * numbers[0] / b.inverse_std[k, lane]

@@ -1,0 +1,439 @@
+"""Gradients of recorded flights: what autograd of the same equations gives, and what differences of
+flights do.
+"""
+
+from copy import deepcopy
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from flight_in_torch import State, fly
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import nn
+
+from sb3_quad.algorithms.apg import APG
+from sb3_quad.algorithms.flight_cost import FlownStates, flight_cost
+from sb3_quad.algorithms.networks.gradients import Perceptrons, Pullback, network_of
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.simulation.adjoint import MOVING
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
+from sb3_quad.simulation.tape import FlightTape
+
+# What each quantity of the state varies by, so that the parts of a cost weigh about the same.
+SCALE = np.concatenate([np.ones(13), np.full(4, 100.0)])
+
+
+def new_batch(n, seed, n_threads=1, **keywords):
+    keywords = {"task": "state_recovery", **keywords}
+    return QuadcopterBatch(n, FlightSettings(**keywords), seed, n_threads)
+
+
+def random_actions(steps, n, seed):
+    """Some beyond their limits, float32 (steps, n, 4)."""
+    return np.random.default_rng(seed).uniform(-1.3, 1.3, (steps, n, 4)).astype(np.float32)
+
+
+def begin(tape, seed=0):
+    """Begin a recording with rotor speeds that no command is equal to.
+
+    There a rotor's rate jumps, and nothing has a derivative.
+    """
+    tape.reset()
+    batch = tape.batch
+    batch.state[ROTOR_SPEEDS] *= np.random.default_rng(seed).uniform(0.9, 1.1, (4, batch.n))
+    batch.observe()
+
+
+class LinearCost:
+    """A random linear cost of the states, actions and observations that count.
+
+    :param observed: whether observations cost.
+    """
+
+    def __init__(self, tape, seed, observed=True):
+        generator = np.random.default_rng(seed)
+        steps, n = tape.n_steps, tape.batch.n
+        self.states = np.zeros((steps, STATE_SIZE, n))
+        weights = generator.standard_normal((steps, MOVING, n)) / SCALE[:, None]
+        self.states[:, :MOVING] = np.where(tape.counts[:, None], weights, 0.0)
+        weights = generator.standard_normal((steps, n, 4))
+        self.actions = np.where(tape.counts[:, :, None], weights, 0.0)
+        size = tape.batch.observation.size
+        # One more, of the last observation, which leads to no action
+        self.observations = np.zeros((steps + 1, n, size), np.float32)
+        if observed:
+            weights = generator.standard_normal((steps, n, size))
+            self.observations[:-1] = np.where(tape.acts[:, :, None], weights, 0.0)
+
+    def __call__(self, states, actions, counts):
+        """As the tape takes it."""
+        value = (self.states * states).sum() + (self.actions * actions).sum()
+        return value, self.states.copy(), self.actions.copy()
+
+    def of(self, flight):
+        """The cost of a flight in PyTorch."""
+        states = th.tensor(self.states[:, :MOVING]).transpose(1, 2)
+        observations = th.tensor(self.observations[:-1]).double()
+        return (
+            (states * flight.states).sum()
+            + (th.tensor(self.actions) * flight.actions).sum()
+            + (observations * flight.observations).sum()
+        )
+
+
+def gradients(tape, cost):
+    """Return the gradients by actions (steps, n, 4) and by the start state (17, n)."""
+    tape.begin(cost)
+    by_actions = [
+        tape.backward(step, cost.observations[step + 1]) for step in reversed(range(tape.n_steps))
+    ]
+    return np.array(by_actions[::-1]), tape.by_start.copy()
+
+
+def assert_close(ours, theirs, relative, axis):
+    """Assert that numbers agree, relative to the largest along the axes: of a row's gradient."""
+    error = np.abs(ours - theirs).max(axis)
+    assert np.isfinite(ours).all() and (error <= relative * np.abs(theirs).max(axis)).all()
+
+
+def record_and_compare(tape, actions, seed):
+    """Record a flight from the present start, and compare it and its gradients with PyTorch's."""
+    batch = tape.batch
+    before = batch.snapshot()
+    observations = [batch.observe(), *(tape.step(action) for action in actions)]
+    after = batch.snapshot()
+    cost = LinearCost(tape, seed)
+    by_actions, by_start = gradients(tape, cost)
+
+    batch.restore(before)
+    free = th.tensor(actions).double().requires_grad_()
+    start = th.tensor(batch.state[:MOVING].T.copy()).requires_grad_()
+    flight = fly(batch, lambda step, _: free[step], tape.n_steps, tape.substeps, start)
+    batch.restore(after)
+    states = flight.states.detach().numpy().transpose(0, 2, 1) / SCALE[:, None]
+    np.testing.assert_allclose(tape.states[1:, :MOVING] / SCALE[:, None], states, atol=1e-9)
+    # Observations are float32.
+    np.testing.assert_allclose(
+        observations[:-1], flight.observations.detach(), rtol=2e-6, atol=2e-6
+    )
+    expected = th.autograd.grad(cost.of(flight), (free, start))
+    # Noise is float32, and all else of the way back float64.
+    tolerance = 1e-6 if batch.scaling[-2:].any() else 1e-11
+    assert_close(by_actions, expected[0].numpy(), tolerance, (0, 2))
+    assert_close(by_start * SCALE[:, None], expected[1].numpy().T * SCALE[:, None], tolerance, 0)
+    return by_actions
+
+
+VEHICLES = {
+    "vehicle": st.sampled_from(["itm", "l2f_crazyflie", "cf21B_500", "rotorpy_hummingbird"])
+}
+RANDOM = {
+    "mass": st.just([0.8, 1.2]),
+    "inertia": st.just([0.7, 1.4]),
+    "motor_gain": st.just([0.5, 1.0]),
+    "motor_gain_down": st.just([0.4, 0.9]),
+    "thrust": st.just([0.9, 1.1]),
+    "center_of_mass": st.just([-0.01, 0.01]),
+    "delay": st.sampled_from([[0, 4], [0, 1], [3, 3]]),
+    "drag": st.just([0.1, 1.0]),
+    "force": st.sampled_from(
+        [
+            {"magnitude": [0, 0.5], "unit": "weight"},
+            {"magnitude": 0.2, "unit": "weight", "frame": "body"},
+        ]
+    ),
+    "torque": st.sampled_from(
+        [
+            {"magnitude": [0, 0.05], "unit": "weight"},
+            {"magnitude": 0.03, "unit": "weight", "frame": "world"},
+        ]
+    ),
+    "gusts": st.just({"std": [0, 0.2], "unit": "weight", "time_constant": 0.1}),
+    "wind": st.just([0, 5]),
+    "wind_gusts": st.just({"std": [0, 2]}),
+}
+SEEN = {
+    "noise": st.sampled_from([0.0, 0.2, {"relative": 0.1, "additive": 0.05}, {"additive": 0.02}]),
+    "last_action": st.just(True),
+    "history": st.sampled_from([[0, 1], [0, 2, 5], [0, 1, 2, 3, 10]]),
+    "position_integral": st.sampled_from(
+        [{}, {"gain": 3, "distance": 1, "speed": 4, "limit": 0.05}]
+    ),
+    "observation_mean": st.just(np.linspace(-0.5, 0.5, 18).tolist()),
+    "observation_std": st.just(np.linspace(0.5, 6.0, 18).tolist()),
+}
+DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
+
+
+@settings(max_examples=settings().max_examples // 2)
+@given(
+    vehicle=st.fixed_dictionaries(VEHICLES, optional=DISTRIBUTION),
+    randomize=st.fixed_dictionaries({}, optional=RANDOM),
+    seen=st.fixed_dictionaries({}, optional=SEEN),
+    steps=st.integers(1, 50),
+    substeps=st.sampled_from([2, 4]),
+    seed=st.integers(0, 2**31),
+)
+@example(
+    # Where the integral stops and goes on depends on the noise.
+    vehicle={},
+    randomize={},
+    seen={
+        "noise": {"relative": 0.1, "additive": 0.05},
+        "position_integral": {"gain": 3, "distance": 0.3, "speed": 3, "limit": 0.05},
+    },
+    steps=30,
+    substeps=2,
+    seed=0,
+)
+def test_flights_and_gradients_are_those_of_autograd(
+    vehicle, randomize, seen, steps, substeps, seed
+):
+    batch = new_batch(20, seed, **vehicle, randomize=randomize, **seen)
+    tape = FlightTape(batch, steps, substeps)
+    begin(tape, seed)
+    record_and_compare(tape, random_actions(steps, batch.n, seed), seed)
+
+
+def test_rows_of_different_noise_have_the_gradients_of_their_own():
+    batch = new_batch(12, 2, noise=0.2, position_integral={"distance": 0.5, "speed": 3.0})
+    batch.set_noise({"relative": 0.1, "additive": 0.05}, [3, 4])
+    batch.set_noise({"additive": 0.1}, [7])
+    batch.set_noise(0.0, [8])
+    tape = FlightTape(batch, 20, 2)
+    begin(tape)
+    record_and_compare(tape, random_actions(20, batch.n, 0), 0)
+
+
+@pytest.mark.parametrize("substeps", [2, 4])
+@pytest.mark.parametrize("vehicle", ["itm", "l2f_crazyflie"])
+def test_the_gradient_by_the_start_is_that_of_differences(vehicle, substeps):
+    torque = {"magnitude": 0.03, "unit": "weight", "frame": "world"}
+    batch = new_batch(
+        4, 3, vehicle=vehicle, randomize={"drag": [0.2, 1.0], "wind": 3.0, "torque": torque}
+    )
+    tape, actions = FlightTape(batch, 20, substeps), random_actions(20, batch.n, 0)
+    begin(tape)
+    start = batch.snapshot()
+    for action in actions:
+        tape.step(action)
+    # Observations are float32, which no difference of 1e-6 survives.
+    cost = LinearCost(tape, 1, observed=False)
+    _, by_start = gradients(tape, cost)
+
+    def costs(row, change):
+        batch.restore(start)
+        batch.state[row] += change
+        states = []
+        for action in actions:
+            batch.step_on(action, substeps)
+            states.append(batch.state.copy())
+        return (cost.states * states).sum(axis=(0, 1))
+
+    for row, scale in enumerate(SCALE):
+        h = 1e-3 * scale
+        # Exact but for h⁴
+        slope = 8 * (costs(row, h) - costs(row, -h)) - (costs(row, 2 * h) - costs(row, -2 * h))
+        error = np.abs(slope / (12 * h) - by_start[row]) * scale
+        assert (error <= 1e-6 * np.abs(by_start * SCALE[:, None]).max(axis=0)).all(), row
+
+
+def test_the_number_of_threads_changes_no_bit():
+    keywords = {
+        "randomize": {"mass": [0.8, 1.2], "delay": [0, 2], "gusts": {"std": 1.0}},
+        "last_action": True,
+        "history": [0, 1],
+        "position_integral": {"distance": 10.0, "speed": 10.0},
+    }
+    n, steps = 600, 6
+    found = []
+    for threads in (1, 2, 2, 2):
+        tape = FlightTape(new_batch(n, 5, threads, **keywords), steps, 2)
+        assert tape._helpers == threads - 1
+        begin(tape)
+        for action in random_actions(steps, n, 0):
+            tape.step(action)
+        found.append((tape, *gradients(tape, LinearCost(tape, 1))))
+    for tape, by_actions, by_start in found[1:]:
+        np.testing.assert_array_equal(tape.states, found[0][0].states)
+        np.testing.assert_array_equal(by_actions, found[0][1])
+        np.testing.assert_array_equal(by_start, found[0][2])
+    assert by_actions.any(axis=(0, 2)).all() and by_start.any(axis=0).all()
+
+
+CARRIED = {
+    "randomize": {"delay": [0, 3], "drag": 0.3, "wind_gusts": {"std": 1.0}},
+    "last_action": True,
+    "history": [0, 3, 7],
+    "position_integral": {"distance": 10.0, "speed": 10.0},
+}
+LOST = [1, 4]
+
+
+def doomed(batch):
+    """Let one row of :data:`LOST` hit the ground, and the other leave the range."""
+    batch.state[POSITION, 1] = [0.0, 0.0, 0.4]
+    batch.state[VELOCITY, 1] = [0.0, 0.0, -3.0]
+    batch.state[POSITION, 4] += [29.9, 0.0, 0.0]
+    batch.state[VELOCITY, 4] = [2.0, 0.0, 0.0]
+    batch.observe()
+
+
+def test_a_lost_row_has_no_gradient_from_there_on_and_disturbs_no_other():
+    steps = 25
+    actions = random_actions(steps, 6, 0)
+    found = []
+    for is_doomed in (True, False):
+        tape = FlightTape(new_batch(6, 7, **CARRIED), steps, 2)
+        begin(tape)
+        if is_doomed:
+            doomed(tape.batch)
+            lost = record_and_compare(tape, actions, 1)
+            assert np.flatnonzero(tape.lost).tolist() == LOST
+            lengths = tape.lengths.copy()
+            assert (lengths[LOST] < steps).all() and (np.delete(lengths, LOST) == steps).all()
+        else:
+            for action in actions:
+                tape.step(action)
+            assert not tape.lost.any()
+        cost = LinearCost(tape, 1)
+        # Whatever a policy answers there
+        cost.observations[np.arange(steps + 1)[:, None] >= tape.lengths] = np.nan
+        found.append(gradients(tape, cost))
+        kept = np.delete(np.arange(6), LOST)
+    np.testing.assert_array_equal(found[0][0][:, kept], found[1][0][:, kept])
+    np.testing.assert_array_equal(found[0][1][:, kept], found[1][1][:, kept])
+    np.testing.assert_array_equal(found[0][0], lost)
+    for row in LOST:
+        # The last action leads to the crash, which does not count.
+        assert not lost[lengths[row] - 1 :, row].any() and lost[: lengths[row] - 1, row].any()
+
+
+def test_flights_that_carry_on_have_the_gradient_of_what_follows():
+    steps, n = 25, 6
+    tape = FlightTape(new_batch(n, 7, **CARRIED), steps, 2)
+    begin(tape)
+    doomed(tape.batch)
+    for action in random_actions(steps, n, 0):
+        tape.step(action)
+    assert np.flatnonzero(tape.lost).tolist() == LOST
+    for recording in (1, 2):
+        before, lost = tape.batch.state.copy(), tape.lost.copy()
+        tape.reset(carry_on=True)
+        goes_on = (tape.batch.state == before).all(axis=0)
+        np.testing.assert_array_equal(goes_on, ~lost)
+        assert not tape.lost.any()
+        record_and_compare(tape, random_actions(steps, n, recording), recording)
+        assert not tape.lost.any()
+
+
+def new_policy(inputs, outputs, widths, activation):
+    return ActorCriticPolicy(
+        gymnasium.spaces.Box(-10.0, 10.0, (inputs,), np.float32),
+        gymnasium.spaces.Box(-1.0, 1.0, (outputs,), np.float32),
+        lambda _: 1e-3,
+        net_arch=widths,
+        activation_fn=activation,
+        ortho_init=False,
+    )
+
+
+@settings(max_examples=settings().max_examples // 4 * 3)
+@given(
+    widths=st.lists(st.integers(1, 70), max_size=3),
+    activation=st.sampled_from([nn.Tanh, nn.ReLU, nn.ELU]),
+    inputs=st.integers(1, 40),
+    outputs=st.integers(1, 5),
+    rows=st.integers(1, 600),
+    calls=st.integers(1, 3),
+    seed=st.integers(0, 2**31),
+)
+def test_a_gradient_goes_through_a_policy_as_by_autograd(
+    widths, activation, inputs, outputs, rows, calls, seed
+):
+    th.manual_seed(seed)
+    policy = new_policy(inputs, outputs, widths, activation)
+    is_compiled = isinstance(network_of(policy), Perceptrons)
+    assert is_compiled == (activation is not nn.ELU or not widths)
+    twin = deepcopy(policy)
+    pullback = Pullback(policy, rows)
+    for _ in range(calls):
+        x, by_actions = th.randn(rows, inputs), th.randn(rows, outputs).double()
+        ours = pullback(x.numpy(), by_actions.numpy())
+        free = x.clone().requires_grad_()
+        twin.get_distribution(free).mode().backward(by_actions.float())
+        assert ours.dtype == np.float32
+        assert_close(ours, free.grad.numpy(), 1e-5, None)
+    pullback.set_gradients()
+    for (name, one), other in zip(policy.named_parameters(), twin.parameters(), strict=True):
+        assert (one.grad is None) == (other.grad is None), name
+        if one.grad is not None:
+            assert_close(one.grad.numpy(), other.grad.numpy(), 1e-5, None)
+
+
+class Snapshots(BaseCallback):
+    """Keeps what each rollout of a batch begins with."""
+
+    def __init__(self, batch):
+        super().__init__()
+        self.batch = batch
+
+    def _on_rollout_start(self):
+        self.kept = self.batch.snapshot()
+        policy = self.model.policy
+        self.actor = deepcopy(nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net))
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("activation", [nn.Tanh, nn.ELU])
+def test_apg_follows_the_gradient_of_the_flight_and_the_policy_together(activation):
+    n, steps = 8, 15
+    env = QuadcopterVecEnv(
+        n,
+        "state_recovery",
+        randomize={"mass": [0.9, 1.1], "delay": [0, 2], "drag": 0.3, "gusts": {"std": 1.0}},
+        last_action=True,
+        history=[0, 2],
+        position_integral={"distance": 10.0, "speed": 10.0},
+        seed=0,
+    )
+    model = APG(
+        "MlpPolicy",
+        env,
+        n_steps=steps,
+        max_grad_norm=1e9,
+        policy_kwargs={"net_arch": [17, 16], "activation_fn": activation},
+        seed=0,
+        device="cpu",
+    )
+    with th.no_grad():  # so that what is observed matters, and some actions are clipped
+        model.policy.action_net.weight *= 100.0
+    start = Snapshots(env.batch)
+    # The second update must forget the gradient of the first.
+    model.learn(2 * n * steps, callback=start)
+
+    actor = start.actor.double()
+    actor.zero_grad()
+    batch = env.batch
+    batch.restore(start.kept)
+    batch.reset()
+    target = th.tensor(batch.state[MOVING:].T).expand(steps, n, 3)
+    flight = fly(batch, lambda _, seen: actor(seen), steps, model.substeps)
+    parts = State.of(flight.states.movedim(2, 0).flatten(1))
+    parts = [part.unflatten(0, (steps, n)) for part in parts]
+    flight_cost(FlownStates._make([*parts, target, flight.actions])).mean().backward()
+    beyond = (flight.actions.abs() > 1.0).double().mean()
+    assert 0.02 < beyond < 0.7
+
+    trained = [*model.policy.mlp_extractor.policy_net.parameters()]
+    trained += model.policy.action_net.parameters()
+    for one, other in zip(trained, actor.parameters(), strict=True):
+        assert_close(one.grad.numpy(), other.grad.numpy(), 1e-4, None)
