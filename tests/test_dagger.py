@@ -20,9 +20,6 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.simulation.state import BODY_RATES, QUATERNION, VELOCITY
-from sb3_quad.simulation.unobserved import UNOBSERVED, unobserved
 
 SMALL = {
     "n_steps": 32,
@@ -384,69 +381,3 @@ def test_dict_observations_and_discrete_actions_are_refused():
         DAgger("MultiInputPolicy", env)
     with pytest.raises(AssertionError, match=r"Discrete\(2\)"):  # SB3's own
         DAgger("MlpPolicy", "CartPole-v1")
-
-
-def test_hidden_units_learn_to_say_what_no_observation_shows(tmp_path):
-    pushes = {"mass": [0.8, 1.25], "force": {"magnitude": [0, 3]}}
-    env = QuadcopterVecEnv(
-        64,
-        seed=0,
-        noise=0.0,
-        last_action=True,
-        history=[0, 8, 16],
-        randomize=pushes,
-        max_episode_steps=60,
-    )
-    sizes = {
-        "n_steps": 30,
-        "batch_size": 480,
-        "n_epochs": 3,
-        "gradient_steps": None,
-        "learning_rate": 3e-3,
-        "bc_loss": "huber_mse",
-        "beta": 1.0,
-    }
-    model = DAgger(
-        "MlpPolicy",
-        env,
-        expert="privileged_geometric",
-        aux_coef=1.0,
-        policy_kwargs={"net_arch": [64, 32]},
-        seed=0,
-        **sizes,
-    )
-    model.learn(64 * 30 * 30)
-    env.step(model.predict(env.reset(), deterministic=True)[0])
-    for _ in range(25):
-        observations = env.step(model.predict(env.batch.observe(), deterministic=True)[0])[0]
-    right = unobserved(env.true_state())
-    said = model.policy.mlp_extractor.policy_net[:2](th.as_tensor(observations)).detach().numpy()
-    assert np.corrcoef(said[:, 0], right[:, 0])[0, 1] > 0.5 and UNOBSERVED[0] == "load"
-    model.save(tmp_path / "model.zip")
-    PPO.load(tmp_path / "model.zip")
-    with pytest.raises(ConfigError, match="two hidden layers"):
-        DAgger("MlpPolicy", env, expert="pid", aux_coef=1.0, policy_kwargs={"net_arch": [8]})
-    with pytest.raises(ConfigError, match="true_state"):
-        DAgger(
-            "MlpPolicy",
-            "Pendulum-v1",
-            expert=lambda observations: observations[:, :1],
-            aux_coef=1.0,
-        ).learn(1)
-
-
-def test_the_load_is_the_action_that_holds_the_height():
-    env = QuadcopterVecEnv(
-        20,
-        seed=1,
-        randomize={"mass": [0.8, 1.25], "motor_gain": 5.0, "force": {"magnitude": [0, 3]}},
-    )
-    env.reset()
-    env.batch.state[QUATERNION] = np.array([[1.0], [0.0], [0.0], [0.0]])
-    env.batch.state[BODY_RATES] = env.batch.state[VELOCITY] = 0.0
-    load = unobserved(env.true_state())[:, :1]
-    for _ in range(20):
-        env.batch.state[VELOCITY] = 0.0
-        env.step(np.repeat(load, 4, axis=1))
-    within = np.abs(load[:, 0]) < 0.9
-    np.testing.assert_allclose(env.true_state().velocity[within, 2], 0.0, atol=2e-3)

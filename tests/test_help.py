@@ -107,14 +107,14 @@ def test_a_misspelt_name_or_a_part_of_names_is_guessed_and_nothing_else(given, v
         ("train --sampler tpe", "option '--sampler': it belongs to sb3-quad tune"),
         ("report folder --nothing", "option '--nothing': see --help, and docs/zoo.md"),
         ("train 5", "argument '5': see --help"),
-        ("train --algo a2c", "algorithm 'a2c': (valid: dagger,"),
+        ("train --algo a2c", "algorithm 'a2c': (valid: apg, dagger,"),
         (
             "train --conf-file nothere.yml",
             "settings file 'nothere.yml': (valid: any_quadcopter/dagger.yml,",
         ),
         (
             "train --hyperparams bc_coef:1 --algo dagger",
-            "key of dagger 'bc_coef': (valid: aux_coef,",
+            "key of dagger 'bc_coef': (valid: batch_size,",
         ),
         (
             "enjoy pid --task tracking --no-render",

@@ -156,8 +156,7 @@ ON_POLICY = [
 ]
 IMITATION = [
     *({"bc_loss": kind, "vf_coef": 0.5} for kind in losses.CLONING_LOSSES),
-    {"bc_loss": "nll", "aux_coef": 0.5, "policy_kwargs": {"net_arch": [32, 32]}},
-    {"aux_coef": 0.5, "policy_kwargs": {"net_arch": [32, 32, 16]}, "clip_range_vf": 0.1},
+    {"policy_kwargs": {"net_arch": [32, 32, 16]}, "clip_range_vf": 0.1},
     {"ent_coef": 0.01, "l2_coef": 0.1, "clip_range_vf": 0.1},
 ]
 

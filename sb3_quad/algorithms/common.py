@@ -48,7 +48,6 @@ LIMITS = {
     "target_kl": _WEIGHT,
     "critic_warmup": _WEIGHT,
     "bc_coef": _WEIGHT,
-    "aux_coef": _WEIGHT,
     "l2_coef": _WEIGHT,
     "vf_coef": _WEIGHT,
     "beta_decay": _WEIGHT,

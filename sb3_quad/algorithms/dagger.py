@@ -45,10 +45,8 @@ from sb3_quad.algorithms.networks.losses import (
 )
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import Float32Array
-from sb3_quad.controllers.controller import Controller, true_state_of
+from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.expert_like import ExpertLike
-from sb3_quad.simulation.unobserved import UNOBSERVED, unobserved
 
 # Observations that the critic evaluates at once after a rollout
 _VALUE_CHUNK = 16384
@@ -113,9 +111,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         and three times the squared error
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
-    :param aux_coef: Weight of an auxiliary loss, "huber_mse". The first units of the last hidden
-        layer but one, by tanh, learn to predict what no observation shows,
-        :data:`~sb3_quad.simulation.unobserved.UNOBSERVED`. 0: no such loss
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only,
         as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
@@ -156,7 +151,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         bc_loss: CloningLoss = "mse",
         log_std_min: float = -3.0,
         l2_coef: float = 0.0,
-        aux_coef: float = 0.0,
         dataset_capacity: int = 500_000,
         shuffle: bool = True,
         _init_setup_model: bool = True,
@@ -194,7 +188,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.bc_loss: CloningLoss = bc_loss
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
-        self.aux_coef = aux_coef
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
         self.expert = None
@@ -232,21 +225,13 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             )
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        action_dim = self.rollout_buffer.action_dim
-        # Hidden layers up to that of the auxiliary loss; 0: there is no such loss.
-        self._aux_layer = 0
-        if self.aux_coef:
-            self._aux_layer = len(self.policy.mlp_extractor.policy_net) // 2 - 1
-            action_dim += len(UNOBSERVED)
-            if self._aux_layer < 1:
-                raise ConfigError(f"aux_coef {self.aux_coef:g}: needs at least two hidden layers")
         dtype = self.rollout_buffer.observations.dtype
         if np.issubdtype(dtype, np.floating):
             dtype = np.dtype(np.float32)
         self.dataset = AggregatedDataset(
             self.dataset_capacity or rollout,
             self.rollout_buffer.obs_shape,
-            action_dim,
+            self.rollout_buffer.action_dim,
             dtype,
         )
 
@@ -257,10 +242,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         """
         if self.env is not None:
             self._labeller = Controller.for_env(expert, self.env, self._labeller)
-            if self.aux_coef and true_state_of(self.env) is None:
-                raise ConfigError(
-                    f"aux_coef {self.aux_coef:g}: needs an environment with true_state()"
-                )
         self.expert = expert
 
     @property
@@ -336,9 +317,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         action_space: Any = self.action_space
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
-        # + What the auxiliary loss teaches, by step
-        aux_targets: list[Float32Array] = []
-        true_state = true_state_of(env) if self._aux_layer else None
         not_yet = th.zeros(env.num_envs)
 
         buffer.reset()
@@ -348,8 +326,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             # + Label the state before the step.
             labels = self._labels(env)
             buffer.expert_actions[step] = labels
-            if true_state is not None:
-                aux_targets.append(unobserved(true_state()))
 
             # + The expert's action flies with probability β, else a sample of the agent's.
             observations: Any = self._last_obs
@@ -390,10 +366,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         # + Add the labels to the dataset.
         if self.dataset_capacity == 0:
             self.dataset.clear()
-        targets = buffer.expert_actions
-        if aux_targets:
-            targets = np.concatenate([targets, aux_targets], axis=2)
-        self.dataset.add(flown, targets.reshape(len(flown), -1))
+        self.dataset.add(flown, buffer.expert_actions.reshape(len(flown), -1))
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
@@ -462,23 +435,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                     entropy: Any = self.policy.get_distribution(observations).entropy()
                 except ValueError as error:  # of a distribution whose mean is not finite
                     raise self._diverged({"bc_loss": math.nan}) from error
-                # + The cloning term L_BC (Eq. 3.12); behind the action lie the auxiliary targets
+                # + The cloning term L_BC (Eq. 3.12)
                 mean = self.policy.action_dist.mode()
                 log_std = self.policy.log_std
-                action_dim = mean.shape[1]
-                errors = cloning_errors(self.bc_loss, mean, log_std, labels[:, :action_dim])
+                errors = cloning_errors(self.bc_loss, mean, log_std, labels)
                 losses = {"bc_loss": errors.mean()}
                 loss = losses["bc_loss"]
-                if self._aux_layer:  # +
-                    aux_labels = labels[:, action_dim:]
-                    layers = self.policy.mlp_extractor.policy_net[: 2 * self._aux_layer]
-                    features = self.policy.extract_features(
-                        observations, self.policy.pi_features_extractor
-                    )
-                    predicted = layers(features)[:, : aux_labels.shape[1]]
-                    errors = cloning_errors("huber_mse", predicted, log_std, aux_labels)
-                    losses["aux_loss"] = errors.mean()
-                    loss = loss + self.aux_coef * losses["aux_loss"]
 
                 # Value loss using the TD(gae_lambda) target
                 if critic_batch is not None:
@@ -525,4 +487,4 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self._log_rollout(buffer, clip_range_vf)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "dataset", "_aux_layer"]
+        return [*super()._excluded_save_params(), "dataset"]
