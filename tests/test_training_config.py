@@ -329,7 +329,7 @@ def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of
 def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file(env_id):
     for algo in ("dagger", "ppo_bc"):
         assert (
-            load_config(algo, env_id, f"robust/{algo}.yml").expert == "privileged_cautious"
+            load_config(algo, env_id, f"robust/{algo}.yml").expert == "privileged_geometric"
         )  # in random worlds
         assert load_config(algo, env_id, f"nominal/{algo}.yml").expert == "geometric"
         assert (
@@ -344,7 +344,7 @@ def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file(env_
         )  # which config.yml then names
         assert load_config(algo, env_id, f"thesis/{algo}.yml").expert == "pid"
     robust = dict.fromkeys(
-        (DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "privileged_cautious"
+        (DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "privileged_geometric"
     )
     pipelines = {**robust, "nominal/two_stage.yml": "geometric"}
     for file, expert in {**pipelines, THESIS: "pid", "thesis/two_stage.yml": "pid"}.items():

@@ -17,7 +17,6 @@ EXPERTS = {
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
     "privileged_geometric": "sb3_quad.experts.geometric:privileged_geometric",
     "privileged_derived": "sb3_quad.experts.geometric:privileged_derived",
-    "privileged_cautious": "sb3_quad.experts.geometric:privileged_cautious",
 }
 DEFAULT_EXPERT = "pid"
 """The expert that is imitated by default, the thesis's."""
