@@ -252,7 +252,8 @@ def test_the_types_of_every_algorithm_are_resolved(algorithm):
     assert {name: convert(each.default, each, name) for name, each in given.items()} == {
         name: each.default for name, each in given.items()
     }
-    assert not takes_whole(parameters["gamma"]) and not takes_whole(parameters["learning_rate"])
+    assert not takes_whole(parameters["learning_rate"])
+    assert "gamma" not in parameters or not takes_whole(parameters["gamma"])
     assert takes_whole(parameters["n_steps" if "n_steps" in parameters else "batch_size"])
 
 
