@@ -126,9 +126,11 @@ _WITH_ATTRIBUTES = _by_name(
     "stable_baselines3.common.noise.NormalActionNoise",
     "stable_baselines3.common.noise.OrnsteinUhlenbeckActionNoise",
     "stable_baselines3.common.noise.VectorizedActionNoise",
+    "stable_baselines3.common.running_mean_std.RunningMeanStd",
     "stable_baselines3.common.utils.ConstantSchedule",
     "stable_baselines3.common.utils.FloatSchedule",
     "stable_baselines3.common.utils.LinearSchedule",
+    "stable_baselines3.common.vec_env.vec_normalize.VecNormalize",
 )
 # The others of these are only named, but for TrainFreq, a named tuple.
 _CLASSES = _WITH_ATTRIBUTES | _by_name(

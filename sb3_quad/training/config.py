@@ -29,6 +29,7 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
+from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
@@ -50,6 +51,7 @@ _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
+NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 # For dummy and subproc. PyBullet allows about as many in a process.
 MAX_SINGLE = 1000
 
@@ -112,8 +114,8 @@ class TrainingConfig(Frozen):
     """wrappers around each environment, for dummy and subproc"""
     vec_env_wrapper: Classes = []
     """wrappers around the vectorised environment"""
-    normalize: Literal[False] | None = None
-    """its statistics would not be part of a model's zip"""
+    normalize: bool | Keywords = False
+    """true, or keywords of SB3's VecNormalize, which then is the outermost wrapper"""
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
     """action noise, for off-policy algorithms"""
     noise_std: NonNegativeFloat = 0.1
@@ -152,6 +154,24 @@ class TrainingConfig(Frozen):
         if name in self.hyperparams:
             return self.hyperparams[name]
         return constructor_parameters(self.algorithm)[name].default
+
+    @property
+    def vec_env_wrappers(self) -> list[tuple[str, StrDict]]:
+        """The wrappers around the vectorised environment, that of ``normalize`` included."""
+        if not self.normalize:
+            return self.vec_env_wrapper
+        keywords = {"gamma": self.keyword("gamma")}
+        if self.normalize is not True:
+            keywords |= self.normalize
+        return [*self.vec_env_wrapper, (NORMALIZE, keywords)]
+
+    @property
+    def normalizes(self) -> bool:
+        """Whether the agent sees observations that VecNormalize has normalised."""
+        return any(
+            path.endswith("VecNormalize") and keywords.get("norm_obs", True)
+            for path, keywords in self.vec_env_wrappers
+        )
 
     @property
     def is_off_policy(self) -> bool:
@@ -441,9 +461,12 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
         # The changes to these are in the settings already.
         "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
     }
+    model = load_model(path)
+    if statistics_of(model) is not None and not config.normalizes:
+        adopted["normalize"] = True
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
-        policy: Any = load_model(path).policy
+        policy: Any = model.policy
         adopted["policy_kwargs"] = {
             **config.policy_kwargs,
             "net_arch": policy.net_arch,

@@ -229,6 +229,8 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
             _check_correction(stage.correct_offset, config)
+            if jobs and jobs[-1].config.normalizes != config.normalizes:
+                raise ConfigError("normalize: must be that of the stage before, whose agent it has")
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.
@@ -244,6 +246,8 @@ def _check_correction(correction: OffsetCorrection | None, config: TrainingConfi
         return
     if not config.task:
         raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
+    if config.env_wrapper or config.vec_env_wrappers:
+        raise ConfigError("correct_offset: flies without wrappers; remove them, and normalize")
     if correction.kind == "arrival":
         config.flight_settings.with_changes(**correction.env_kwargs)
     elif config.flight_settings.size != OBSERVATION_SIZE:
