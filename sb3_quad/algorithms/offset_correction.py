@@ -30,7 +30,6 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
-from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings, levels
@@ -179,8 +178,6 @@ def first_layer(model: BaseAlgorithm, size: int = OBSERVATION_SIZE) -> th.nn.Lin
     :raises ConfigError: it has none.
     """
     # SAC and TD3 have an actor, on-policy algorithms an extractor for both networks.
-    if statistics_of(model) is not None:
-        raise ConfigError("offset correction needs an agent that sees raw observations")
     policy = model.policy
     owner = getattr(policy, "actor", None) or getattr(policy, "mlp_extractor", None)
     for name in ("policy_net", "latent_pi", "mu"):

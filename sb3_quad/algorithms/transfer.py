@@ -48,9 +48,7 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
         except ExpertError as error:  # other spaces
             raise ConfigError(f"{name}: {error}") from None
         return
-    env = model.get_env()
-    if env is not None:
-        share_statistics(statistics_of(teacher), env, training=True)
+    share_statistics(statistics_of(teacher), model.get_env(), training=True)
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{name}: holds parameters that are not finite")
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:

@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, StrDict
@@ -28,10 +28,10 @@ class Controller:
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
     2 and 3 get the observations that a policy sees. An SB3 model that was trained behind
-    ``VecNormalize`` gets raw ones, normalised by its own statistics. ``predict`` may return a state together with
-    the actions, as SB3's recurrent policies do. The next call passes it back as ``state``, with
-    ``episode_start`` (n,): the rows that have just begun an episode. All rows of a new Controller
-    begin one.
+    ``VecNormalize`` gets raw ones, normalised by its own statistics. ``predict`` may return a state
+    together with the actions, as SB3's recurrent policies do. The next call passes it back as
+    ``state``, with ``episode_start`` (n,): the rows that have just begun an episode. All rows of a
+    new Controller begin one.
 
     :param source: the controller, as above.
     :param action_space: the environment's action space, a Box.
@@ -60,7 +60,7 @@ class Controller:
         self._predict_state: Any = None
         self._statistics = statistics_of(source)
         # Whose raw observations the source sees instead of those that it is asked about.
-        self._raw: VecNormalize | None = None
+        self._raw: Any = None
         self._error: type[SB3QuadError] = ExpertError if kind == "expert" else ControllerError
         name = getattr(source, "__name__", type(source).__name__)
         self._who = f"{kind} {name}"
@@ -119,12 +119,10 @@ class Controller:
             return present
         vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
         source = resolve_expert(expert, vehicle)
-        raw = unwrap_vec_normalize(env) if isinstance(source, BaseAlgorithm) else None
-        observations = env.observation_space if raw is None else raw.venv.observation_space
-        controller = Controller(
-            source, env.action_space, observations, true_state_of(env), kind="expert"
-        )
-        controller._raw = raw
+        env_spaces = (env.action_space, env.observation_space)
+        controller = Controller(source, *env_spaces, true_state_of(env), kind="expert")
+        if isinstance(source, BaseAlgorithm):
+            controller._raw = unwrap_vec_normalize(env)
         controller.made_for = (expert, env)
         return controller
 

@@ -185,15 +185,19 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
 
 
 def refuse_settings(path: StrPath, keys: Sequence[str]) -> None:
-    """Check that the run in whose folder a zip lies was trained without some settings.
+    """Check that an agent was trained without some settings, by the run in whose folder it lies.
+
+    A zip of this package that says how its agent flies was.
 
     :param keys: of settings files, of this package and of rl_zoo3.
     :raises ConfigError: it was trained with one of them.
     """
+    if KEY in saved_data(path):
+        return
     for config in Path(path).parent.glob("*/config.yml"):
-        for key in keys:
-            if read_yaml(config).get(key):
-                raise ConfigError(
-                    f"{path}: was trained with {key} (see {config}), which is missing here; "
-                    "its agent flies otherwise without"
-                )
+        settings = read_yaml(config)
+        used = ", ".join(filter(settings.get, keys))
+        if used:
+            raise ConfigError(
+                f"{path}: was trained with {used} (see {config}), without which it flies otherwise"
+            )

@@ -29,7 +29,6 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
@@ -160,18 +159,11 @@ class TrainingConfig(Frozen):
         """The wrappers around the vectorised environment, that of ``normalize`` included."""
         if not self.normalize:
             return self.vec_env_wrapper
-        keywords = {"gamma": self.keyword("gamma")}
+        # As rl_zoo3 gives them.
+        keywords = {name: self.hyperparams[name] for name in self.hyperparams.keys() & {"gamma"}}
         if self.normalize is not True:
             keywords |= self.normalize
         return [*self.vec_env_wrapper, (NORMALIZE, keywords)]
-
-    @property
-    def normalizes(self) -> bool:
-        """Whether the agent sees observations that VecNormalize has normalised."""
-        return any(
-            path.endswith("VecNormalize") and keywords.get("norm_obs", True)
-            for path, keywords in self.vec_env_wrappers
-        )
 
     @property
     def is_off_policy(self) -> bool:
@@ -461,12 +453,9 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
         # The changes to these are in the settings already.
         "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
     }
-    model = load_model(path)
-    if statistics_of(model) is not None and not config.normalizes:
-        adopted["normalize"] = True
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
-        policy: Any = model.policy
+        policy: Any = load_model(path).policy
         adopted["policy_kwargs"] = {
             **config.policy_kwargs,
             "net_arch": policy.net_arch,

@@ -229,8 +229,9 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
             _check_correction(stage.correct_offset, config)
-            if jobs and jobs[-1].config.normalizes != config.normalizes:
-                raise ConfigError("normalize: must be that of the stage before, whose agent it has")
+            before = jobs[-1].config.vec_env_wrappers if jobs else config.vec_env_wrappers
+            if dict(before).keys() != dict(config.vec_env_wrappers).keys():
+                raise ConfigError("wrappers, and normalize, must be those of the stage before")
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.

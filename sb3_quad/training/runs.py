@@ -49,8 +49,6 @@ class RunFolder:
         self.config = path / name / "config.yml"
         # The options; env_kwargs there are those of the evaluations.
         self.arguments = path / name / "args.yml"
-        # The statistics of VecNormalize at the run's end, where rl_zoo3 expects them.
-        self.statistics = path / name / "vecnormalize.pkl"
         # The command that was typed.
         self.command = path / name / "command.txt"
 

@@ -285,12 +285,10 @@ class _Training:
     def run_to_end(self) -> TrainingResult:
         """Train until the job is done, or a signal or an error ends it, and save the model."""
         config = self.job.config
-        env: Any = self.model.get_env()
         statistics = self.model.get_vec_normalize_env()
         setattr(self.model, STATISTICS, statistics)
-        # A zip says how its agent flies, but a flight has no wrapper other than statistics.
-        inner = env.venv if env is statistics else env
-        if config.task and flight_settings_of(inner) is not None:
+        # A zip says how its agent flies, but a flight cannot have the user's wrappers.
+        if config.task and flight_settings_of(self.model.get_env()) is not None:
             self.job.flight_settings.write_into(self.model)
         self.run.error.unlink(missing_ok=True)
         start = time.perf_counter()
@@ -308,8 +306,9 @@ class _Training:
         if self.signals.received:
             self._save_interrupted()
         else:
+            # Those at the end, where rl_zoo3 has them.
             if statistics is not None:
-                write_bytes(self.run.statistics, pickle.dumps(statistics))
+                write_bytes(self.run.config.with_name("vecnormalize.pkl"), pickle.dumps(statistics))
             save_model(self.model, self.run.model)
             self.run.resume_state.unlink(missing_ok=True)
             self._refuse_removed_folder()
