@@ -156,7 +156,7 @@ def test_an_agent_without_statistics_sees_raw_observations_behind_them(tmp_path)
     np.testing.assert_array_equal(labeller.labels(observation), expected.clip(-2, 2))
 
 
-def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp_path):
+def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp_path, monkeypatch):
     path, _ = zoo_agent
     file = path.parent / "Pendulum-v1" / "vecnormalize.pkl"
     file.write_bytes(pickle.dumps(np.zeros(3)))
@@ -164,6 +164,10 @@ def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp
         DAgger("MlpPolicy", "Pendulum-v1", expert=str(path)).learn(1)
     file.write_bytes(pickle.dumps(Path(tmp_path)))
     with pytest.raises(ConfigError, match=r"names pathlib.*may run anything"):
+        resolve_expert(path)
+    file.write_bytes(b"none")
+    with monkeypatch.context() as trusting, pytest.raises(ConfigError, match="cannot be read"):
+        trusting.setenv("SB3_QUAD_TRUST", "1")
         resolve_expert(path)
     file.unlink()
     with pytest.raises(ConfigError, match=r"was trained with normalize \(see .*config\.yml\)"):

@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import explained_variance
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import network_of
@@ -62,6 +62,7 @@ class ExpertMixin:
     """The expert of an algorithm, and what its zips say about its flights."""
 
     env: VecEnv | None
+    _vec_normalize_env: VecNormalize | None
     policy: Any
     logger: Logger
     num_timesteps: int
@@ -125,7 +126,8 @@ class ExpertMixin:
         settings = flight_settings_of(self.env)
         if settings is not None:
             settings.write_into(self)
-        setattr(self, STATISTICS, unwrap_vec_normalize(self.env))
+        # BaseAlgorithm has them by this name, which no zip holds.
+        setattr(self, STATISTICS, self._vec_normalize_env)
 
     def _threads(self) -> AbstractContextManager[None]:
         """Return the context to learn in: compiled code leaves PyTorch one thread."""

@@ -8,7 +8,7 @@ from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.zips import WRAPPERS, refuse_settings, saved_data
+from sb3_quad.controllers.zips import refuse_settings, saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import Task
@@ -40,7 +40,7 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
         raise ConfigError(
             f"{zip_file}: several config.yml files lie next to it ({', '.join(map(str, configs))})"
         )
-    refuse_settings(zip_file, WRAPPERS)
+    refuse_settings(zip_file)
     return _settings_of_run(configs[0]), configs[0]
 
 

@@ -43,6 +43,9 @@ class Controller:
         ``ExpertError``).
     """
 
+    # A VecNormalize whose raw observations the source sees instead of those that it is asked about.
+    _raw: Any = None
+
     def __init__(
         self,
         source: Any,
@@ -59,8 +62,6 @@ class Controller:
         self._true_state = true_state if hasattr(source, "actions") else None
         self._predict_state: Any = None
         self._statistics = statistics_of(source)
-        # Whose raw observations the source sees instead of those that it is asked about.
-        self._raw: Any = None
         self._error: type[SB3QuadError] = ExpertError if kind == "expert" else ControllerError
         name = getattr(source, "__name__", type(source).__name__)
         self._who = f"{kind} {name}"

@@ -3,7 +3,7 @@
 from copy import deepcopy
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_quad.base.errors import ConfigError
 
@@ -21,10 +21,11 @@ def statistics_of(model: Any) -> Any:
     return found if getattr(found, "norm_obs", False) else None
 
 
-def share_statistics(statistics: Any, env: VecEnv, training: bool = False) -> None:
+def share_statistics(statistics: Any, env: Any, training: bool = False) -> None:
     """Let an environment normalise by the statistics of another VecNormalize.
 
     :param statistics: that one, or None.
+    :param env: a VecEnv, or None.
     :param training: whether they go on learning there; else rewards stay raw, too, as in the
         environments of SB3's EvalCallback.
     :raises ConfigError: only one of the two normalises observations.

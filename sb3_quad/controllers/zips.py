@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import pickle
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -176,7 +177,12 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
     :raises ConfigError: a file that cannot be read, or none where the run had statistics.
     """
     for file in Path(path).parent.glob("*/vecnormalize.pkl"):
-        statistics = unpickle(base64.b64encode(file.read_bytes()).decode(), str(file))
+        content = file.read_bytes()
+        with raised_as(ConfigError, f"{file}: cannot be read"):
+            if trusted():
+                statistics = pickle.loads(content)
+            else:
+                statistics = unpickle(base64.b64encode(content).decode(), str(file))
         if not isinstance(statistics, VecNormalize):
             raise ConfigError(f"{file}: holds no VecNormalize")
         return statistics
@@ -184,7 +190,7 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
     return None
 
 
-def refuse_settings(path: StrPath, keys: Sequence[str]) -> None:
+def refuse_settings(path: StrPath, keys: Sequence[str] = WRAPPERS) -> None:
     """Check that an agent was trained without some settings, by the run in whose folder it lies.
 
     A zip of this package that says how its agent flies was.

@@ -223,15 +223,16 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
 
     :raises ConfigError: settings of a stage, or options of its job, that do not fit.
     """
-    jobs = []
+    jobs: list[TrainingJob] = []
     for stage in pipeline.stages:
         where = f"stage {stage.name!r}"
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
             _check_correction(stage.correct_offset, config)
-            before = jobs[-1].config.vec_env_wrappers if jobs else config.vec_env_wrappers
-            if dict(before).keys() != dict(config.vec_env_wrappers).keys():
-                raise ConfigError("wrappers, and normalize, must be those of the stage before")
+            for before in jobs[-1:]:
+                own = dict(config.vec_env_wrappers)
+                if own.keys() != dict(before.config.vec_env_wrappers).keys():
+                    raise ConfigError("wrappers, and normalize, must be those of the stage before")
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.
