@@ -166,9 +166,10 @@ def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp
     with pytest.raises(ConfigError, match=r"names pathlib.*may run anything"):
         resolve_expert(path)
     file.write_bytes(b"none")
-    with monkeypatch.context() as trusting, pytest.raises(ConfigError, match="cannot be read"):
-        trusting.setenv("SB3_QUAD_TRUST", "1")
+    monkeypatch.setenv("SB3_QUAD_TRUST", "1")
+    with pytest.raises(ConfigError, match=r"is not what Stable-Baselines3 pickles"):
         resolve_expert(path)
+    monkeypatch.undo()
     file.unlink()
     with pytest.raises(ConfigError, match=r"was trained with normalize \(see .*config\.yml\)"):
         resolve_expert(path)
@@ -257,7 +258,7 @@ def test_a_training_behind_wrappers_ends_well_and_its_agent_is_not_flown_without
 def test_a_pipeline_whose_stages_do_not_fit_is_refused_before_the_first(tmp_path):
     one = {"name": "one", "algo": "dagger", "env": ENV, "settings": {"normalize": True}}
     two = {"name": "two", "algo": "ppo_bc", "env": ENV}
-    with pytest.raises(ConfigError, match="stage 'two': wrappers, and normalize"):
+    with pytest.raises(ConfigError, match="stage 'two': normalize: must be as in"):
         stage_jobs(Pipeline(stages=[one, two]), {})
     with pytest.raises(ConfigError, match="stage 'one': correct_offset: flies without wrappers"):
         stage_jobs(Pipeline(stages=[{**one, "correct_offset": "position"}]), {})

@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import pickle
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -177,12 +176,7 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
     :raises ConfigError: a file that cannot be read, or none where the run had statistics.
     """
     for file in Path(path).parent.glob("*/vecnormalize.pkl"):
-        content = file.read_bytes()
-        with raised_as(ConfigError, f"{file}: cannot be read"):
-            if trusted():
-                statistics = pickle.loads(content)
-            else:
-                statistics = unpickle(base64.b64encode(content).decode(), str(file))
+        statistics = unpickle(base64.b64encode(file.read_bytes()).decode(), str(file))
         if not isinstance(statistics, VecNormalize):
             raise ConfigError(f"{file}: holds no VecNormalize")
         return statistics

@@ -159,8 +159,8 @@ class TrainingConfig(Frozen):
         """The wrappers around the vectorised environment, that of ``normalize`` included."""
         if not self.normalize:
             return self.vec_env_wrapper
-        # As rl_zoo3 gives them.
-        keywords = {name: self.hyperparams[name] for name in self.hyperparams.keys() & {"gamma"}}
+        # As rl_zoo3 gives it.
+        keywords = {"gamma": self.hyperparams.get("gamma", 0.99)}
         if self.normalize is not True:
             keywords |= self.normalize
         return [*self.vec_env_wrapper, (NORMALIZE, keywords)]

@@ -229,10 +229,8 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
             _check_correction(stage.correct_offset, config)
-            for before in jobs[-1:]:
-                own = dict(config.vec_env_wrappers)
-                if own.keys() != dict(before.config.vec_env_wrappers).keys():
-                    raise ConfigError("wrappers, and normalize, must be those of the stage before")
+            if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
+                raise ConfigError("normalize: must be as in the stage before, whose agent it has")
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.
