@@ -244,6 +244,11 @@ class TrainingConfig(Frozen):
             )
         if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
+        if "NormalizeObservation" in str(self.env_wrapper):
+            raise ConfigError(
+                "env_wrapper: NormalizeObservation has statistics of its own in each environment, "
+                "also to evaluate in; remove it, and give normalize: true"
+            )
         if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
