@@ -446,9 +446,10 @@ def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tm
 
     plain = QuadcopterVecEnv(2)
     assert flights_of(SACBC("MlpPolicy", plain))["observation_mean"] is None
-    for wrapped in (VecNormalize(plain), VecFrameStack(plain, 2)):
-        assert flights_of(PPOBC("MlpPolicy", wrapped)) is None
-    assert flights_of(PPOBC("MlpPolicy", VecNormalize(plain, norm_obs=False))) is not None
+    for stacked in (VecFrameStack(plain, 2), VecNormalize(VecFrameStack(plain, 2))):
+        assert flights_of(PPOBC("MlpPolicy", stacked)) is None
+    normalised = PPOBC("MlpPolicy", VecNormalize(plain))
+    assert flights_of(normalised) is not None and normalised.vec_normalize is normalised.env
     assert flights_of(PPOBC("MlpPolicy", "Pendulum-v1")) is None
 
     def turned():

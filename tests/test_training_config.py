@@ -127,7 +127,11 @@ def test_any_text_on_the_command_line_is_a_value(text):
             {"policy_kwargs": {"net_arch": {"pi": [8, 0]}}},
             r"net_arch is \{'pi': \[8, 0\]\}, must be at least 1",
         ),
-        ({"normalize": True}, "normalize: Input should be False"),
+        ({"normalize": "often"}, "normalize"),
+        (
+            {"env_wrapper": "gymnasium.wrappers.NormalizeObservation", "vec_env": "dummy"},
+            "env_wrapper: NormalizeObservation .* normalize: true",
+        ),
         ({"callback": 3}, "package.module.Class"),
     ],
 )

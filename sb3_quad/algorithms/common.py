@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import explained_variance
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import network_of
@@ -24,6 +24,7 @@ from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.controllers.statistics import STATISTICS, share_statistics
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.simulation.settings import KEY, FlightSettings
 
@@ -61,6 +62,7 @@ class ExpertMixin:
     """The expert of an algorithm, and what its zips say about its flights."""
 
     env: VecEnv | None
+    _vec_normalize_env: VecNormalize | None
     policy: Any
     logger: Logger
     num_timesteps: int
@@ -114,12 +116,18 @@ class ExpertMixin:
         # The orthogonal weights of a new network depend on the number of threads that make them.
         with one_torch_thread(compiled=True):
             super()._setup_model()  # type: ignore[misc]
-        self._note_flight_settings()
+        if self.env is not None:
+            # A zip's statistics, which are read before this, go on in the environment.
+            if hasattr(self, STATISTICS):
+                share_statistics(getattr(self, STATISTICS), self.env, training=True)
+            self._note_flight_settings()
 
     def _note_flight_settings(self) -> None:
         settings = flight_settings_of(self.env)
         if settings is not None:
             settings.write_into(self)
+        # BaseAlgorithm has them by this name, which no zip holds.
+        setattr(self, STATISTICS, self._vec_normalize_env)
 
     def _threads(self) -> AbstractContextManager[None]:
         """Return the context to learn in: compiled code leaves PyTorch one thread."""
@@ -182,15 +190,13 @@ class ExpertMixin:
 
 
 def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
-    """Return how the vehicles of an environment fly, also through wrappers that change rewards.
+    """Return how the vehicles of an environment fly, also through wrappers that change rewards, and
+    VecNormalize, whose statistics are in a model's zips.
 
     None: it is not of this package, or a wrapper changes observations or actions, so that an agent
     of this environment would fly otherwise without the wrapper.
     """
     if env is None or not env.has_attr(KEY):
-        return None
-    normalised = unwrap_vec_normalize(env)
-    if normalised is not None and normalised.norm_obs:
         return None
     for wrapper in (gymnasium.ObservationWrapper, gymnasium.ActionWrapper):
         if any(env.env_is_wrapped(wrapper)):

@@ -5,12 +5,14 @@ from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, StrDict
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.simulation.state import QuadcopterState
 
 
@@ -25,10 +27,11 @@ class Controller:
        true state.
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
-    2 and 3 get the observations that a policy sees. ``predict`` may return a state together with
-    the actions, as SB3's recurrent policies do. The next call passes it back as ``state``, with
-    ``episode_start`` (n,): the rows that have just begun an episode. All rows of a new Controller
-    begin one.
+    2 and 3 get the observations that a policy sees. An SB3 model that was trained behind
+    ``VecNormalize`` gets raw ones, normalised by its own statistics. ``predict`` may return a state
+    together with the actions, as SB3's recurrent policies do. The next call passes it back as
+    ``state``, with ``episode_start`` (n,): the rows that have just begun an episode. All rows of a
+    new Controller begin one.
 
     :param source: the controller, as above.
     :param action_space: the environment's action space, a Box.
@@ -39,6 +42,9 @@ class Controller:
     :raises ControllerError: the source is of no kind above, or its spaces do not fit (of an expert:
         ``ExpertError``).
     """
+
+    # A VecNormalize whose raw observations the source sees instead of those that it is asked about.
+    _raw: Any = None
 
     def __init__(
         self,
@@ -55,6 +61,7 @@ class Controller:
         self._deterministic = deterministic
         self._true_state = true_state if hasattr(source, "actions") else None
         self._predict_state: Any = None
+        self._statistics = statistics_of(source)
         self._error: type[SB3QuadError] = ExpertError if kind == "expert" else ControllerError
         name = getattr(source, "__name__", type(source).__name__)
         self._who = f"{kind} {name}"
@@ -93,7 +100,8 @@ class Controller:
     ) -> "Controller":
         """Return the controller that labels the states of a vector environment.
 
-        With ``VecNormalize`` the expert sees normalised observations.
+        With ``VecNormalize`` an SB3 model sees the raw observations, which it normalises as in its
+        own training. Other experts see the normalised ones.
 
         :param expert: the expert. A name is resolved for the vehicle of row 0.
         :param present: the controller so far. It is returned, with its state, if it was made for
@@ -114,6 +122,8 @@ class Controller:
         source = resolve_expert(expert, vehicle)
         env_spaces = (env.action_space, env.observation_space)
         controller = Controller(source, *env_spaces, true_state_of(env), kind="expert")
+        if isinstance(source, BaseAlgorithm):
+            controller._raw = unwrap_vec_normalize(env)
         controller.made_for = (expert, env)
         return controller
 
@@ -173,6 +183,10 @@ class Controller:
         """Return the controller's own answer, unchecked."""
         if self._true_state is not None:
             return self.source.actions(self._true_state())
+        if self._raw is not None:
+            observation = self._raw.get_original_obs()
+        if self._statistics is not None:
+            observation = self._statistics.normalize_obs(observation)
         if not hasattr(self.source, "predict"):
             return self.source(observation)
         # Without a state yet, the policy begins by itself. Many policies take no such keywords.

@@ -8,7 +8,7 @@ from sb3_quad.base.errors import ConfigError, ExpertError, raised_as, unknown
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrPath
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
-from sb3_quad.controllers.zips import load_model
+from sb3_quad.controllers.zips import load_model, refuse_settings
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 # Experts by name, and their factories, which are imported when they are asked for.
@@ -47,6 +47,7 @@ def resolve_expert(
     # A policy of the package and a run folder stand for a zip.
     path = agent_path(text)
     if path.endswith(".zip"):
+        refuse_settings(path)
         return load_model(path)
     factory = import_factory(text, kind)
     with raised_as(ExpertError, f"{kind} {text}: the factory failed"):

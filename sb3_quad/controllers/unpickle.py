@@ -20,7 +20,7 @@ from numpy.random import PCG64, Generator, SeedSequence
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.process import TRUST_VARIABLE
+from sb3_quad.base.process import TRUST_VARIABLE, trusted
 from sb3_quad.base.types import StrDict
 
 WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {TRUST_VARIABLE}=1)"
@@ -28,15 +28,16 @@ _UNLIKE_SB3 = "is not what Stable-Baselines3 pickles"
 
 
 def unpickle(text: str, where: str) -> Any:
-    """Return the object that an entry of an SB3 zip holds.
+    """Return the object that an entry of an SB3 zip holds. :func:`trusted` files may hold any.
 
     :param text: base64 of a pickle, as SB3 writes it.
     :param where: what messages call the entry.
     :raises ConfigError: the pickle names or does something that SB3's own pickles do not. Nothing
         of that has been imported or called.
     """
+    read = pickle.Unpickler if trusted() else _Reader
     try:
-        return _Reader(io.BytesIO(base64.b64decode(text))).load()
+        return read(io.BytesIO(base64.b64decode(text))).load()
     except _Refusal as error:
         fault = str(error)
     except Exception as error:  # what wrong types raise depends on the types
@@ -126,9 +127,11 @@ _WITH_ATTRIBUTES = _by_name(
     "stable_baselines3.common.noise.NormalActionNoise",
     "stable_baselines3.common.noise.OrnsteinUhlenbeckActionNoise",
     "stable_baselines3.common.noise.VectorizedActionNoise",
+    "stable_baselines3.common.running_mean_std.RunningMeanStd",
     "stable_baselines3.common.utils.ConstantSchedule",
     "stable_baselines3.common.utils.FloatSchedule",
     "stable_baselines3.common.utils.LinearSchedule",
+    "stable_baselines3.common.vec_env.vec_normalize.VecNormalize",
 )
 # The others of these are only named, but for TrainFreq, a named tuple.
 _CLASSES = _WITH_ATTRIBUTES | _by_name(

@@ -186,13 +186,15 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
 
     :raises ConfigError: settings of a stage, or options of its job, that do not fit.
     """
-    jobs = []
+    jobs: list[TrainingJob] = []
     for stage in pipeline.stages:
         where = f"stage {stage.name!r}"
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
             if stage.correct_offset:
                 _check_correction(config)
+            if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
+                raise ConfigError("normalize: must be as in the stage before, whose agent it has")
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.
@@ -206,6 +208,8 @@ def _check_correction(config: TrainingConfig) -> None:
     """Check that the offset of an agent with these settings can be corrected."""
     if not config.task:
         raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
+    if config.env_wrapper or config.vec_env_wrappers:
+        raise ConfigError("correct_offset: flies without wrappers; remove them, and normalize")
     if config.flight_settings.size != OBSERVATION_SIZE:
         raise ConfigError(
             f"correct_offset is for agents that see the {OBSERVATION_SIZE} features alone"

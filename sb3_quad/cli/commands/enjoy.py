@@ -262,8 +262,7 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     """Return label and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and
     ``--load-…`` name.
 
-    :raises ConfigError: No such run or file, settings that cannot be read, or a wrapper that this
-        command does not have.
+    :raises ConfigError: No such run or file.
     """
     from sb3_quad.training.algorithms import get_algorithm
     from sb3_quad.training.runs import find_run
@@ -283,13 +282,6 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     if not path.is_file():
         zips = sorted(file.name for file in run.path.glob("*.zip"))
         raise ConfigError(f"{path}: no such file; the run holds {', '.join(zips)}")
-    settings, _ = run.read_yaml()
-    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
-        if settings.get(key):
-            raise ConfigError(
-                f"{run.path}: was trained with {key}, which enjoy does not put around the "
-                "environment"
-            )
     return f"{options.algo} {path.name}", str(path)
 
 
