@@ -7,7 +7,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import AnyArray, IntArray, StrDict
 from sb3_quad.simulation.settings import ENDLESS
 
@@ -60,18 +59,15 @@ class BatchVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows; return observations (n, ...), rewards (n,), done (n,), infos."""
-        given = self.advance(self._actions)
-        shapes = [*map(np.shape, given)]
-        rows = (self.num_envs,)
-        # NumPy would broadcast rewards (n, 1) to (n, n).
-        if shapes != [rows + self.observation_space.shape, rows, rows]:
-            raise ConfigError(f"{type(self).__name__}.advance: gives arrays of shapes {shapes}")
-        observations = np.array(given[0], self.observation_space.dtype)
-        rewards = np.array(given[1], np.float32)
-        terminated = np.array(given[2], np.bool_)
+        seen, gained, failed = self.advance(self._actions)
+        observations = np.array(seen, self.observation_space.dtype)
+        rewards = np.array(gained, np.float32)
+        terminated = np.array(failed, np.bool_)
+        # In place, where NumPy refuses arrays (n, 1).
         self._returns += rewards
         self._lengths += 1
-        dones = terminated | (self._lengths >= self.max_episode_steps)
+        dones = self._lengths >= self.max_episode_steps
+        dones |= terminated
         infos: list[StrDict] = [{} for _ in dones]
         ended = np.flatnonzero(dones)
         for row in ended:
@@ -93,11 +89,11 @@ class BatchVecEnv(VecEnv):
         """Return an attribute of this environment, once for each of the given rows."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, *args: Any, **kwargs: Any) -> Any:
-        """Refuse: rows have no attributes and methods of their own."""
-        raise AttributeError(f"{attr_name}: the rows of {type(self).__name__} have none")
+    def set_attr(self, *args: Any, **kwargs: Any) -> Any:
+        """Refuse; override it where your rows have attributes of their own."""
+        raise NotImplementedError("rows have no attributes and methods of their own")
 
-    env_method = set_attr
+    env_method: Any = set_attr
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
         """Return True for SB3's ``Monitor`` only, since the rows give its ``info["episode"]``."""

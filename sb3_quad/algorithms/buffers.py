@@ -196,7 +196,7 @@ class AggregatedDataset:
                 acted.append(actions.reshape(len(actions), -1))
             observations = np.concatenate(seen, dtype=seen[0].dtype, casting="same_kind")
             actions = np.concatenate(acted, dtype=np.float32)
-            if not len(observations) == len(actions) <= self.capacity:
+            if not 0 < len(observations) == len(actions) <= self.capacity:
                 raise ValueError(
                     f"{len(observations)} observations, {len(actions)} actions, room for"
                     f" {self.capacity}"

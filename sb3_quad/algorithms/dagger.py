@@ -254,6 +254,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self._labeller = Controller.for_env(expert, self.env, self._labeller)
         self.expert = expert
 
+    def will_clone(self) -> bool:
+        """Return whether learning asks the expert; else it clones the flights it was given."""
+        return self.expert is not None or self.beta > 0.0 or len(self.dataset) == 0
+
     @property
     def current_beta(self) -> float:
         """β of the present rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
@@ -286,8 +290,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """
-        alone = self.expert is None and self.beta == 0.0 and len(self.dataset) > 0
-        if not alone:
+        if self.will_clone():
             self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
