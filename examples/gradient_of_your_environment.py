@@ -114,7 +114,7 @@ def mean_cost(model, seed):
         env.step_async(model.predict(observations, deterministic=True)[0])
         observations, rewards, _, _ = env.step_wait()
         costs.append(-rewards.mean())
-    return float(np.mean(costs)), float(np.median(np.abs(observations[:, 0])))
+    return float(np.mean(costs)), float(np.median(np.abs(env.state[:, 0])))
 
 
 def main():
