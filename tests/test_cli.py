@@ -570,3 +570,20 @@ def test_flights_of_a_file_are_cloned_by_beta_0_alone(tmp_path, capsys):
     file.write_text(yaml.safe_dump({ENV: {**settings, "demonstrations": "none.npz"}}))
     assert main(asked) == 2
     assert "none.npz: cannot be read" in capsys.readouterr().err
+
+
+def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
+    sb3_quad.fly(sb3_quad.PIDExpert(), n_flights=4, max_steps=50, record=tmp_path / "flights.npz")
+    cloned = {"demonstrations": str(tmp_path / "flights.npz"), "beta": 0}
+    cloned["callback"] = {"test_cli.Interrupt": {"after": 900}}
+    Interrupt.sent = True
+    whole = train(job(tmp_path, **cloned), report=lambda line: None)
+    Interrupt.sent = False
+    interrupted = train(job(tmp_path, **cloned), report=lambda line: None)
+    (tmp_path / "flights.npz").unlink()
+    again = resume(str(interrupted.run.path), report=lambda line: None)
+    assert len(again.model.dataset) == 200
+    for ours, theirs in zip(
+        again.model.policy.parameters(), whole.model.policy.parameters(), strict=True
+    ):
+        assert torch.equal(ours, theirs)
