@@ -115,6 +115,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
         prepares them ("chronologically", 4.2.3)
+    :param demonstrations: a file of flights that the dataset begins with, as ``dataset.load`` takes
+        it. With ``beta=0`` no expert is needed: the agent clones these flights alone, and its own
+        flights train the critic
     :raises ConfigError: an argument out of range, or observations that are a Dict
     :raises ExpertError: an expert that does not fit the environment
     """
@@ -153,6 +156,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         l2_coef: float = 0.0,
         dataset_capacity: int = 500_000,
         shuffle: bool = True,
+        demonstrations: str | Path | None = None,
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -201,8 +205,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self._setup_model()
             if initial is not None:
                 transfer_policy(initial, self)
+            if demonstrations is not None:
+                self.dataset.load(demonstrations)
 
     def _setup_model(self) -> None:
+        if self.beta == 0.0:
+            self.beta_final = 0.0
         if not 0.0 <= self.beta_final <= self.beta <= 1.0:
             raise ConfigError(
                 f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1"
@@ -225,6 +233,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             )
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+        space: Any = self.action_space
         dtype = self.rollout_buffer.observations.dtype
         if np.issubdtype(dtype, np.floating):
             dtype = np.dtype(np.float32)
@@ -234,6 +243,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self.rollout_buffer.action_dim,
             dtype,
         )
+        self.dataset.action_range = space.low.ravel(), space.high.ravel()
 
     def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on.
@@ -243,6 +253,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if self.env is not None:
             self._labeller = Controller.for_env(expert, self.env, self._labeller)
         self.expert = expert
+
+    def will_clone(self) -> bool:
+        """Return whether learning asks the expert; else it clones the flights it was given."""
+        return self.expert is not None or self.beta > 0.0 or len(self.dataset) == 0
 
     @property
     def current_beta(self) -> float:
@@ -272,10 +286,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         """Train for ``total_timesteps``; all arguments are those of SB3's ``learn``.
 
         With ``reset_num_timesteps`` β begins again. The dataset stays until ``dataset.clear()``.
+        Without an expert, the agent clones the pairs that the dataset holds, if β is 0.
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """
-        self.set_expert(self.expert)
+        if self.will_clone():
+            self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
         with self._threads():
@@ -324,8 +340,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         for step in range(n_rollout_steps):
             # + Label the state before the step.
-            labels = self._labels(env)
-            buffer.expert_actions[step] = labels
+            if self.expert is not None:
+                buffer.expert_actions[step] = self._labels(env)
+            labels = buffer.expert_actions[step]
 
             # + The expert's action flies with probability β, else a sample of the agent's.
             observations: Any = self._last_obs
@@ -363,10 +380,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
         buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
-        # + Add the labels to the dataset.
-        if self.dataset_capacity == 0:
-            self.dataset.clear()
-        self.dataset.add(flown, buffer.expert_actions.reshape(len(flown), -1))
+        # + Add the labels to the dataset. Without an expert, it keeps the flights of a file.
+        if self.expert is not None:
+            if self.dataset_capacity == 0:
+                self.dataset.clear()
+            self.dataset.add(flown, buffer.expert_actions.reshape(len(flown), -1))
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)

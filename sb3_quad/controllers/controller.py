@@ -113,7 +113,8 @@ class Controller:
         if expert is None:
             raise ExpertError(
                 "no expert: give expert=... when building or loading the model, "
-                "or call set_expert(expert)"
+                "or call set_expert(expert); with beta=0, DAgger can clone the flights that its "
+                "dataset holds"
             )
         # A recurrent expert keeps its state as long as it labels the same environment.
         if present and present.made_for[0] is expert and present.made_for[1] is env:

@@ -62,6 +62,8 @@ def import_factory(text: str, kind: str = "expert") -> Any:
     """
     location = EXPERTS.get(text, text)
     if ":" not in location:
+        if Path(text).is_dir():
+            raise ConfigError(f"{kind} {text}: no run with an agent in this folder")
         valid = [*EXPERTS, *pretrained_names()]
         raise ConfigError(
             unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory"

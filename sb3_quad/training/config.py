@@ -380,8 +380,8 @@ def build_config(
     settings = dict(settings)
     for key in ENV_KEYS & settings.keys():
         settings[key] = with_vehicle_path(settings[key])
-    # The default is written out, so that config.yml names the expert.
-    if takes_expert(algorithm) and settings.get("expert") is None:
+    # The default is written out, so that config.yml names the expert. Flights of a file need none.
+    if takes_expert(algorithm) and not (settings.get("expert") or settings.get("demonstrations")):
         settings["expert"] = DEFAULT_EXPERT
 
     def source(key: str) -> str:

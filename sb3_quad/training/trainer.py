@@ -38,7 +38,7 @@ from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.statistics import STATISTICS
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import instance, takes_expert
+from sb3_quad.training.algorithms import instance
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
@@ -169,7 +169,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
 
 def _expert(config: TrainingConfig) -> StrDict:
     """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
-    return {"expert": config.make_expert()} if takes_expert(config.algorithm) else {}
+    return {} if config.expert is None else {"expert": config.make_expert()}
 
 
 def _user_callbacks(config: TrainingConfig) -> list[BaseCallback]:
@@ -193,10 +193,10 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
     model = _construct(config, env, keywords)
     # An expert that fails does so before there is a run folder.
-    will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
+    will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: False)
     if will_clone():
         observation: Any = env.reset()
-        Controller.for_env(keywords["expert"], env).labels(observation)
+        Controller.for_env(keywords.get("expert"), env).labels(observation)
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):
