@@ -24,6 +24,7 @@ from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     actor_and_critic_parameters,
+    in_half_ranges,
     is_ever_nonzero,
     model_of,
     policy_arguments,
@@ -162,7 +163,7 @@ class PPOBC(ExpertMixin, PPO):
             max_grad_norm=max_grad_norm,
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class or ExpertRolloutBuffer,
+            rollout_buffer_class=rollout_buffer_class,
             rollout_buffer_kwargs=rollout_buffer_kwargs,
             target_kl=target_kl,
             stats_window_size=stats_window_size,
@@ -196,7 +197,10 @@ class PPOBC(ExpertMixin, PPO):
         if self.bc_filter not in filters:
             raise ConfigError(unknown("bc_filter", self.bc_filter, filters))
         self._refuse_dict_observations()
-        if not issubclass(self.rollout_buffer_class or RolloutBuffer, ExpertRolloutBuffer):
+        # SB3's own, as a zip of PPO names it, is one without labels.
+        if self.rollout_buffer_class in (None, RolloutBuffer):
+            self.rollout_buffer_class = ExpertRolloutBuffer
+        if not issubclass(self.rollout_buffer_class, ExpertRolloutBuffer):
             raise ConfigError(
                 f"rollout_buffer_class {self.rollout_buffer_class}: must be an ExpertRolloutBuffer"
             )
@@ -210,7 +214,7 @@ class PPOBC(ExpertMixin, PPO):
                 "PPOBC clones into a Box action space only, this environment has"
                 f" {self.action_space}"
             )
-        self.bc_coef = FloatSchedule(self.bc_coef)
+        self._rescale(False)
         if self.expert is not None and self.will_clone():
             self._check_cloning()
 
@@ -232,14 +236,20 @@ class PPOBC(ExpertMixin, PPO):
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
         if bc_coef > 0.0:
             self._check_cloning()
-        self.bc_coef = FloatSchedule(bc_coef)
+        self.bc_coef = FloatSchedule(float(bc_coef))
 
     def will_clone(self) -> bool:
         """Return whether the schedule ever gives the cloning term a weight.
 
         A hundred samples of it are taken.
         """
-        return is_ever_nonzero(self.bc_coef)  # type: ignore[arg-type]
+        return is_ever_nonzero(self.bc_coef)
+
+    def _rescale(self, into: bool) -> None:
+        # Without a cloning term it is PPO, which counts actions as they are.
+        buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
+        if isinstance(self.action_space, spaces.Box) and (self.will_clone() or buffer.bc_coef):
+            super()._rescale(into)
 
     def _check_cloning(self) -> None:
         if self.expert is None:
@@ -290,7 +300,7 @@ class PPOBC(ExpertMixin, PPO):
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         progress = 1.0 - float(end) / float(self._total_timesteps)
-        buffer.bc_coef = float(self.bc_coef(progress))  # type: ignore[operator]
+        buffer.bc_coef = float(self.bc_coef(progress))
         if buffer.bc_coef == 0.0:
             # A recurrent expert that does not see this rollout begins again.
             self._labeller = None
@@ -313,6 +323,7 @@ class PPOBC(ExpertMixin, PPO):
         finally:
             del self.policy.forward
 
+    @in_half_ranges  # +
     def train(self) -> None:
         """Update the policy on the rollout just flown, by PPO's lines. Additions are marked ``+``.
 
