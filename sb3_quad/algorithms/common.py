@@ -99,6 +99,7 @@ class ExpertMixin:
     _n_updates: int
     expert: ExpertLike | None
     bc_coef: Any
+    batch_size: Any
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
 
@@ -148,6 +149,10 @@ class ExpertMixin:
                 continue
             if not isinstance(value, (int, float)) or not value >= least:
                 raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
+        # Rows are sampled all at once.
+        capacity = getattr(self, "dataset_capacity", 0) or getattr(self, "buffer_size", 0)
+        if 0 < capacity < getattr(self, "batch_size", 0):
+            raise ConfigError(f"batch_size {self.batch_size}: more than the {capacity} rows kept")
         if hasattr(self, "bc_coef"):
             self.bc_coef = FloatSchedule(self.bc_coef)
         if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
@@ -264,7 +269,7 @@ def half_ranges(space: spaces.Box, into: bool) -> tuple[Float32Array, Float32Arr
     :param into: False: the other way round.
     :raises ConfigError: limits so far apart that they are none.
     """
-    half = 0.5 * (space.high - space.low).astype(np.float32).ravel()
+    half = (0.5 * space.high - 0.5 * space.low).astype(np.float32).ravel()
     middle = space.low.astype(np.float32).ravel() + half
     if not (half < _UNLIMITED).all():
         raise ConfigError(f"action space {space}: give it the limits of the actuators")

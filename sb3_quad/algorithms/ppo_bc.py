@@ -151,7 +151,7 @@ class PPOBC(ExpertMixin, PPO):
             learning_rate=learning_rate,
             n_steps=n_steps,
             # The default is known when the environments are. PPO warns where this is no divisor.
-            batch_size=max(n_steps, 2) if batch_size is None else batch_size,
+            batch_size=batch_size or max(n_steps, 2),
             n_epochs=n_epochs,
             gamma=gamma,
             gae_lambda=gae_lambda,

@@ -45,6 +45,11 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
         except ExpertError as error:  # other spaces
             raise ConfigError(f"{name}: {error}") from None
         return
+    if teacher.action_space != model.action_space:
+        raise ConfigError(
+            f"{name}: its actions are of {teacher.action_space}, here they are of"
+            f" {model.action_space}"
+        )
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{name}: holds parameters that are not finite")
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:
