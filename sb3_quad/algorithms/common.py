@@ -1,5 +1,6 @@
 """The parts that all algorithms with an expert share."""
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import wraps
@@ -149,6 +150,9 @@ class ExpertMixin:
                 continue
             if not isinstance(value, (int, float)) or not value >= least:
                 raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
+        # DAgger's None is nothing that PPO could load.
+        if vars(self).get("max_grad_norm", 0.0) is None:
+            self.max_grad_norm = math.inf
         # Rows are sampled all at once.
         capacity = getattr(self, "dataset_capacity", 0) or getattr(self, "buffer_size", 0)
         if 0 < capacity < getattr(self, "batch_size", 0):

@@ -68,7 +68,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
     with Σw² over the weight matrices of both networks, without biases and log_std.
 
-    For any environment with a Box action space and observations that are not a Dict. Papers:
+    For any environment with a Box action space and observations that are not a Dict. Errors of
+    actions and log_std count in half ranges of that Box, from its middle. Papers:
     https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
 
     A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from
@@ -425,7 +426,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         critic_batches = iter(np.array_split(critic_rows, n_critic))
         flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
         targets = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
-        max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         # The terms of each step, by name
         history: dict[str, list[float]] = {}
 
@@ -480,8 +480,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 for parameter in critic_parameters:
                     parameter.grad = None
             # Clip grad norm, + of actor and critic each by itself
-            norm = th.nn.utils.clip_grad_norm_(actor_parameters, max_grad_norm)
-            critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, max_grad_norm)
+            norm = th.nn.utils.clip_grad_norm_(actor_parameters, self.max_grad_norm)
+            critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, self.max_grad_norm)
             if not np.isfinite([*terms.values(), float(norm), float(critic_norm)]).all():  # +
                 self.policy.optimizer.zero_grad()
                 raise self._diverged(terms)

@@ -69,6 +69,8 @@ class PPOBC(ExpertMixin, PPO):
     equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model
     loads with ``PPO.load``, even where this package is not installed.
 
+    Where it clones, errors of actions and log_std count in half ranges of the Box action space.
+
     :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
     :param policy_kwargs: unless it holds ``log_std_init``, that is -0.9. ``log_std_init=None``:
         SB3's, or that of the initial policy.
@@ -174,7 +176,7 @@ class PPOBC(ExpertMixin, PPO):
             device=device,
             _init_setup_model=False,
         )
-        self.batch_size = batch_size  # type: ignore[assignment]
+        self.batch_size = batch_size
         self.expert = expert
         self.bc_coef = bc_coef
         self.bc_loss: CloningLoss = bc_loss
