@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3 import A2C, PPO, SAC
 
 from sb3_quad import APG, PPOBC, SACBC, DAgger, QuadcopterVecEnv
-from sb3_quad.base.errors import ConfigError, SB3QuadError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.zips import load_model, load_zip
 
 SHORT = {"n_steps": 20, "batch_size": 40, "n_epochs": 1, "seed": 0, "device": "cpu"}
@@ -92,8 +92,7 @@ def test_custom_objects_replace_what_a_zip_holds(zips, made, loader):
 def test_parameters_are_taken_or_refused(zips, made, loader):
     model = loader("MlpPolicy", QuadcopterVecEnv(4, seed=0), device="cpu")
     if not is_of_its_kind(made, loader):
-        error = SB3QuadError if loader in OURS else Exception
-        with pytest.raises(error) as raised:
+        with pytest.raises((RuntimeError, ValueError)) as raised:
             model.set_parameters(zips / made)
         assert loader not in OURS or "\n" not in str(raised.value)
         return
@@ -108,7 +107,7 @@ def test_parameters_of_other_layers_are_refused_in_one_line(algorithm):
     other = algorithm(
         "MlpPolicy", QuadcopterVecEnv(2), policy_kwargs={"net_arch": [8]}, device="cpu"
     )
-    with pytest.raises(SB3QuadError, match="set_parameters") as raised:
+    with pytest.raises(RuntimeError, match="set_parameters") as raised:
         one.set_parameters(other.get_parameters())
     assert "\n" not in str(raised.value)
 

@@ -23,8 +23,9 @@ from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
+from sb3_quad.base.files import one_line
 from sb3_quad.base.types import Float32Array
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_model
@@ -156,7 +157,10 @@ class ExpertMixin:
         # Rows are sampled all at once.
         capacity = getattr(self, "dataset_capacity", 0) or getattr(self, "buffer_size", 0)
         if 0 < capacity < getattr(self, "batch_size", 0):
-            raise ConfigError(f"batch_size {self.batch_size}: more than the {capacity} rows kept")
+            raise ConfigError(
+                f"batch_size {self.batch_size}: more than the {capacity} rows of dataset_capacity"
+                " or buffer_size"
+            )
         if hasattr(self, "bc_coef"):
             self.bc_coef = FloatSchedule(self.bc_coef)
         if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
@@ -175,10 +179,12 @@ class ExpertMixin:
     def set_parameters(self, *arguments: Any, **keywords: Any) -> None:
         """Take the parameters of another model by SB3's ``set_parameters``.
 
-        :raises TrainingError: parameters of other networks.
+        :raises RuntimeError: parameters of other networks, in one line.
         """
-        with raised_as(TrainingError, "set_parameters: these do not fit"):
+        try:
             super().set_parameters(*arguments, **keywords)  # type: ignore[misc]
+        except RuntimeError as error:
+            raise RuntimeError(f"set_parameters: {one_line(error)}") from None
 
     def _rescale(self, into: bool) -> None:
         """Let actor and rollout count actions in half ranges from the middle, or as they are again.
@@ -273,8 +279,9 @@ def half_ranges(space: spaces.Box, into: bool) -> tuple[Float32Array, Float32Arr
     :param into: False: the other way round.
     :raises ConfigError: limits so far apart that they are none.
     """
-    half = (0.5 * space.high - 0.5 * space.low).astype(np.float32).ravel()
-    middle = space.low.astype(np.float32).ravel() + half
+    low, high = limits_of(space)
+    half = 0.5 * high - 0.5 * low
+    middle = low + half
     if not (half < _UNLIMITED).all():
         raise ConfigError(f"action space {space}: give it the limits of the actuators")
     half[half == 0.0] = 1.0  # an action that cannot change

@@ -88,15 +88,15 @@ class Controller:
 
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
-        self._limits = _limits(action_space)
+        self._limits = limits_of(action_space)
         # The source may speak of other limits: a model of those that it has learnt with, an expert
         # of the true state of those that a quadcopter has under all wrappers.
         own = getattr(source, "action_space", None)
         if self._true_state is not None and env is not None and env.has_attr(KEY):
             own = spaces.Box(-1.0, 1.0, action_space.shape)
         self._own_limits: Float32Array | None = None
-        if isinstance(own, spaces.Box) and not np.allclose(_limits(own), self._limits):
-            self._own_limits = _limits(own)
+        if isinstance(own, spaces.Box) and not np.allclose(limits_of(own), self._limits):
+            self._own_limits = limits_of(own)
             if not np.allclose(_limits_below(env, action_space), self._own_limits):
                 raise self._error(
                     f"{self._who}: its actions are of {own}, the environment's of {action_space};"
@@ -210,7 +210,7 @@ class Controller:
         return actions
 
 
-def _limits(space: spaces.Box) -> Float32Array:
+def limits_of(space: spaces.Box) -> Float32Array:
     """Return the lower and the upper limits of actions, (2, action_dim)."""
     return np.stack([space.low.ravel(), space.high.ravel()]).astype(np.float32)
 
@@ -218,7 +218,7 @@ def _limits(space: spaces.Box) -> Float32Array:
 def _limits_below(env: VecEnv | None, space: spaces.Box) -> Any:
     """Return what the outermost action wrapper makes of the limits of its actions."""
     if env is None or not env.has_attr("action"):
-        return _limits(space)
+        return limits_of(space)
     made = [env.env_method("action", limit, indices=[0])[0] for limit in (space.low, space.high)]
     return np.reshape(made, (2, -1))
 
