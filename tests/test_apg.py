@@ -94,7 +94,7 @@ def test_a_cost_of_ones_own_is_what_is_minimised():
         observations = tape.reset()
         for _ in range(60):
             observations = tape.step(agent.predict(observations, deterministic=True)[0])
-        w, x, y, z = np.moveaxis(tape.states[1:, 3:7], 1, 0)
+        x, y = np.moveaxis(tape.states[1:, 4:6], 1, 0)
         return float(np.mean(2.0 * (x**2 + y**2)))
 
     env = QuadcopterVecEnv(64, task="target_tracking", seed=0)

@@ -25,6 +25,8 @@ from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, 
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     actor_and_critic_parameters,
+    half_ranges,
+    in_half_ranges,
     model_of,
     policy_arguments,
 )
@@ -66,7 +68,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
     with Σw² over the weight matrices of both networks, without biases and log_std.
 
-    For any environment with a Box action space and observations that are not a Dict. Papers:
+    For any environment with a Box action space and observations that are not a Dict. Errors of
+    actions and log_std count in half ranges of that Box, from its middle. Papers:
     https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
 
     A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from
@@ -209,9 +212,13 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 self.dataset.load(demonstrations)
 
     def _setup_model(self) -> None:
+        self._refuse_dict_observations()
+        # A zip of PPO names PPO's.
+        self.rollout_buffer_class = ExpertRolloutBuffer
+        super()._setup_model()
         if self.beta == 0.0:
             self.beta_final = 0.0
-        if not 0.0 <= self.beta_final <= self.beta <= 1.0:
+        if not self.beta_final <= self.beta <= 1.0:
             raise ConfigError(
                 f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1"
             )
@@ -225,12 +232,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             )
         if self.gradient_steps is not None and self.gradient_steps < 1:
             raise ConfigError(f"gradient_steps {self.gradient_steps}: must be at least 1, or None")
-        self._refuse_dict_observations()
-        super()._setup_model()
         if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
             raise ConfigError(
                 f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy"
             )
+        self._rescale(False)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         space: Any = self.action_space
@@ -394,6 +400,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
+    @in_half_ranges
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
 
@@ -421,7 +428,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         )
         actor_parameters, critic_parameters = actor_and_critic_parameters(self.policy)
 
-        # + Rows of the dataset for the actor
+        # + Labels in half ranges, and rows of the dataset for the actor
+        half, middle = half_ranges(self.action_space, into=True)
+        labels = self.dataset.filled["actions"] * half + middle
         buffer = self.rollout_buffer
         rng = self._generator(1)
         n_rows = buffer.buffer_size * buffer.n_envs
@@ -435,12 +444,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         critic_batches = iter(np.array_split(critic_rows, n_critic))
         flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
         targets = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
-        max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         # The terms of each step, by name
         history: dict[str, list[float]] = {}
 
         for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
-            actor_batch = self.dataset.batch(rows)
+            actor_batch = self.dataset.batch(rows)._replace(targets=labels)
             critic_batch = None
             if (i + 1) * n_critic // n_batches > i * n_critic // n_batches:
                 critic_batch = Batch(next(critic_batches), flown, targets)
@@ -448,7 +456,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             if isinstance(network, Perceptrons):  # +
                 terms = network.gradients(compiled_loss, actor_batch, critic_batch)
             else:
-                observations, labels = actor_batch.tensors(self.device)
+                observations, experts = actor_batch.tensors(self.device)
                 try:
                     entropy: Any = self.policy.get_distribution(observations).entropy()
                 except ValueError as error:  # of a distribution whose mean is not finite
@@ -456,7 +464,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 # + The cloning term L_BC (Eq. 3.12)
                 mean = self.policy.action_dist.mode()
                 log_std = self.policy.log_std
-                errors = cloning_errors(self.bc_loss, mean, log_std, labels)
+                errors = cloning_errors(self.bc_loss, mean, log_std, experts)
                 losses = {"bc_loss": errors.mean()}
                 loss = losses["bc_loss"]
 
@@ -490,8 +498,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 for parameter in critic_parameters:
                     parameter.grad = None
             # Clip grad norm, + of actor and critic each by itself
-            norm = th.nn.utils.clip_grad_norm_(actor_parameters, max_grad_norm)
-            critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, max_grad_norm)
+            norm = th.nn.utils.clip_grad_norm_(actor_parameters, self.max_grad_norm)
+            critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, self.max_grad_norm)
             if not np.isfinite([*terms.values(), float(norm), float(critic_norm)]).all():  # +
                 self.policy.optimizer.zero_grad()
                 raise self._diverged(terms)

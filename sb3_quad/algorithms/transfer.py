@@ -48,6 +48,11 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
         except ExpertError as error:  # other spaces
             raise ConfigError(f"{name}: {error}") from None
         return
+    if teacher.action_space != model.action_space:
+        raise ConfigError(
+            f"{name}: its actions are of {teacher.action_space}, here they are of"
+            f" {model.action_space}"
+        )
     share_statistics(statistics_of(teacher), model.get_env(), training=True)
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{name}: holds parameters that are not finite")

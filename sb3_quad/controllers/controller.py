@@ -13,6 +13,7 @@ from sb3_quad.base.types import BoolArray, Float32Array, StrDict
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.statistics import statistics_of
+from sb3_quad.simulation.settings import KEY
 from sb3_quad.simulation.state import QuadcopterState
 
 
@@ -39,6 +40,8 @@ class Controller:
     :param true_state: returns the current true state; None: not available.
     :param kind: what messages call the controller. With ``"expert"``, errors are ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
+    :param env: the environment that an expert labels. It may have an action wrapper that is linear,
+        such as ``RescaleAction``; :meth:`labels` then go through its inverse.
     :raises ControllerError: the source is of no kind above, or its spaces do not fit (of an expert:
         ``ExpertError``).
     """
@@ -54,6 +57,7 @@ class Controller:
         true_state: Callable[[], QuadcopterState] | None = None,
         kind: str = "controller",
         deterministic: bool = True,
+        env: VecEnv | None = None,
     ) -> None:
         self.source = source
         # The ``expert=`` argument and the environment that :meth:`for_env` compares.
@@ -91,8 +95,20 @@ class Controller:
 
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
-        self._low = action_space.low.ravel().astype(np.float32)
-        self._high = action_space.high.ravel().astype(np.float32)
+        self._limits = limits_of(action_space)
+        # The source may speak of other limits: a model of those that it has learnt with, an expert
+        # of the true state of those that a quadcopter has under all wrappers.
+        own = getattr(source, "action_space", None)
+        if self._true_state is not None and env is not None and env.has_attr(KEY):
+            own = spaces.Box(-1.0, 1.0, action_space.shape)
+        self._own_limits: Float32Array | None = None
+        if isinstance(own, spaces.Box) and not np.allclose(limits_of(own), self._limits):
+            self._own_limits = limits_of(own)
+            if not np.allclose(_limits_below(env, action_space), self._own_limits):
+                raise self._error(
+                    f"{self._who}: its actions are of {own}, the environment's of {action_space};"
+                    " no wrapper such as RescaleAction leads straight from these to those"
+                )
 
     @staticmethod
     def for_env(
@@ -122,7 +138,7 @@ class Controller:
         vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
         source = resolve_expert(expert, vehicle)
         env_spaces = (env.action_space, env.observation_space)
-        controller = Controller(source, *env_spaces, true_state_of(env), kind="expert")
+        controller = Controller(source, *env_spaces, true_state_of(env), kind="expert", env=env)
         if isinstance(source, BaseAlgorithm):
             controller._raw = unwrap_vec_normalize(env)
         controller.made_for = (expert, env)
@@ -158,7 +174,7 @@ class Controller:
         if isinstance(observation, dict):
             batch = next(iter(observation.values()))
         shape = (len(batch), *self._action_shape)
-        flat_shape = (len(batch), len(self._low))
+        flat_shape = (len(batch), self._limits.shape[1])
         if raw.shape not in (shape, flat_shape):
             raise self._error(f"{self._who}: gives actions of shape {raw.shape}, must be {shape}")
         actions = raw.reshape(flat_shape).astype(np.float32)
@@ -176,9 +192,16 @@ class Controller:
         return actions
 
     def labels(self, observation: Any, episode_start: BoolArray | None = None) -> Float32Array:
-        """Return :meth:`actions` clipped to the action space: the labels that an agent imitates."""
+        """Return the labels that an agent imitates.
+
+        They are :meth:`actions`, as the environment's wrapper takes them, within the action space.
+        """
         actions = self.actions(observation, episode_start=episode_start)
-        return actions.clip(self._low, self._high)
+        low, high = self._limits
+        if self._own_limits is not None:
+            least, most = self._own_limits
+            actions = low + (actions - least) * ((high - low) / (most - least))
+        return actions.clip(low, high)
 
     def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
         """Return the controller's own answer, unchecked."""
@@ -200,6 +223,19 @@ class Controller:
             observation, deterministic=self._deterministic, **keywords
         )
         return actions
+
+
+def limits_of(space: spaces.Box) -> Float32Array:
+    """Return the lower and the upper limits of actions, (2, action_dim)."""
+    return np.stack([space.low.ravel(), space.high.ravel()]).astype(np.float32)
+
+
+def _limits_below(env: VecEnv | None, space: spaces.Box) -> Any:
+    """Return what the outermost action wrapper makes of the limits of its actions."""
+    if env is None or not env.has_attr("action"):
+        return limits_of(space)
+    made = [env.env_method("action", limit, indices=[0])[0] for limit in (space.low, space.high)]
+    return np.reshape(made, (2, -1))
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:

@@ -41,6 +41,8 @@ _OURS = {
 }
 # Of the pickles of an agent, ``predict`` needs only these.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs", STATISTICS)
+# So are numbers of NumPy, whose types SB3 writes so.
+_NUMBERS = ("<class 'numpy.int", "<class 'numpy.float")
 # The others become None, or these values where SB3 cannot load None.
 _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}
 # SB3 and this package never save these, and loading them would import what they name.
@@ -123,7 +125,8 @@ def load_zip(
         if key in _NEVER_READ:
             objects[key] = None
         elif isinstance(entry, dict) and ":serialized:" in entry:
-            if to_fly and key not in _TO_FLY:
+            is_number = str(entry.get(":type:")).startswith(_NUMBERS)
+            if to_fly and key not in _TO_FLY and not is_number:
                 objects[key] = _STAND_INS.get(key)
             else:
                 objects[key] = unpickle(entry[":serialized:"], f"{where}: its {key}")
