@@ -217,18 +217,21 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         callback.on_rollout_start()
         observations = tape.reset(self.carry_on)
         self._observations = []
-        for _ in range(n_rollout_steps):
+        infos: list[dict[str, Any]] = [{} for _ in range(env.num_envs)]
+        for step in range(n_rollout_steps):
             self._observations.append(observations)
             observations = tape.step(mean_actions(network, observations))
             self.num_timesteps += env.num_envs
+            # Callbacks find every flight to end with the recording.
+            dones = np.full(env.num_envs, step == n_rollout_steps - 1)
+            if dones.all():
+                for info, reward, length, is_lost in zip(infos, *tape.episodes(), strict=True):
+                    info["episode"] = {"r": float(reward), "l": int(length), "t": 0.0}
+                    info["is_success"] = not is_lost
+                self._update_info_buffer(infos, dones)
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
-        assert self.ep_info_buffer is not None
-        assert self.ep_success_buffer is not None
-        for reward, length, is_lost in zip(*tape.episodes(), strict=True):
-            self.ep_info_buffer.append({"r": reward, "l": length, "t": 0.0})
-            self.ep_success_buffer.append(not is_lost)
         callback.on_rollout_end()
         return True
 
