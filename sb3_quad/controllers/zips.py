@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.process import trusted
+from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.controllers.unpickle import unpickle
+from sb3_quad.controllers.unpickle import WAY_OUT, held, unpickle
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
@@ -36,12 +36,17 @@ _OURS = {
 # Of the pickles of an agent, ``predict`` needs only these.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")
 # The others become None, or these values where SB3 cannot load None.
-_STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}
+_STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "target_entropy": 0.0, "train_freq": 1}
 # SB3 and this package never save these, and loading them would import what they name.
 _NEVER_READ = ("env", "expert", "_labeller")
 DAMAGED = "not a complete SB3 zip"
 # What SB3 saves apart from policies and optimisers. Loading another one would set any attribute.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
+_VARIABLE_FILES = ("pytorch_variables.pth", "tensors.pth")
+# Values in spaces and in the policy's keywords; each layer takes time.
+_LARGEST = 2000
+# Keywords that say nothing of a policy's layers, and that not all policies or devices take.
+_WITHOUT_SIZE = ("device", "optimizer_class", "optimizer_kwargs", "squash_output", "use_sde")
 
 
 def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
@@ -59,8 +64,21 @@ def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
         if not Path(path).is_file():
             raise ConfigError(f"{where}: no such file")
     # What a damaged archive raises depends on where the damage is.
-    with raised_as(ConfigError, f"{where}: {DAMAGED}"), zipfile.ZipFile(path) as archive:
+    with raised_as(ConfigError, f"{where}: {DAMAGED}"), _open(path, where) as archive:
         return dict(json.loads(archive.read("data")))
+
+
+def _open(file: Any, where: str) -> zipfile.ZipFile:
+    """Open a zip whose parts need no more memory than it has bytes, as SB3 and PyTorch write it.
+
+    :raises ConfigError: parts are compressed, or overlap.
+    """
+    archive = zipfile.ZipFile(file)
+    parts = archive.infolist()
+    size = sum(part.file_size for part in parts)
+    if size > archive.start_dir or any(part.compress_type for part in parts):
+        raise ConfigError(f"{where}: is compressed, as no zip of SB3 is; pack it with zip -0")
+    return archive
 
 
 def saved_algorithm(path: StrPath) -> str:
@@ -124,15 +142,48 @@ def load_zip(
     with raised_as(ConfigError, f"{where}: cannot be loaded"), warnings.catch_warnings():
         # SB3 takes the buffer of n-step returns, its own choice, for the user's.
         warnings.filterwarnings("ignore", "`n_steps=")
+        # It reads the layers of older zips, too.
+        warnings.filterwarnings("ignore", "As shared layers")
         if data:
-            # SB3 sets variables by their names, on any part of the model.
-            variables = load_from_zip_file(path, load_data=False, device="cpu")[2] or {}
-            if variables.keys() - _VARIABLES:
-                raise ConfigError(
-                    f"{where}: holds variables that no algorithm has; "
-                    f"known are {', '.join(sorted(_VARIABLES))}"
-                )
+            with _open(path, where) as archive:
+                _check_parameters(archive, data | objects, where)
         return algorithm.load(path, custom_objects=objects, **kwargs)
+
+
+def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> None:
+    """Check what PyTorch and the policy's class make of a zip, neither of which limits its size."""
+    for part in archive.namelist():
+        if not part.endswith(".pth"):
+            continue
+        its = f"{where}: its {part}"
+        with (
+            raised_as(ConfigError, f"{its} is not what PyTorch saves since 1.6; {WAY_OUT}"),
+            _open(archive.open(part), its) as weights,
+        ):
+            (name,) = [name for name in weights.namelist() if name.endswith("/data.pkl")]
+            content = unpickle(weights.read(name), its)
+        # SB3 sets variables by their names, on any part of the model.
+        if part in _VARIABLE_FILES and content and content.keys() - _VARIABLES:
+            raise ConfigError(
+                f"{where}: holds variables that no algorithm has; "
+                f"known are {', '.join(sorted(_VARIABLES))}"
+            )
+    walk([data[key] for key in _TO_FLY], held, _LARGEST)
+    keywords = {}
+    for key, value in data["policy_kwargs"].items():
+        if key not in _WITHOUT_SIZE:
+            keywords[key] = value
+    if keywords.get("n_critics", 2) > 100:
+        raise ConfigError(f"{where}: asks for more than 100 critics")
+    # Parameters on this device take no memory.
+    meta = th.device("meta")
+    sketch: Any = type("Sketch", (data["policy_class"],), {"device": meta})
+    with meta:
+        policy = sketch(data["observation_space"], data["action_space"], lambda _: 0.0, **keywords)
+    asked = sum(parameter.numel() for parameter in policy.parameters())
+    # Half precision is the least that somebody may have saved.
+    if 2 * asked > archive.getinfo("policy.pth").file_size:
+        raise ConfigError(f"{where}: asks for {asked:,} parameters, policy.pth holds fewer")
 
 
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
