@@ -47,6 +47,8 @@ def unpickle(content: str | bytes, where: str) -> Any:
         if isinstance(content, str):
             content = base64.b64decode(content)
         steps = _Steps(content)
+        # Those of SB3 need up to two for each byte.
+        steps.left = min(_STEPS, 10_000 + 5 * len(content))
         reader = _Reader(steps)
         reader.steps = steps
         found = reader.load()
@@ -243,7 +245,7 @@ _HARMLESS = """
 class _Steps(io.BytesIO):
     """The content of a pickle, which is read in a limited number of steps."""
 
-    left = _STEPS
+    left: int
 
     def read(self, size: int | None = -1) -> bytes:
         self.left -= 1

@@ -44,7 +44,7 @@ DAMAGED = "not a complete SB3 zip"
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 _VARIABLE_FILES = ("pytorch_variables.pth", "tensors.pth")
 # Values in spaces and in the policy's keywords; each layer takes time.
-_LARGEST = 2000
+_LARGEST = 1000
 # Keywords that say nothing of a policy's layers, and that not all policies or devices take.
 _WITHOUT_SIZE = ("device", "optimizer_class", "optimizer_kwargs", "squash_output", "use_sde")
 
@@ -169,10 +169,8 @@ def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> No
                 f"known are {', '.join(sorted(_VARIABLES))}"
             )
     walk([data[key] for key in _TO_FLY], held, _LARGEST)
-    keywords = {}
-    for key, value in data["policy_kwargs"].items():
-        if key not in _WITHOUT_SIZE:
-            keywords[key] = value
+    given = data["policy_kwargs"]
+    keywords = {key: given[key] for key in given if key not in _WITHOUT_SIZE}
     if keywords.get("n_critics", 2) > 100:
         raise ConfigError(f"{where}: asks for more than 100 critics")
     # Parameters on this device take no memory.
