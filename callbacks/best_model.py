@@ -15,6 +15,7 @@ from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
+from sb3_quad.controllers.statistics import share_statistics
 
 # By the name in the log: an array of an evaluation, and its statistic.
 LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
@@ -67,7 +68,8 @@ class BestModel(EveryTimesteps):
     >>> PPO.load("best_model.zip", device="cpu").num_timesteps in (800, 1600)
     True
 
-    :param env: the environments to evaluate in, not those of the training; you close them.
+    :param env: the environments to evaluate in, not those of the training; you close them. A
+        VecNormalize there gets the training's statistics, and neither learns nor scales rewards.
     :param every: timesteps between evaluations.
     :param n_episodes: episodes in each.
     :param seed: of the evaluation's episodes.
@@ -127,6 +129,7 @@ class BestModel(EveryTimesteps):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         for evaluations in self._evaluations.values():
+            share_statistics(self.model.get_vec_normalize_env(), evaluations.env)
             evaluations.read(self._n_episodes)
         # A resumed training continues the clock and knows the best model so far.
         self._start = time.perf_counter()
@@ -161,6 +164,7 @@ class BestModel(EveryTimesteps):
                 values[name] = float(value)
         texts = []
         for prefix, evaluations in self._evaluations.items():
+            share_statistics(self.model.get_vec_normalize_env(), evaluations.env)
             flown = _fly(self.model, evaluations.env, self._n_episodes, self._seed)
             evaluations.append({**values, **flown})
             text = prefix

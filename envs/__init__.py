@@ -5,15 +5,24 @@ from typing import TYPE_CHECKING
 from sb3_quad.base.imports import lazy_names
 
 if TYPE_CHECKING:
+    from sb3_quad.envs.batch_vec_env import BatchVecEnv
     from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
     from sb3_quad.simulation.tasks import TASKS, Task
 
-__all__ = ["TASKS", "QuadcopterEnv", "QuadcopterVecEnv", "QuadcopterVectorEnv", "Task"]
+__all__ = [
+    "TASKS",
+    "BatchVecEnv",
+    "QuadcopterEnv",
+    "QuadcopterVecEnv",
+    "QuadcopterVectorEnv",
+    "Task",
+]
 
 # Imported on first use, so that `import sb3_quad` need not wait for pybullet, numba and torch.
 _LAZY = {
+    "BatchVecEnv": "sb3_quad.envs.batch_vec_env",
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
     "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",

@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import Wrapper
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import AnyArray, StrDict
+from sb3_quad.base.types import StrDict
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
+from sb3_quad.envs.batch_vec_env import BatchVecEnv
 from sb3_quad.simulation.tape import FlightTape
 from sb3_quad.simulation.tasks import TaskSpec
 
@@ -42,7 +41,7 @@ class RowSeeds(VecEnv):
         return self._seeds.copy()
 
 
-class QuadcopterVecEnv(BatchEnv, RowSeeds):
+class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     """n quadcopters stepped together by compiled code; the flight is PyBullet's to 1e-9.
 
     The learning problem, the arguments and the setters are those of
@@ -79,13 +78,10 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         **keywords: Unpack[FlightKeywords],
     ) -> None:
         self._make_batch(n_envs, seed, n_threads, task, autoreset=True, **keywords)
-        # Only QuadcopterEnv draws.
-        self.render_mode = None
         self._staggered = staggered
         # The list is reused in every step; only rows that end or have just ended change.
         self._infos: list[StrDict] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
-        self._actions: AnyArray = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces(self.batch.observation.size))
 
@@ -105,10 +101,6 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         if self._staggered:
             self.batch.stagger()
         return observations
-
-    def step_async(self, actions: AnyArray) -> None:
-        """Keep the actions, (n, 4), for :meth:`step_wait`."""
-        self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         """Fly one control step.
@@ -153,20 +145,16 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         """
         return FlightTape(self.batch, n_steps, substeps)
 
-    def close(self) -> None:
-        """Do nothing: there is nothing to close."""
-
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the given rows, one value per row."""
-        rows = self.batch.rows(indices)
         if attr_name == "vehicle":
             values = self.batch.vehicle_list
         elif attr_name in _OF_ROWS:
             values = getattr(self, attr_name)
         else:
             # It belongs to the environment, not to a row.
-            return [getattr(self, attr_name)] * rows.size
-        return [values[row] for row in rows]
+            return super().get_attr(attr_name, indices)
+        return [values[row] for row in self.batch.rows(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set ``target``, ``wind`` or ``noise`` of the given rows."""
@@ -190,9 +178,3 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
             )
         getattr(self, method_name)(*method_args, indices=indices, **method_kwargs)
         return [None] * rows.size
-
-    def env_is_wrapped(
-        self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
-    ) -> list[bool]:
-        """Return True for SB3's ``Monitor`` only, since the rows give its ``info["episode"]``."""
-        return [wrapper_class is Monitor] * self.batch.rows(indices).size

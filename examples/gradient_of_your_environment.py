@@ -15,9 +15,9 @@ import argparse
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad import APG
+from sb3_quad.envs import BatchVecEnv
 
 DT = 0.05  # s
 N_STEPS = 80
@@ -79,54 +79,30 @@ class CartTape:
         return by_action.numpy()
 
 
-class Carts(VecEnv):
+class Carts(BatchVecEnv):
     """A row of carts; an observation is the distance and the velocity of one."""
 
     def __init__(self, n_envs, seed):
         observations = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         super().__init__(n_envs, observations, spaces.Box(-1.0, 1.0, (1,), np.float32))
-        self.random = np.random.default_rng(seed)
+        self.seed(seed)
         self.state = np.zeros((n_envs, 2), np.float32)
 
     def record(self, n_steps, substeps):
         """Return a tape; the carts have no substeps."""
         return CartTape(self, n_steps)
 
-    def reset(self):
-        """Put the carts at random distances."""
-        self.state = self.random.normal(0.0, 2.0, (self.num_envs, 2)).astype(np.float32)
-        return self.state
+    def begin(self, rows):
+        """Put these carts at random distances."""
+        self.state[rows] = self.rng.normal(0.0, 2.0, (len(rows), 2))
+        return self.state[rows]
 
-    def step_async(self, actions):
-        """Keep the actions."""
-        self.actions = actions
-
-    def step_wait(self):
+    def advance(self, actions):
         """Move the carts; their episodes do not end."""
-        action = th.from_numpy(self.actions)
+        action = th.from_numpy(actions)
         state = move(th.from_numpy(self.state), action)
         self.state = state.numpy()
-        dones = np.zeros(self.num_envs, dtype=bool)
-        return self.state, -cost_of(state, action).numpy(), dones, [{}] * self.num_envs
-
-    def close(self):
-        """Do nothing."""
-
-    def get_attr(self, attr_name, indices=None):
-        """Return an attribute, once for each cart."""
-        return [getattr(self, attr_name)] * self.num_envs
-
-    def set_attr(self, attr_name, value, indices=None):
-        """Set an attribute."""
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
-        """Refuse: carts have no methods."""
-        raise AttributeError(method_name)
-
-    def env_is_wrapped(self, wrapper_class, indices=None):
-        """Return that nothing is wrapped."""
-        return [False] * self.num_envs
+        return self.state, -cost_of(state, action), np.zeros(self.num_envs, dtype=bool)
 
 
 def mean_cost(model, seed):
@@ -138,7 +114,7 @@ def mean_cost(model, seed):
         env.step_async(model.predict(observations, deterministic=True)[0])
         observations, rewards, _, _ = env.step_wait()
         costs.append(-rewards.mean())
-    return float(np.mean(costs)), float(np.median(np.abs(observations[:, 0])))
+    return float(np.mean(costs)), float(np.median(np.abs(env.state[:, 0])))
 
 
 def main():

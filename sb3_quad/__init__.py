@@ -2,8 +2,15 @@
 the gradient of the model, for Stable-Baselines3.
 """
 
+import signal
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+# Ctrl-C ends a command at once while it imports, see interrupts_leave; imports begin here.
+_is_command = "sb3_quad.cli" in sys.orig_argv or Path(sys.argv[0]).stem == "sb3-quad"
+if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie next to this folder rather than in
 # it; an installed package holds them inside, and then this does nothing.

@@ -524,3 +524,66 @@ def test_any_task_has_a_closing_table(task):
         True,
         True,
     ]
+
+
+@pytest.mark.parametrize("as_command", [True, False])
+def test_ctrl_c_while_a_command_is_imported_ends_it_at_once(as_command):
+    """Where it is only imported by others, it raises KeyboardInterrupt as ever."""
+    code = "import sb3_quad, os, signal; os.kill(os.getpid(), signal.SIGINT)"
+    words = ["sb3_quad.cli"] if as_command else []
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGINT
+    assert ("KeyboardInterrupt" in done.stderr) is not as_command
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_command_that_runs_notes_ctrl_c_again(ignored):
+    """Unless it is ignored, as by a shell for what it starts in the background."""
+    code = (
+        "import signal, sb3_quad.cli as cli; before = signal.getsignal(signal.SIGINT);"
+        "cli.main(['check-vehicle', 'itm', '-n', '2']);"
+        "after = signal.getsignal(signal.SIGINT);"
+        "assert before is (signal.SIG_IGN if ignored else signal.SIG_DFL), before;"
+        "assert after is (signal.SIG_IGN if ignored else signal.default_int_handler), after"
+    )
+    words = [sys.executable, "-c", f"ignored = {ignored};" + code, "sb3_quad.cli"]
+    if ignored:
+        words = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *words]
+    subprocess.run(words, capture_output=True, check=True)
+
+
+def test_flights_of_a_file_are_cloned_by_beta_0_alone(tmp_path, capsys):
+    flights = tmp_path / "flights.npz"
+    sb3_quad.fly(sb3_quad.PIDExpert(), n_flights=4, max_steps=50, record=flights)
+    settings = {**SMALL_DAGGER, "demonstrations": str(flights)}
+    settings["env_kwargs"] = {"max_episode_steps": 50}
+    file = tmp_path / "flights.yml"
+    asked = ["train", "--algo", "dagger", "--conf-file", str(file), "-f", str(tmp_path / "logs")]
+    asked += ["--eval-episodes", "2", "--no-progress"]
+    file.write_text(yaml.safe_dump({ENV: settings}))
+    assert main(asked) == 2
+    assert "with beta=0, DAgger can clone the flights" in capsys.readouterr().err
+    assert not (tmp_path / "logs").exists()
+    file.write_text(yaml.safe_dump({ENV: {**settings, "beta": 0}}))
+    assert main(asked) == 0
+    assert "expert" not in (tmp_path / "logs/dagger" / f"{ENV}_1" / ENV / "config.yml").read_text()
+    file.write_text(yaml.safe_dump({ENV: {**settings, "demonstrations": "none.npz"}}))
+    assert main(asked) == 2
+    assert "none.npz: cannot be read" in capsys.readouterr().err
+
+
+def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
+    sb3_quad.fly(sb3_quad.PIDExpert(), n_flights=4, max_steps=50, record=tmp_path / "flights.npz")
+    cloned = {"demonstrations": str(tmp_path / "flights.npz"), "beta": 0}
+    cloned["callback"] = {"test_cli.Interrupt": {"after": 900}}
+    Interrupt.sent = True
+    whole = train(job(tmp_path, **cloned), report=lambda line: None)
+    Interrupt.sent = False
+    interrupted = train(job(tmp_path, **cloned), report=lambda line: None)
+    (tmp_path / "flights.npz").unlink()
+    again = resume(str(interrupted.run.path), report=lambda line: None)
+    assert len(again.model.dataset) == 200
+    for ours, theirs in zip(
+        again.model.policy.parameters(), whole.model.policy.parameters(), strict=True
+    ):
+        assert torch.equal(ours, theirs)

@@ -1,5 +1,7 @@
 """DAgger: who flies, what is labelled, what is learnt, and what survives an interruption."""
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -138,7 +140,8 @@ def test_the_deviation_stops_at_its_floor():
     model = build(bc_loss="nll", log_std_min=-1.98, learning_rate=1e-2, n_epochs=20).learn(
         ROLLOUT * 4
     )
-    assert model.policy.log_std.min().item() == pytest.approx(-1.98)
+    # It is meant in half ranges, and Pendulum's torque has limits of 2.
+    assert model.policy.log_std.min().item() == pytest.approx(-1.98 + math.log(2.0))
 
 
 # --- Loss terms
@@ -381,3 +384,53 @@ def test_dict_observations_and_discrete_actions_are_refused():
         DAgger("MultiInputPolicy", env)
     with pytest.raises(AssertionError, match=r"Discrete\(2\)"):  # SB3's own
         DAgger("MlpPolicy", "CartPole-v1")
+
+
+def recorded(path, n_flights=48):
+    """Write the expert's flights of a pendulum, 50 steps each, into a file."""
+    env = pendulum(n_flights)
+    observation = env.reset()
+    observations, actions = [], []
+    for _ in range(50):
+        observations.append(observation)
+        actions.append(turn_back(observation))
+        observation, *_ = env.step(actions[-1])
+    np.savez(path, obs=np.concatenate(observations), acts=np.concatenate(actions))
+
+
+def test_flights_of_a_file_are_cloned_without_an_expert(tmp_path):
+    recorded(tmp_path / "flights.npz")
+    model = build(expert=None, beta=0, demonstrations=tmp_path / "flights.npz", gradient_steps=64)
+    env = pendulum(16, seed=9)
+    seen = env.reset()
+    untrained = np.abs(model.predict(seen, deterministic=True)[0] - turn_back(seen)).mean()
+    model.learn(20 * ROLLOUT)
+    errors = np.abs(model.predict(seen, deterministic=True)[0] - turn_back(seen))
+    assert errors.mean() < 0.2 * untrained
+    # The agent's own flights have no labels, and do not become pairs.
+    assert len(model.dataset) == 48 * 50
+    assert model.beta_final == 0.0
+
+
+def test_without_an_expert_beta_0_is_to_be_said(tmp_path):
+    recorded(tmp_path / "flights.npz", 2)
+    model = build(expert=None, demonstrations=tmp_path / "flights.npz")
+    with pytest.raises(ExpertError, match="with beta=0, DAgger can clone the flights"):
+        model.learn(ROLLOUT)
+    model.set_beta(0.0)
+    model.learn(ROLLOUT)
+    model.dataset.clear()
+    with pytest.raises(ExpertError, match="no expert"):
+        model.learn(ROLLOUT)
+
+
+def test_flights_of_a_file_are_held_beside_new_labels_of_an_expert(tmp_path):
+    recorded(tmp_path / "flights.npz", 2)
+    model = build(demonstrations=tmp_path / "flights.npz").learn(ROLLOUT)
+    assert len(model.dataset) == 100 + ROLLOUT
+
+
+def test_flights_of_another_range_of_actions_are_refused(tmp_path):
+    np.savez(tmp_path / "rpm.npz", obs=np.zeros((3, 3)), acts=np.full((3, 1), 1500.0))
+    with pytest.raises(ConfigError, match=r"rpm\.npz: .*actions from 1500 to 1500"):
+        build(expert=None, beta=0, demonstrations=tmp_path / "rpm.npz")

@@ -1,5 +1,7 @@
 """The aggregated dataset: a ring that forgets the oldest."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -83,3 +85,77 @@ def test_a_file_that_does_not_fit_leaves_the_pairs_as_they_are(tmp_path):
         assert "\n" not in str(raised.value)
     for array, old in zip(contents(dataset), before, strict=True):
         np.testing.assert_array_equal(array, old)
+
+
+def flight(n, short=False, shape=(2,)):
+    """A flight of n actions with one observation more, as imitation (short) or Minari has it."""
+    observations = np.arange(2.0 * (n + 1)).reshape(n + 1, *shape)
+    actions = np.linspace(-1.0, 1.0, n)[:, None]
+    names = ("obs", "acts") if short else ("observations", "actions")
+    return SimpleNamespace(**dict(zip(names, (observations, actions), strict=True)))
+
+
+@pytest.mark.parametrize("short", [False, True])
+def test_flights_of_others_are_taken_without_their_last_observations(short):
+    dataset = filled(8, 5)
+    dataset.load([flight(3, short), flight(2, short)])
+    observations, actions = contents(dataset)
+    np.testing.assert_array_equal(observations, [[0, 1], [2, 3], [4, 5], [0, 1], [2, 3]])
+    np.testing.assert_array_equal(actions.ravel(), [-1, 0, 1, -1, 1])
+
+
+def test_trajectories_of_imitation_are_taken():
+    types = pytest.importorskip("imitation.data.types")
+    rng = np.random.default_rng(0)
+    paths = [
+        types.Trajectory(rng.random((6, 2)), rng.random((5, 1)), infos=None, terminal=True)
+        for _ in range(3)
+    ]
+    dataset = AggregatedDataset(20, (2,), 1)
+    dataset.load(paths)
+    assert len(dataset) == 15
+
+
+def test_arrays_of_other_names_and_of_single_numbers_are_taken(tmp_path):
+    np.savez(tmp_path / "others.npz", obs=np.zeros((4, 2)), acts=np.ones(3), rews=np.ones(3))
+    dataset = filled(8)
+    dataset.load(tmp_path / "others.npz")
+    assert [array.shape for array in contents(dataset)] == [(3, 2), (3, 1)]
+
+
+def with_number(n, name, number):
+    changed = flight(n)
+    getattr(changed, name)[1] = number
+    return [changed]
+
+
+@pytest.mark.parametrize(
+    ("flights", "message"),
+    [
+        (with_number(3, "actions", 1500.0), "actions from -1 to 1500"),
+        (with_number(3, "actions", np.nan), "actions from nan"),
+        (with_number(3, "observations", np.inf), "not finite"),
+        ([flight(9)], "9 observations, 9 actions, room for 8"),
+        ([], "0 actions"),
+        ([flight(2), SimpleNamespace(obs=np.zeros((5, 2)), acts=np.zeros((3, 1)))], "7 obs"),
+        ([SimpleNamespace(observations={"camera": 1}, actions=np.zeros((3, 1)))], "unsized"),
+        ([flight(3, shape=(1, 2))], "dimension"),
+        ([{"observations": 1}], "no attribute 'observations'"),
+        (3, "int: holds no flights that fit the environment"),
+    ],
+)
+def test_flights_that_do_not_fit_are_refused_in_one_line(flights, message):
+    dataset = filled(8, 5)
+    dataset.action_range = (-1.0, 1.0)
+    before = contents(dataset)
+    with pytest.raises(ConfigError, match=message) as raised:
+        dataset.load(flights)
+    assert "\n" not in str(raised.value)
+    for array, old in zip(contents(dataset), before, strict=True):
+        np.testing.assert_array_equal(array, old)
+
+
+def test_floats_are_no_pixels():
+    dataset = AggregatedDataset(8, (2,), 1, np.uint8)
+    with pytest.raises(ConfigError, match="Cannot cast"):
+        dataset.load([flight(3)])

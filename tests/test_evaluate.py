@@ -4,7 +4,9 @@ line.
 
 import csv
 import importlib
+import os
 import shutil
+import subprocess
 import sys
 import zipfile
 
@@ -201,11 +203,36 @@ def test_a_folder_of_results_is_kept_or_written_anew(here, capsys):
     error = capsys.readouterr().err
     assert "holds results already; give another folder with -o" in error and error.count("\n") == 1
     assert times_of_change(here) == before
+    # A reader's own files stay.
+    own = [here / "out/notes.md", here / "out/flights/b/mine.npz", here / "out/flights/mine.txt"]
+    for path in own:
+        path.write_text("mine")
     assert evaluate("a=pid", "--scenario", "tracking", "--seed", "7", "--overwrite") == 0
+    assert {path.read_text() for path in own} == {"mine"}
+    for path in own:
+        path.unlink()
     assert {row["seed"] for row in rows()} == {
         str(each) for each in row_seeds(seed_for("suite", 7), 5)
     }
     assert len(times_of_change(here)) == len(load_results("out").entries) == 1
+
+
+def test_a_folder_without_an_agent_is_called_that(here, capsys):
+    (here / "logs").mkdir()
+    assert evaluate("logs", "--scenario", "tracking") == 1
+    assert "controller logs: no run with an agent in this folder" in capsys.readouterr().err
+
+
+def test_a_console_without_some_letters_shows_the_table(here):
+    """Windows' consoles and the locale C have no minus sign."""
+    command = [sys.executable, "-m", "sb3_quad.cli", "evaluate", "pid", "--suite", "quick"]
+    done = subprocess.run(
+        [*command, "--episodes", "2", "--no-report", "-o", "out"],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert b"success, %" in done.stdout and not done.stderr
 
 
 def test_an_interrupted_evaluation_goes_on_by_the_same_command_alone(here, capsys):

@@ -290,3 +290,18 @@ def test_tables_stand_without_a_single_success():
     text = text_of(table_of(metrics, "recovery", ["expert", "RL-agent", "PPO only"]))
     assert "0.0 (" in text and "88.25, 88.75 % while training" in text
     assert "nan" not in text
+
+
+def test_a_recorded_flight_holds_what_was_seen_and_done(tmp_path):
+    seen = []
+
+    def pilot(observation):
+        seen.append(observation.copy())
+        return np.full((len(observation), 4), -1.5)  # beyond the range, which is clipped
+
+    flights = fly(pilot, n_flights=3, max_steps=400, record=tmp_path / "f.npz")
+    with np.load(tmp_path / "f.npz") as file:
+        observations, actions = file["observations"], file["actions"]
+    assert len(observations) == len(actions) == flights.length.sum() < 3 * 400
+    np.testing.assert_array_equal(observations[:6], np.concatenate(seen[:2]))
+    assert (actions == -1.0).all()

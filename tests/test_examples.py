@@ -262,3 +262,15 @@ def test_robustness_plot(run, tmp_path):
 def test_raptor(run):
     output = run("raptor.py")
     assert output.count("survival") == 2
+
+
+def test_a_batch_of_ones_own_learns(run):
+    output = run("own_batch.py", "--timesteps", "60000")
+    before, after = map(float, re.findall(r": ([\d.]+) of 200 steps upright", output))
+    assert before < 100.0 < 150.0 < after
+
+
+def test_a_gradient_of_ones_own_leads_to_the_mark(run):
+    output = run("gradient_of_your_environment.py", "--updates", "20")
+    before, after = map(float, re.findall(r"([\d.]+) m from the mark", output))
+    assert after < 0.5 * before

@@ -285,7 +285,9 @@ def test_the_run_folder_gives_vehicle_and_scaling(zips, tmp_path):
         in export_policy(path, "torchscript", vehicle="itm", n_observations=100).metadata["vehicle"]
     )
     (run_folder / "Env-v0" / "vecnormalize.pkl").touch()
-    with pytest.raises(ConfigError, match="VecNormalize"):
+    with pytest.raises(
+        ConfigError, match=r"vecnormalize\.pkl is not what Stable-Baselines3 pickles"
+    ):
         export_policy(path, "torchscript")
 
 

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, privileged_derived
 from sb3_quad.experts.geometric_gains import derived_gains
@@ -162,9 +161,3 @@ def test_privileged_derived_is_gentler_where_commands_act_late(name: str, late: 
     )
     assert gentle.success.all() and not np.isnan(gentle.settling_time[0.1]).any()
     assert (np.abs(gentle.reward - plain.reward) > 1e-9).any() == late
-
-
-@pytest.mark.parametrize(("privileged", "name"), [(False, "attitude"), (True, "atitude")])
-def test_late_needs_known_gains_and_a_privileged_expert(privileged: bool, name: str) -> None:
-    with pytest.raises(ConfigError, match=f"late {name}"):
-        GeometricExpert(privileged=privileged, late={name: 0.5})

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -40,7 +41,7 @@ def here(tmp_path, monkeypatch):
             "env": ENV,
             "conf_file": f"nominal/{algo}.yml",
             "pass_on": "last",
-            "correct_offset": "hover",
+            "correct_offset": 1.0,
             "settings": {**TINY, "expert": "geometric"},
         }
         for name, algo in (("one", "dagger"), ("two", "ppo_bc"))
@@ -48,6 +49,10 @@ def here(tmp_path, monkeypatch):
     stages[1]["settings"] = {**stages[1]["settings"], "n_epochs": 1}
     (folder / "stages.yml").write_text(yaml.safe_dump({"stages": stages}))
     monkeypatch.chdir(folder)
+    # Agents that have hardly learnt crash on the way.
+    monkeypatch.setattr(
+        "sb3_quad.algorithms.offset_correction.hover_offset", lambda *_, **__: np.zeros(3)
+    )
     return folder
 
 

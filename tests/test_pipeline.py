@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch as th
 import yaml
 from stable_baselines3 import PPO
 
@@ -29,8 +28,6 @@ from sb3_quad.cli.parser import PAIRS
 from sb3_quad.controllers.pretrained import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training import arrival_correction
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import (
     load_pipeline,
@@ -132,38 +129,18 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "settings": {"n_stepz": 3}}], "did you mean 'n_steps'"),
         ([{**STAGES[0], "require": {"success": 1}}], "did you mean 'success_rate'"),
         (
-            [{**STAGES[0], "correct_offset": "hover", "conf_file": "robust/dagger.yml"}],
+            [{**STAGES[0], "correct_offset": 1.0, "conf_file": "robust/dagger.yml"}],
             "see the 18 features alone",
         ),
-        (
-            [{**STAGES[0], "correct_offset": {"kind": "arrival", "scale": 0.6}}],
-            "scale does not go with kind: arrival",
-        ),
-        (
-            [{**STAGES[0], "correct_offset": {"kind": "hover", "overshoot_cost": 2.0}}],
-            "overshoot_cost does not go with kind: hover",
-        ),
-        ([{**STAGES[0], "correct_offset": {"kind": "arrival", "round": 2}}], "did you mean 'round"),
-        ([{**STAGES[0], "correct_offset": "hovering"}], "'position', 'hover' or 'arrival'"),
-        (
-            [
-                {
-                    **STAGES[0],
-                    "correct_offset": {
-                        "kind": "arrival",
-                        "env_kwargs": {"randomize": {"gust": {}}},
-                    },
-                }
-            ],
-            "did you mean 'gusts'",
-        ),
+        ([{**STAGES[0], "correct_offset": "position"}], "correct_offset"),
+        ([{**STAGES[0], "correct_offset": 0}], "correct_offset"),
         (
             [
                 {
                     **STAGES[0],
                     "env": "Pendulum-v1",
                     "conf_file": "PENDULUM",
-                    "correct_offset": "arrival",
+                    "correct_offset": 1.0,
                 }
             ],
             "Pendulum-v1 is not an environment of this package",
@@ -249,71 +226,23 @@ def test_the_correction_cancels_the_offset_of_a_trained_agent(monkeypatch):
     assert result.before > 0.4 and result.after < 0.05
 
 
-def test_a_stage_configures_the_flights_and_rounds_of_its_correction(tmp_path, job, monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        pipeline_module,
-        "correct_arrival",
-        lambda *given: seen.append(given) or Correction(1.0, 0.5),
-    )
-    twice = {"kind": "arrival", "rounds": 2, "env_kwargs": {"randomize": {"mass": [0.9, 1.1]}}}
-    for correction in ("arrival", twice):
-        settings = {"env_kwargs": {"randomize": {"share": 0.5}, "noise": 0.1}}
-        stage = {**STAGES[0], "correct_offset": correction, "settings": settings}
-        run_pipeline(tiny(tmp_path, [stage]), job, "stages", quiet)
-    flown = [settings for _, _, _, settings, _ in seen]
-    assert [
-        (how.randomize.share, how.randomize.mass and how.randomize.mass.high) for how in flown
-    ] == [
-        (0.5, None),
-        (1.0, 1.1),
-        (1.0, 1.1),
+def test_a_stage_gives_the_alpha_of_its_correction(tmp_path, job, monkeypatch):
+    given = []
+
+    def noted(model, seed, settings, scale):
+        given.append((settings.noise, scale))
+        return Correction(1.0, 0.5)
+
+    monkeypatch.setattr(pipeline_module, "correct_offset", noted)
+    settings = {"env_kwargs": {"noise": 0.1}}
+    stages = [
+        {**STAGES[0], "name": name, "correct_offset": scale, "settings": settings}
+        for name, scale in (("one", 0.7), ("two", None), ("three", 1))
     ]
-    assert {how.noise for how in flown} == {0.1}
-    assert len({seed for _, seed, *_ in seen}) == 2 and seen[0][1] == seen[1][1]
-
-
-@pytest.mark.slow
-def test_an_agent_that_answers_to_its_velocity_too_little_arrives_without_overshoot_again(
-    monkeypatch,
-):
-    monkeypatch.setattr(arrival_correction, "N_FLIGHTS", 24)
-    monkeypatch.setattr(arrival_correction, "N_CHECKED", 120)
-    model, settings = load_pretrained("itm-recovery"), FlightSettings()
-    layer = model.policy.mlp_extractor.policy_net[0]
-    with th.no_grad():
-        layer.weight[:, 12:15] *= 0.7
-    before = layer.weight.detach().clone()
-    result = arrival_correction.correct_arrival(model, 1, settings, settings)
-    assert result.after < result.before - 0.2
-    factors = (layer.weight / before).detach().numpy()
-    np.testing.assert_allclose(factors, np.broadcast_to(factors[0], factors.shape), rtol=1e-4)
-    assert factors[0, 12] == pytest.approx(factors[0, 13]) and factors[0, 12] > 1.1  # more braking
-    np.testing.assert_allclose(factors[:, -1], 1.0)
-
-
-def test_scales_that_do_not_help_are_not_kept(monkeypatch):
-    for name, value in (
-        ("ROUNDS", 1),
-        ("CANDIDATES", 2),
-        ("BEST", 1),
-        ("N_FLIGHTS", 2),
-        ("N_CHECKED", 2),
-    ):
-        monkeypatch.setattr(arrival_correction, name, value)
-    env = QuadcopterVecEnv(4, seed=1, last_action=True, history=[0, 2])
-    model = PPO(
-        "MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu"
-    )  # loses every flight, however it is scaled
-    before = model.policy.mlp_extractor.policy_net[0].weight.detach().clone()
-    result = arrival_correction.correct_arrival(
-        model, 1, *[FlightSettings(last_action=True, history=[0, 2])] * 2
-    )
-    assert result.after == result.before and th.equal(
-        model.policy.mlp_extractor.policy_net[0].weight, before
-    )
-    with pytest.raises(ConfigError, match="reads the 18 features"):
-        arrival_correction.correct_arrival(model, 1, FlightSettings(), FlightSettings())
+    lines = []
+    run_pipeline(tiny(tmp_path, stages), job, "stages", lines.append)
+    assert given == [(0.1, 0.7), (0.1, 1.0)]
+    assert [line for line in lines if "steady offset 1.000 m, now 0.500 m" in line]
 
 
 def small_file(tmp_path):
@@ -360,29 +289,29 @@ def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
 def two_stages(tmp_path):
     """The offset of the first is to be corrected."""
     first = {**STAGES[0], "conf_file": "nominal/dagger.yml"}
-    return tiny(tmp_path, [{**first, "correct_offset": "hover"}, {**first, "name": "two"}])
+    return tiny(tmp_path, [{**first, "correct_offset": 1.0}, {**first, "name": "two"}])
 
 
-def no_correction(model, seed, settings):
+def no_correction(model, seed, settings, scale):
     return Correction(1.0, 0.0)
 
 
 def test_a_stage_is_not_trained_again_when_its_correction_was_interrupted(
     tmp_path, job, monkeypatch
 ):
-    def interrupted(model, seed, settings):
+    def interrupted(model, seed, settings, scale):
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(pipeline_module, "correct_hover", interrupted)
+    monkeypatch.setattr(pipeline_module, "correct_offset", interrupted)
     lines = []
     result = run_pipeline(two_stages(tmp_path), job, "stages", lines.append)
     assert result.exit_code == 143 and f"--resume {result.folder}" in lines[-1]
 
-    monkeypatch.setattr(pipeline_module, "correct_hover", no_correction)
+    monkeypatch.setattr(pipeline_module, "correct_offset", no_correction)
     after = resume_pipeline(result.folder, quiet)
     assert after.stages["one"].agent.endswith("corrected_model.zip")
     assert len(list((tmp_path / "logs" / "dagger").iterdir())) == 2
-    monkeypatch.setattr(pipeline_module, "correct_hover", interrupted)
+    monkeypatch.setattr(pipeline_module, "correct_offset", interrupted)
     again = resume_pipeline(result.folder, quiet)  # as after a kill in the final tables
     assert [each.agent for each in again.stages.values()] == [
         each.agent for each in after.stages.values()
@@ -396,7 +325,7 @@ def test_a_pipeline_that_was_killed_before_it_noted_its_progress_is_resumed(
         raise SystemExit
 
     folder = tmp_path / "logs" / "stages" / "stages_1"
-    monkeypatch.setattr(pipeline_module, "correct_hover", no_correction)
+    monkeypatch.setattr(pipeline_module, "correct_offset", no_correction)
     monkeypatch.setattr(pipeline_module, "train", killed)  # the first stage has no run folder yet
     with pytest.raises(SystemExit):
         run_pipeline(two_stages(tmp_path), job, "stages", quiet)

@@ -13,11 +13,11 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, privileged_cautious, privileged_geometric
+from sb3_quad.experts.geometric import GeometricExpert, privileged_geometric
 from sb3_quad.experts.geometric_gains import PRIVILEGED_YAW
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import QUATERNION, VELOCITY, P, W
+from sb3_quad.simulation.state import QUATERNION, P, W
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 RANDOMIZE = {
@@ -342,27 +342,6 @@ def test_the_privileged_expert_flies_as_the_others_where_nothing_is_random():
         state = batch.true_state()
         np.testing.assert_allclose(told.actions(state), plain.actions(state), atol=1e-5)
         batch.step(plain.actions(state))
-
-
-def test_the_cautious_expert_falls_less_fast_where_rotors_lift_hardly_more_than_the_load():
-    randomize = {"mass": [1.2, 1.25], "force": {"magnitude": [2, 4], "direction": [0, 0, -1]}}
-    descent, survival = {}, {}
-    for expert in (privileged_geometric(), privileged_cautious()):
-        batch = batch_of(480, randomize=randomize, autoreset=False)
-        lowest, lost = np.zeros(480), np.zeros(480, bool)
-        for _ in range(600):
-            lost |= batch.step(expert.actions(batch.true_state()))[2]
-            lowest = np.minimum(lowest, batch.state[VELOCITY][2])
-        descent[expert.reserve > 0], survival[expert.reserve > 0] = -lowest.min(), 1.0 - lost.mean()
-    assert survival[True] >= survival[False] == 1.0 and descent[False] > 1.2 * descent[True], (
-        descent
-    )
-
-
-@pytest.mark.parametrize(("privileged", "reserve"), [(True, -0.1), (False, 0.1)])
-def test_a_reserve_is_for_a_privileged_expert_and_not_negative(privileged, reserve):
-    with pytest.raises(ConfigError, match="reserve"):
-        GeometricExpert(privileged=privileged, reserve=reserve)
 
 
 @pytest.mark.parametrize(

@@ -475,3 +475,15 @@ def test_episodes_side_by_side_have_one_seed_after_the_other():
     assert [len(episode) for episode in abreast] == [2, 2]
     for ours, theirs in zip([each for episode in abreast for each in episode], alone, strict=True):
         np.testing.assert_array_equal(ours.state.array, theirs[0].state.array)
+
+
+@pytest.mark.parametrize("what", [["--task", "state_recovery"], ["--scenario", "thesis:side_hit"]])
+def test_all_fly_the_vehicle_that_is_asked_for(capsys, what):
+    flown = {}
+    for vehicle in ("itm", "crazyflie"):
+        asked = ["enjoy", "pid", *what, "--vehicle", vehicle, "--no-render", "-n", "100"]
+        assert main(asked) == 0
+        flown[vehicle] = capsys.readouterr().out
+    assert flown["itm"] != flown["crazyflie"]
+    assert main(["enjoy", "pid", "--vehicle", "crazyfly", "--no-render"]) == 2
+    assert "crazyflie" in capsys.readouterr().err

@@ -159,6 +159,17 @@ def test_bad_input_is_one_line_before_anything_is_trained(
     assert not (tmp_path / "logs").exists()
 
 
+@pytest.mark.parametrize(
+    ("expert", "words"),
+    [("nobody", "unknown expert 'nobody'"), ("teacher.zip", "teacher.zip: no such file")],
+)
+def test_a_dry_run_finds_its_experts(tmp_path, capsys, monkeypatch, expert, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", "--algo", "dagger", "--expert", expert, "--dry-run"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+
+
 def test_dry_run_lists_the_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert (

@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_arrays, write_arrays
 from sb3_quad.base.types import Arrays, Float32Array, IntArray
 
@@ -103,6 +104,9 @@ class AggregatedDataset:
     :param dtype: of the observations; actions are float32
     """
 
+    #: The least and the greatest actions, (action_dim,); those of a file must lie between
+    action_range: tuple[Any, Any] = (-np.inf, np.inf)
+
     def __init__(
         self,
         capacity: int,
@@ -162,20 +166,48 @@ class AggregatedDataset:
         pairs: dict[str, Any] = self.pairs
         write_arrays(path, **pairs)
 
-    def load(self, path: str | Path) -> None:
-        """Hold the pairs of a file that :meth:`save` has written, instead of the present ones.
+    def load(self, source: Any) -> None:
+        """Hold the pairs of recorded flights instead of the present ones.
 
-        :raises ConfigError: a file that is missing, damaged, or of other spaces; the present pairs
-            then stay.
+        :param source: an ``.npz`` file with the arrays ``observations`` and ``actions``, as
+            :meth:`save` and ``fly(..., record=...)`` write it, or ``obs`` and ``acts``; or several
+            flights, each with arrays of these names: a Minari dataset, a list of imitation's
+            trajectories. A flight may have one observation more than actions, its last.
+        :raises ConfigError: a file that is missing, damaged, of other spaces, or of more pairs than
+            ``capacity``; the present pairs then stay.
         """
-        new = read_arrays(path)
-        for name, array in self.filled.items():
-            if name not in new or new[name].shape[1:] != array.shape[1:]:
-                raise ConfigError(f"{path}: holds no {name} of shape (n, {array.shape[1:]})")
-        if len({len(array) for array in new.values()}) != 1:
-            raise ConfigError(f"{path}: holds arrays of different lengths")
+        where = type(source).__name__
+        if isinstance(source, (str, Path)):
+            where = str(source)
+            source = [SimpleNamespace(**read_arrays(source))]
+        # Begun by no rows of the dataset's own, which arrays of other shapes do not follow.
+        seen = [self.observations[:0]]
+        acted = [self.actions[:0]]
+        # Files of others may hold anything.
+        with raised_as(ConfigError, f"{where}: holds no flights that fit the environment"):
+            for flight in source:
+                # imitation has the shorter names.
+                short = hasattr(flight, "acts")
+                observations = np.asarray(flight.obs if short else flight.observations)
+                actions = np.asarray(flight.acts if short else flight.actions)
+                if len(observations) == len(actions) + 1:
+                    observations = observations[:-1]
+                seen.append(observations)
+                acted.append(actions.reshape(len(actions), -1))
+            observations = np.concatenate(seen, dtype=seen[0].dtype, casting="same_kind")
+            actions = np.concatenate(acted, dtype=np.float32)
+            if not 0 < len(observations) == len(actions) <= self.capacity:
+                raise ValueError(
+                    f"{len(observations)} observations, {len(actions)} actions, room for"
+                    f" {self.capacity}"
+                )
+            # NaN is not itself.
+            if (actions != actions.clip(*self.action_range).astype(np.float32)).any():
+                raise ValueError(f"actions from {actions.min():g} to {actions.max():g}")
+            if not np.isfinite(observations).all():
+                raise ValueError("observations that are not finite")
         self.clear()
-        self.add(**new)
+        self.add(observations, actions)
 
 
 def sample_rows(

@@ -1,8 +1,11 @@
 """The parts that all algorithms with an expert share."""
 
+import math
+from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -13,17 +16,19 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import explained_variance
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
-from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
+from sb3_quad.base.files import one_line
 from sb3_quad.base.types import Float32Array
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.controllers.statistics import STATISTICS, share_statistics
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.simulation.settings import KEY, FlightSettings
 
@@ -50,25 +55,55 @@ LIMITS = {
     "bc_coef": _WEIGHT,
     "l2_coef": _WEIGHT,
     "vf_coef": _WEIGHT,
+    "beta": _SHARE,
+    "beta_final": _SHARE,
     "beta_decay": _WEIGHT,
 }
 """Valid range of each argument of the algorithms; the greatest holds for settings files alone."""
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
+# A half range beyond this is no limit at all.
+_UNLIMITED = 1e9
+
+
+def in_half_ranges(train: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Let an update count actions in half ranges of the action space, from its middle.
+
+    The losses and their constants are meant so. And Adam moves all weights by about the same, which
+    is nothing to an actor that gives 1,000 to 2,000, and too much to one that gives ±0.002. So the
+    last layer is scaled for the update, and back after it. In a Box of [-1, 1] nothing is done.
+    """
+
+    @wraps(train)
+    def scaled(self: Any) -> None:
+        self._rescale(True)
+        try:
+            train(self)
+        finally:
+            self._rescale(False)
+
+    return scaled
 
 
 class ExpertMixin:
     """The expert of an algorithm, and what its zips say about its flights."""
 
     env: VecEnv | None
+    _vec_normalize_env: VecNormalize | None
     policy: Any
     logger: Logger
     num_timesteps: int
     observation_space: spaces.Space[Any]
+    action_space: Any
+    policy_class: Any
+    policy_aliases: ClassVar[Any]
+    rollout_buffer: Any
     _last_obs: Any
     _last_episode_starts: Any
     _n_updates: int
     expert: ExpertLike | None
+    bc_coef: Any
+    batch_size: Any
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
 
@@ -104,22 +139,87 @@ class ExpertMixin:
             )
         return offset_correction.correct_offset(self, seed, settings, scale)  # type: ignore[arg-type]
 
-    def _setup_model(self) -> None:
+    def _check_arguments(self) -> None:
+        # SB3 would pickle NumPy's numbers into the zip, and takes not all of them.
+        for name, value in [*vars(self).items()]:
+            if isinstance(value, np.generic):
+                setattr(self, name, value.item())
         for name, (least, _) in LIMITS.items():
             value = getattr(self, name, None)
             if callable(value):
                 value = value(1.0)  # a schedule, at its start
-            if isinstance(value, (int, float)) and not value >= least:
-                raise ConfigError(f"{name} {value:g}: must be at least {least}")
+            # Some arguments can be None, and train_freq a tuple.
+            if value is None or isinstance(value, tuple):
+                continue
+            if not isinstance(value, (int, float)) or not value >= least:
+                raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
+        # DAgger's None is nothing that PPO could load.
+        if vars(self).get("max_grad_norm", 0.0) is None:
+            self.max_grad_norm = math.inf
+        # Rows are sampled all at once.
+        capacity = getattr(self, "dataset_capacity", 0) or getattr(self, "buffer_size", 0)
+        if 0 < capacity < getattr(self, "batch_size", 0):
+            raise ConfigError(
+                f"batch_size {self.batch_size}: more than the {capacity} rows of dataset_capacity"
+                " or buffer_size"
+            )
+        if hasattr(self, "bc_coef"):
+            self.bc_coef = FloatSchedule(self.bc_coef)
+        if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
+            raise ConfigError(
+                f"policy {self.policy_class.__name__}: {type(self).__name__} has none of this kind;"
+                " give an agent of another algorithm as expert=... to a new model"
+            )
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
         # The orthogonal weights of a new network depend on the number of threads that make them.
         with one_torch_thread(compiled=True):
             super()._setup_model()  # type: ignore[misc]
-        self._note_flight_settings()
+        if self.env is not None:
+            # A zip's statistics, which are read before this, go on in the environment.
+            if hasattr(self, STATISTICS):
+                share_statistics(getattr(self, STATISTICS), self.env, training=True)
+            self._note_flight_settings()
+
+    def set_parameters(self, *arguments: Any, **keywords: Any) -> None:
+        """Take the parameters of another model by SB3's ``set_parameters``.
+
+        :raises RuntimeError: parameters of other networks, in one line.
+        """
+        try:
+            super().set_parameters(*arguments, **keywords)  # type: ignore[misc]
+        except RuntimeError as error:
+            raise RuntimeError(f"set_parameters: {one_line(error)}") from None
+
+    def _rescale(self, into: bool) -> None:
+        """Let actor and rollout count actions in half ranges from the middle, or as they are again.
+
+        :raises ConfigError: no limits to speak of, or an actor without a plain last layer.
+        """
+        half, middle = half_ranges(self.action_space, into)
+        if (half == 1.0).all() and not middle.any():
+            return
+        policy = self.policy
+        buffer = self.rollout_buffer
+        buffer.expert_actions = buffer.expert_actions * half + middle
+        if policy.squash_output:  # which gives half ranges already
+            return
+        buffer.actions = buffer.actions * half + middle
+        buffer.log_probs = buffer.log_probs - np.log(half).sum()
+        scale = th.as_tensor(half, device=policy.device)
+        unfit = f"action space {self.action_space}: wrap it in RescaleAction(env, -1, 1)"
+        with raised_as(ConfigError, unfit), th.no_grad():
+            policy.action_net.weight *= scale[:, None]
+            policy.action_net.bias.mul_(scale).add_(th.as_tensor(middle, device=policy.device))
+            policy.log_std += scale.log()
 
     def _note_flight_settings(self) -> None:
         settings = flight_settings_of(self.env)
         if settings is not None:
             settings.write_into(self)
+        # BaseAlgorithm has them by this name, which no zip holds.
+        setattr(self, STATISTICS, self._vec_normalize_env)
 
     def _threads(self) -> AbstractContextManager[None]:
         """Return the context to learn in: compiled code leaves PyTorch one thread."""
@@ -181,16 +281,31 @@ class ExpertMixin:
         return [*super()._excluded_save_params(), *own]  # type: ignore[misc]
 
 
+def half_ranges(space: spaces.Box, into: bool) -> tuple[Float32Array, Float32Array]:
+    """Return factors and offsets, (a,) each, that make actions of half ranges from the middle.
+
+    :param into: False: the other way round.
+    :raises ConfigError: limits so far apart that they are none.
+    """
+    low, high = limits_of(space)
+    half = 0.5 * high - 0.5 * low
+    middle = low + half
+    if not (half < _UNLIMITED).all():
+        raise ConfigError(f"action space {space}: give it the limits of the actuators")
+    half[half == 0.0] = 1.0  # an action that cannot change
+    if not into:
+        return half, middle
+    return 1.0 / half, -middle / half
+
+
 def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
-    """Return how the vehicles of an environment fly, also through wrappers that change rewards.
+    """Return how the vehicles of an environment fly, also through wrappers that change rewards, and
+    VecNormalize, whose statistics are in a model's zips.
 
     None: it is not of this package, or a wrapper changes observations or actions, so that an agent
     of this environment would fly otherwise without the wrapper.
     """
     if env is None or not env.has_attr(KEY):
-        return None
-    normalised = unwrap_vec_normalize(env)
-    if normalised is not None and normalised.norm_obs:
         return None
     for wrapper in (gymnasium.ObservationWrapper, gymnasium.ActionWrapper):
         if any(env.env_is_wrapped(wrapper)):

@@ -25,6 +25,8 @@ from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, 
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     actor_and_critic_parameters,
+    half_ranges,
+    in_half_ranges,
     model_of,
     policy_arguments,
 )
@@ -66,7 +68,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
     with Σw² over the weight matrices of both networks, without biases and log_std.
 
-    For any environment with a Box action space and observations that are not a Dict. Papers:
+    For any environment with a Box action space and observations that are not a Dict. Errors of
+    actions and log_std count in half ranges of that Box, from its middle. Papers:
     https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
 
     A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from
@@ -115,6 +118,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
         prepares them ("chronologically", 4.2.3)
+    :param demonstrations: a file of flights that the dataset begins with, as ``dataset.load`` takes
+        it. With ``beta=0`` no expert is needed: the agent clones these flights alone, and its own
+        flights train the critic
     :raises ConfigError: an argument out of range, or observations that are a Dict
     :raises ExpertError: an expert that does not fit the environment
     """
@@ -153,6 +159,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         l2_coef: float = 0.0,
         dataset_capacity: int = 500_000,
         shuffle: bool = True,
+        demonstrations: str | Path | None = None,
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -201,9 +208,17 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self._setup_model()
             if initial is not None:
                 transfer_policy(initial, self)
+            if demonstrations is not None:
+                self.dataset.load(demonstrations)
 
     def _setup_model(self) -> None:
-        if not 0.0 <= self.beta_final <= self.beta <= 1.0:
+        self._refuse_dict_observations()
+        # A zip of PPO names PPO's.
+        self.rollout_buffer_class = ExpertRolloutBuffer
+        super()._setup_model()
+        if self.beta == 0.0:
+            self.beta_final = 0.0
+        if not self.beta_final <= self.beta <= 1.0:
             raise ConfigError(
                 f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1"
             )
@@ -217,14 +232,14 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             )
         if self.gradient_steps is not None and self.gradient_steps < 1:
             raise ConfigError(f"gradient_steps {self.gradient_steps}: must be at least 1, or None")
-        self._refuse_dict_observations()
-        super()._setup_model()
         if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
             raise ConfigError(
                 f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy"
             )
+        self._rescale(False)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+        space: Any = self.action_space
         dtype = self.rollout_buffer.observations.dtype
         if np.issubdtype(dtype, np.floating):
             dtype = np.dtype(np.float32)
@@ -234,6 +249,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self.rollout_buffer.action_dim,
             dtype,
         )
+        self.dataset.action_range = space.low.ravel(), space.high.ravel()
 
     def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on.
@@ -243,6 +259,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if self.env is not None:
             self._labeller = Controller.for_env(expert, self.env, self._labeller)
         self.expert = expert
+
+    def will_clone(self) -> bool:
+        """Return whether learning asks the expert; else it clones the flights it was given."""
+        return self.expert is not None or self.beta > 0.0 or len(self.dataset) == 0
 
     @property
     def current_beta(self) -> float:
@@ -272,10 +292,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         """Train for ``total_timesteps``; all arguments are those of SB3's ``learn``.
 
         With ``reset_num_timesteps`` β begins again. The dataset stays until ``dataset.clear()``.
+        Without an expert, the agent clones the pairs that the dataset holds, if β is 0.
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """
-        self.set_expert(self.expert)
+        if self.will_clone():
+            self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
         with self._threads():
@@ -324,8 +346,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         for step in range(n_rollout_steps):
             # + Label the state before the step.
-            labels = self._labels(env)
-            buffer.expert_actions[step] = labels
+            if self.expert is not None:
+                buffer.expert_actions[step] = self._labels(env)
+            labels = buffer.expert_actions[step]
 
             # + The expert's action flies with probability β, else a sample of the agent's.
             observations: Any = self._last_obs
@@ -363,10 +386,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
         buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
-        # + Add the labels to the dataset.
-        if self.dataset_capacity == 0:
-            self.dataset.clear()
-        self.dataset.add(flown, buffer.expert_actions.reshape(len(flown), -1))
+        # + Add the labels to the dataset. Without an expert, it keeps the flights of a file.
+        if self.expert is not None:
+            if self.dataset_capacity == 0:
+                self.dataset.clear()
+            self.dataset.add(flown, buffer.expert_actions.reshape(len(flown), -1))
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
@@ -376,6 +400,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
+    @in_half_ranges
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
 
@@ -403,7 +428,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         )
         actor_parameters, critic_parameters = actor_and_critic_parameters(self.policy)
 
-        # + Rows of the dataset for the actor
+        # + Labels in half ranges, and rows of the dataset for the actor
+        half, middle = half_ranges(self.action_space, into=True)
+        labels = self.dataset.filled["actions"] * half + middle
         buffer = self.rollout_buffer
         rng = self._generator(1)
         n_rows = buffer.buffer_size * buffer.n_envs
@@ -417,12 +444,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         critic_batches = iter(np.array_split(critic_rows, n_critic))
         flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
         targets = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
-        max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         # The terms of each step, by name
         history: dict[str, list[float]] = {}
 
         for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
-            actor_batch = self.dataset.batch(rows)
+            actor_batch = self.dataset.batch(rows)._replace(targets=labels)
             critic_batch = None
             if (i + 1) * n_critic // n_batches > i * n_critic // n_batches:
                 critic_batch = Batch(next(critic_batches), flown, targets)
@@ -430,7 +456,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             if isinstance(network, Perceptrons):  # +
                 terms = network.gradients(compiled_loss, actor_batch, critic_batch)
             else:
-                observations, labels = actor_batch.tensors(self.device)
+                observations, experts = actor_batch.tensors(self.device)
                 try:
                     entropy: Any = self.policy.get_distribution(observations).entropy()
                 except ValueError as error:  # of a distribution whose mean is not finite
@@ -438,7 +464,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 # + The cloning term L_BC (Eq. 3.12)
                 mean = self.policy.action_dist.mode()
                 log_std = self.policy.log_std
-                errors = cloning_errors(self.bc_loss, mean, log_std, labels)
+                errors = cloning_errors(self.bc_loss, mean, log_std, experts)
                 losses = {"bc_loss": errors.mean()}
                 loss = losses["bc_loss"]
 
@@ -472,8 +498,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 for parameter in critic_parameters:
                     parameter.grad = None
             # Clip grad norm, + of actor and critic each by itself
-            norm = th.nn.utils.clip_grad_norm_(actor_parameters, max_grad_norm)
-            critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, max_grad_norm)
+            norm = th.nn.utils.clip_grad_norm_(actor_parameters, self.max_grad_norm)
+            critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, self.max_grad_norm)
             if not np.isfinite([*terms.values(), float(norm), float(critic_norm)]).all():  # +
                 self.policy.optimizer.zero_grad()
                 raise self._diverged(terms)

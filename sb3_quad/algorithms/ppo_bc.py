@@ -24,6 +24,7 @@ from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     actor_and_critic_parameters,
+    in_half_ranges,
     is_ever_nonzero,
     model_of,
     policy_arguments,
@@ -67,6 +68,8 @@ class PPOBC(ExpertMixin, PPO):
     either no ``clip_range_vf`` or ``max_clipped_value=False``) is PPO's, bit for bit. Any other is
     equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model
     loads with ``PPO.load``, even where this package is not installed.
+
+    Where it clones, errors of actions and log_std count in half ranges of the Box action space.
 
     :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
     :param policy_kwargs: unless it holds ``log_std_init``, that is -0.9. ``log_std_init=None``:
@@ -150,7 +153,7 @@ class PPOBC(ExpertMixin, PPO):
             learning_rate=learning_rate,
             n_steps=n_steps,
             # The default is known when the environments are. PPO warns where this is no divisor.
-            batch_size=max(n_steps, 2) if batch_size is None else batch_size,
+            batch_size=batch_size or max(n_steps, 2),
             n_epochs=n_epochs,
             gamma=gamma,
             gae_lambda=gae_lambda,
@@ -162,7 +165,7 @@ class PPOBC(ExpertMixin, PPO):
             max_grad_norm=max_grad_norm,
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class or ExpertRolloutBuffer,
+            rollout_buffer_class=rollout_buffer_class,
             rollout_buffer_kwargs=rollout_buffer_kwargs,
             target_kl=target_kl,
             stats_window_size=stats_window_size,
@@ -173,7 +176,7 @@ class PPOBC(ExpertMixin, PPO):
             device=device,
             _init_setup_model=False,
         )
-        self.batch_size = batch_size  # type: ignore[assignment]
+        self.batch_size = batch_size
         self.expert = expert
         self.bc_coef = bc_coef
         self.bc_loss: CloningLoss = bc_loss
@@ -196,7 +199,10 @@ class PPOBC(ExpertMixin, PPO):
         if self.bc_filter not in filters:
             raise ConfigError(unknown("bc_filter", self.bc_filter, filters))
         self._refuse_dict_observations()
-        if not issubclass(self.rollout_buffer_class or RolloutBuffer, ExpertRolloutBuffer):
+        # SB3's own, as a zip of PPO names it, is one without labels.
+        if self.rollout_buffer_class in (None, RolloutBuffer):
+            self.rollout_buffer_class = ExpertRolloutBuffer
+        if not issubclass(self.rollout_buffer_class, ExpertRolloutBuffer):
             raise ConfigError(
                 f"rollout_buffer_class {self.rollout_buffer_class}: must be an ExpertRolloutBuffer"
             )
@@ -210,7 +216,7 @@ class PPOBC(ExpertMixin, PPO):
                 "PPOBC clones into a Box action space only, this environment has"
                 f" {self.action_space}"
             )
-        self.bc_coef = FloatSchedule(self.bc_coef)
+        self._rescale(False)
         if self.expert is not None and self.will_clone():
             self._check_cloning()
 
@@ -232,14 +238,20 @@ class PPOBC(ExpertMixin, PPO):
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
         if bc_coef > 0.0:
             self._check_cloning()
-        self.bc_coef = FloatSchedule(bc_coef)
+        self.bc_coef = FloatSchedule(float(bc_coef))
 
     def will_clone(self) -> bool:
         """Return whether the schedule ever gives the cloning term a weight.
 
         A hundred samples of it are taken.
         """
-        return is_ever_nonzero(self.bc_coef)  # type: ignore[arg-type]
+        return is_ever_nonzero(self.bc_coef)
+
+    def _rescale(self, into: bool) -> None:
+        # Without a cloning term it is PPO, which counts actions as they are.
+        buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
+        if isinstance(self.action_space, spaces.Box) and (self.will_clone() or buffer.bc_coef):
+            super()._rescale(into)
 
     def _check_cloning(self) -> None:
         if self.expert is None:
@@ -290,7 +302,7 @@ class PPOBC(ExpertMixin, PPO):
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         progress = 1.0 - float(end) / float(self._total_timesteps)
-        buffer.bc_coef = float(self.bc_coef(progress))  # type: ignore[operator]
+        buffer.bc_coef = float(self.bc_coef(progress))
         if buffer.bc_coef == 0.0:
             # A recurrent expert that does not see this rollout begins again.
             self._labeller = None
@@ -313,6 +325,7 @@ class PPOBC(ExpertMixin, PPO):
         finally:
             del self.policy.forward
 
+    @in_half_ranges  # +
     def train(self) -> None:
         """Update the policy on the rollout just flown, by PPO's lines. Additions are marked ``+``.
 

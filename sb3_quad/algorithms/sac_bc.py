@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, polyak_update
+from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn import functional as F
@@ -174,13 +174,13 @@ class SACBC(ExpertMixin, SAC):
             raise ConfigError(unknown("bc_loss", self.bc_loss, kinds))
         if self.bc_filter not in BC_FILTERS:
             raise ConfigError(unknown("bc_filter", self.bc_filter, BC_FILTERS))
-        self.bc_coef = FloatSchedule(self.bc_coef)
-        self._clones = is_ever_nonzero(self.bc_coef)
         if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
             raise ConfigError(
                 f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
                 " observations; give 1"
             )
+        self._check_arguments()
+        self._clones = is_ever_nonzero(self.bc_coef)
         if self._clones and self.replay_buffer_class not in _STOCK_BUFFERS:
             raise ConfigError(
                 f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's"
@@ -278,7 +278,7 @@ class SACBC(ExpertMixin, SAC):
             optimizers += [self.ent_coef_optimizer]
         self._update_learning_rate(optimizers)
         # + Weight of the cloning term in this update
-        bc_coef = self.bc_coef(self._current_progress_remaining)  # type: ignore[operator]
+        bc_coef = self.bc_coef(self._current_progress_remaining)
         # The terms of each gradient step, by name
         history: dict[str, list[float]] = {}
 

@@ -14,6 +14,7 @@ from sb3_quad.algorithms.buffers import AggregatedDataset
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
 from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.statistics import share_statistics, statistics_of
 from sb3_quad.controllers.zips import load_model
 
 
@@ -26,6 +27,8 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
 
     ``log_std`` comes from ``source``, unless the model's settings give a ``log_std_init``: then
     that holds. The optimiser stays as it is, so a new model starts with a new one.
+
+    Statistics of VecNormalize go into the model's environment.
 
     :param source: a model, or the path of an SB3 zip, of any algorithm.
     :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ;
@@ -45,6 +48,12 @@ def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) ->
         except ExpertError as error:  # other spaces
             raise ConfigError(f"{name}: {error}") from None
         return
+    if teacher.action_space != model.action_space:
+        raise ConfigError(
+            f"{name}: its actions are of {teacher.action_space}, here they are of"
+            f" {model.action_space}"
+        )
+    share_statistics(statistics_of(teacher), model.get_env(), training=True)
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{name}: holds parameters that are not finite")
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:

@@ -96,7 +96,9 @@ def interrupts_leave() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        # A command has begun like this, see sb3_quad/__init__.py.
+        leaves = before is signal.SIG_DFL
+        signal.signal(signal.SIGINT, signal.default_int_handler if leaves else before)
 
 
 def ignore_interrupts() -> None:

@@ -70,9 +70,9 @@ def make_parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    # Lines appear at once, also in a pipe.
+    # Lines appear at once, also in a pipe. Letters that the console lacks become question marks.
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(line_buffering=True)
+        sys.stdout.reconfigure(line_buffering=True, errors="replace")
     try:
         options = _parse(arguments)
         if options is None:
@@ -118,7 +118,7 @@ def _parse(arguments: list[str]) -> Namespace | None:
     agent = getattr(options, "trained_agent", None)
     # SB3 adds the suffix, too.
     if agent and not (Path(agent).is_file() or Path(f"{agent}.zip").is_file()):
-        raise ConfigError(f"-i {agent}: no such file")
+        raise ConfigError(f"-i {agent}: no such file, and no folder of a run with an agent")
     return options
 
 

@@ -7,13 +7,16 @@ import shlex
 from collections.abc import Iterable
 from typing import Any
 
+from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrMapping
 from sb3_quad.cli.output import console
 from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.zips import saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.tables import Table
+from sb3_quad.simulation.settings import KEY
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
@@ -63,12 +66,24 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     return result.tables[0]
 
 
+def print_agent(job: TrainingJob, model: Any) -> None:
+    """Print :func:`agent_and_expert`, or why there is none: what was trained is there anyway."""
+    # Training writes this into all agents that fly without wrappers.
+    if not hasattr(model, KEY):
+        print("no table: its flights have no wrappers; the evaluations above have them")
+        return
+    try:
+        console().print(agent_and_expert(job, model))
+    except SB3QuadError as error:
+        print(f"no table: {error}")
+
+
 def close_run(result: TrainingResult) -> int:
     """Print the table of a single run's agent and where everything is. Returns the exit code."""
     if result.exit_code != 0:
         return result.exit_code
     if result.job.config.task:
-        console().print(agent_and_expert(result.job, result.model))
+        print_agent(result.job, result.model)
     # A complete run without evaluations does not know how long it took.
     if result.seconds:
         print(f"trained in {result.seconds:.1f} s")
@@ -88,13 +103,16 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     controllers = {"expert": result.job.for_evaluation().make_expert()}
     for name, stage in result.stages.items():
         controllers[name] = stage.agent
-    print_tables(
-        controllers,
-        result.job.flight_settings.in_any_task(),
-        PIPELINE_EPISODES,
-        seed_for("table", result.job.seed),
-        ("expert", "IL-agent", "RL-agent"),
-    )
+    try:
+        print_tables(
+            controllers,
+            result.job.flight_settings.in_any_task(),
+            PIPELINE_EPISODES,
+            seed_for("table", result.job.seed),
+            ("expert", "IL-agent", "RL-agent"),
+        )
+    except SB3QuadError as error:
+        print(f"no tables: {error}")
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print(f"saved in {result.folder}, {seconds:.0f} s in all")
@@ -106,9 +124,11 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
 def _print_next(run: RunFolder) -> None:
     """Print the commands that show, measure and export the agent of a run.
 
-    Environments of other packages have no such commands.
+    Environments of other packages have no such commands, nor agents behind wrappers.
     """
     if run.name not in ENVIRONMENTS:
+        return
+    if KEY not in saved_data(run.result):
         return
     # An agent of many vehicles has none that export could take by itself.
     settings, _ = agent_settings(run.result)

@@ -9,7 +9,7 @@ from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.zips import saved_data
+from sb3_quad.controllers.zips import refuse_settings, saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import Task
@@ -25,7 +25,7 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
     are ``FlightSettings()`` and the file is None.
 
     :raises ConfigError: a zip or settings that cannot be read or do not fit; settings of several
-        runs next to the zip; or statistics of VecNormalize, which a zip does not hold.
+        runs next to the zip; or of a run with wrappers, which flights here do not have.
     """
     # Zips of this package say it themselves.
     data = saved_data(zip_file)
@@ -34,10 +34,6 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
 
     # Other zips, such as those of rl_zoo3, lie in a run folder.
     folder = Path(zip_file).parent
-    for statistics in sorted(folder.glob("*/vecnormalize.pkl")):
-        raise ConfigError(
-            f"{zip_file}: was trained with VecNormalize ({statistics}), which the zip does not hold"
-        )
     configs = sorted(folder.glob("*/config.yml"))
     if not configs:
         return FlightSettings(), None
@@ -45,6 +41,7 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
         raise ConfigError(
             f"{zip_file}: several config.yml files lie next to it ({', '.join(map(str, configs))})"
         )
+    refuse_settings(zip_file)
     return _settings_of_run(configs[0]), configs[0]
 
 

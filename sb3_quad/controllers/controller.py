@@ -5,12 +5,15 @@ from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, StrDict
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.controllers.statistics import statistics_of
+from sb3_quad.simulation.settings import KEY
 from sb3_quad.simulation.state import QuadcopterState
 
 
@@ -25,10 +28,11 @@ class Controller:
        true state.
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
-    2 and 3 get the observations that a policy sees. ``predict`` may return a state together with
-    the actions, as SB3's recurrent policies do. The next call passes it back as ``state``, with
-    ``episode_start`` (n,): the rows that have just begun an episode. All rows of a new Controller
-    begin one.
+    2 and 3 get the observations that a policy sees. An SB3 model that was trained behind
+    ``VecNormalize`` gets raw ones, normalised by its own statistics. ``predict`` may return a state
+    together with the actions, as SB3's recurrent policies do. The next call passes it back as
+    ``state``, with ``episode_start`` (n,): the rows that have just begun an episode. All rows of a
+    new Controller begin one.
 
     :param source: the controller, as above.
     :param action_space: the environment's action space, a Box.
@@ -36,9 +40,14 @@ class Controller:
     :param true_state: returns the current true state; None: not available.
     :param kind: what messages call the controller. With ``"expert"``, errors are ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
+    :param env: the environment that an expert labels. It may have an action wrapper that is linear,
+        such as ``RescaleAction``; :meth:`labels` then go through its inverse.
     :raises ControllerError: the source is of no kind above, or its spaces do not fit (of an expert:
         ``ExpertError``).
     """
+
+    # A VecNormalize whose raw observations the source sees instead of those that it is asked about.
+    _raw: Any = None
 
     def __init__(
         self,
@@ -48,6 +57,7 @@ class Controller:
         true_state: Callable[[], QuadcopterState] | None = None,
         kind: str = "controller",
         deterministic: bool = True,
+        env: VecEnv | None = None,
     ) -> None:
         self.source = source
         # The ``expert=`` argument and the environment that :meth:`for_env` compares.
@@ -55,6 +65,7 @@ class Controller:
         self._deterministic = deterministic
         self._true_state = true_state if hasattr(source, "actions") else None
         self._predict_state: Any = None
+        self._statistics = statistics_of(source)
         self._error: type[SB3QuadError] = ExpertError if kind == "expert" else ControllerError
         name = getattr(source, "__name__", type(source).__name__)
         self._who = f"{kind} {name}"
@@ -84,8 +95,20 @@ class Controller:
 
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
-        self._low = action_space.low.ravel().astype(np.float32)
-        self._high = action_space.high.ravel().astype(np.float32)
+        self._limits = limits_of(action_space)
+        # The source may speak of other limits: a model of those that it has learnt with, an expert
+        # of the true state of those that a quadcopter has under all wrappers.
+        own = getattr(source, "action_space", None)
+        if self._true_state is not None and env is not None and env.has_attr(KEY):
+            own = spaces.Box(-1.0, 1.0, action_space.shape)
+        self._own_limits: Float32Array | None = None
+        if isinstance(own, spaces.Box) and not np.allclose(limits_of(own), self._limits):
+            self._own_limits = limits_of(own)
+            if not np.allclose(_limits_below(env, action_space), self._own_limits):
+                raise self._error(
+                    f"{self._who}: its actions are of {own}, the environment's of {action_space};"
+                    " no wrapper such as RescaleAction leads straight from these to those"
+                )
 
     @staticmethod
     def for_env(
@@ -93,7 +116,8 @@ class Controller:
     ) -> "Controller":
         """Return the controller that labels the states of a vector environment.
 
-        With ``VecNormalize`` the expert sees normalised observations.
+        With ``VecNormalize`` an SB3 model sees the raw observations, which it normalises as in its
+        own training. Other experts see the normalised ones.
 
         :param expert: the expert. A name is resolved for the vehicle of row 0.
         :param present: the controller so far. It is returned, with its state, if it was made for
@@ -105,7 +129,8 @@ class Controller:
         if expert is None:
             raise ExpertError(
                 "no expert: give expert=... when building or loading the model, "
-                "or call set_expert(expert)"
+                "or call set_expert(expert); with beta=0, DAgger can clone the flights that its "
+                "dataset holds"
             )
         # A recurrent expert keeps its state as long as it labels the same environment.
         if present and present.made_for[0] is expert and present.made_for[1] is env:
@@ -113,7 +138,9 @@ class Controller:
         vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
         source = resolve_expert(expert, vehicle)
         env_spaces = (env.action_space, env.observation_space)
-        controller = Controller(source, *env_spaces, true_state_of(env), kind="expert")
+        controller = Controller(source, *env_spaces, true_state_of(env), kind="expert", env=env)
+        if isinstance(source, BaseAlgorithm):
+            controller._raw = unwrap_vec_normalize(env)
         controller.made_for = (expert, env)
         return controller
 
@@ -147,7 +174,7 @@ class Controller:
         if isinstance(observation, dict):
             batch = next(iter(observation.values()))
         shape = (len(batch), *self._action_shape)
-        flat_shape = (len(batch), len(self._low))
+        flat_shape = (len(batch), self._limits.shape[1])
         if raw.shape not in (shape, flat_shape):
             raise self._error(f"{self._who}: gives actions of shape {raw.shape}, must be {shape}")
         actions = raw.reshape(flat_shape).astype(np.float32)
@@ -165,14 +192,25 @@ class Controller:
         return actions
 
     def labels(self, observation: Any, episode_start: BoolArray | None = None) -> Float32Array:
-        """Return :meth:`actions` clipped to the action space: the labels that an agent imitates."""
+        """Return the labels that an agent imitates.
+
+        They are :meth:`actions`, as the environment's wrapper takes them, within the action space.
+        """
         actions = self.actions(observation, episode_start=episode_start)
-        return actions.clip(self._low, self._high)
+        low, high = self._limits
+        if self._own_limits is not None:
+            least, most = self._own_limits
+            actions = low + (actions - least) * ((high - low) / (most - least))
+        return actions.clip(low, high)
 
     def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
         """Return the controller's own answer, unchecked."""
         if self._true_state is not None:
             return self.source.actions(self._true_state())
+        if self._raw is not None:
+            observation = self._raw.get_original_obs()
+        if self._statistics is not None:
+            observation = self._statistics.normalize_obs(observation)
         if not hasattr(self.source, "predict"):
             return self.source(observation)
         # Without a state yet, the policy begins by itself. Many policies take no such keywords.
@@ -185,6 +223,19 @@ class Controller:
             observation, deterministic=self._deterministic, **keywords
         )
         return actions
+
+
+def limits_of(space: spaces.Box) -> Float32Array:
+    """Return the lower and the upper limits of actions, (2, action_dim)."""
+    return np.stack([space.low.ravel(), space.high.ravel()]).astype(np.float32)
+
+
+def _limits_below(env: VecEnv | None, space: spaces.Box) -> Any:
+    """Return what the outermost action wrapper makes of the limits of its actions."""
+    if env is None or not env.has_attr("action"):
+        return limits_of(space)
+    made = [env.env_method("action", limit, indices=[0])[0] for limit in (space.low, space.high)]
+    return np.reshape(made, (2, -1))
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:

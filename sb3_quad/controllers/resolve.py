@@ -8,7 +8,7 @@ from sb3_quad.base.errors import ConfigError, ExpertError, raised_as, unknown
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrPath
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
-from sb3_quad.controllers.zips import load_model
+from sb3_quad.controllers.zips import load_model, refuse_settings
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 # Experts by name, and their factories, which are imported when they are asked for.
@@ -17,7 +17,6 @@ EXPERTS = {
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
     "privileged_geometric": "sb3_quad.experts.geometric:privileged_geometric",
     "privileged_derived": "sb3_quad.experts.geometric:privileged_derived",
-    "privileged_cautious": "sb3_quad.experts.geometric:privileged_cautious",
 }
 DEFAULT_EXPERT = "pid"
 """The expert that is imitated by default, the thesis's."""
@@ -48,6 +47,7 @@ def resolve_expert(
     # A policy of the package and a run folder stand for a zip.
     path = agent_path(text)
     if path.endswith(".zip"):
+        refuse_settings(path)
         return load_model(path)
     factory = import_factory(text, kind)
     with raised_as(ExpertError, f"{kind} {text}: the factory failed"):
@@ -62,6 +62,8 @@ def import_factory(text: str, kind: str = "expert") -> Any:
     """
     location = EXPERTS.get(text, text)
     if ":" not in location:
+        if Path(text).is_dir():
+            raise ConfigError(f"{kind} {text}: no run with an agent in this folder")
         valid = [*EXPERTS, *pretrained_names()]
         raise ConfigError(
             unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory"

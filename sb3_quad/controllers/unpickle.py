@@ -25,7 +25,7 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.process import TRUST_VARIABLE
+from sb3_quad.base.process import TRUST_VARIABLE, trusted
 from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict
 
@@ -36,7 +36,9 @@ _STEPS = 1_500_000
 
 
 def unpickle(content: str | bytes, where: str) -> Any:
-    """Return the object that an entry of an SB3 zip holds. Tensors in it become None.
+    """Return the object that an entry of an SB3 zip holds. :func:`trusted` files may hold any.
+
+    Tensors become None.
 
     :param content: a pickle, or its text in base64, as SB3 writes it.
     :param where: what messages call the entry.
@@ -46,6 +48,8 @@ def unpickle(content: str | bytes, where: str) -> Any:
     try:
         if isinstance(content, str):
             content = base64.b64decode(content)
+        if trusted():
+            return pickle.loads(content)
         steps = _Steps(content)
         # Those of SB3 need up to two for each byte.
         steps.left = min(_STEPS, 10_000 + 5 * len(content))
@@ -144,9 +148,11 @@ _WITH_ATTRIBUTES = _by_name(
     stable_baselines3.common.noise.NormalActionNoise
     stable_baselines3.common.noise.OrnsteinUhlenbeckActionNoise
     stable_baselines3.common.noise.VectorizedActionNoise
+    stable_baselines3.common.running_mean_std.RunningMeanStd
     stable_baselines3.common.utils.ConstantSchedule
     stable_baselines3.common.utils.FloatSchedule
     stable_baselines3.common.utils.LinearSchedule
+    stable_baselines3.common.vec_env.vec_normalize.VecNormalize
     """
 )
 # The others of these are only named, but for TrainFreq, a named tuple.

@@ -4,18 +4,23 @@ import io
 import json
 import warnings
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.process import trusted
 from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.yaml_files import read_yaml
+from sb3_quad.controllers.statistics import STATISTICS
 from sb3_quad.controllers.unpickle import WAY_OUT, held, unpickle
+from sb3_quad.simulation.settings import KEY
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
@@ -34,12 +39,15 @@ _OURS = {
     "APG": ("PPO", "carry_on"),
 }
 # Of the pickles of an agent, ``predict`` needs only these.
-_TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")
+_TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs", STATISTICS)
+# So are numbers of NumPy, whose types SB3 writes so.
+_NUMBERS = ("<class 'numpy.int", "<class 'numpy.float")
 # The others become None, or these values where SB3 cannot load None.
-_STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "target_entropy": 0.0, "train_freq": 1}
+_STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}
 # SB3 and this package never save these, and loading them would import what they name.
 _NEVER_READ = ("env", "expert", "_labeller")
 DAMAGED = "not a complete SB3 zip"
+WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 # What SB3 saves apart from policies and optimisers. Loading another one would set any attribute.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 _VARIABLE_FILES = ("pytorch_variables.pth", "tensors.pth")
@@ -134,7 +142,8 @@ def load_zip(
         if key in _NEVER_READ:
             objects[key] = None
         elif isinstance(entry, dict) and ":serialized:" in entry:
-            if to_fly and key not in _TO_FLY:
+            is_number = str(entry.get(":type:")).startswith(_NUMBERS)
+            if to_fly and key not in _TO_FLY and not is_number:
                 objects[key] = _STAND_INS.get(key)
             else:
                 objects[key] = unpickle(entry[":serialized:"], f"{where}: its {key}")
@@ -168,7 +177,7 @@ def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> No
                 f"{where}: holds variables that no algorithm has; "
                 f"known are {', '.join(sorted(_VARIABLES))}"
             )
-    walk([data[key] for key in _TO_FLY], held, _LARGEST)
+    walk([data.get(key) for key in _TO_FLY], held, _LARGEST)
     given = data["policy_kwargs"]
     keywords = {key: given[key] for key in given if key not in _WITHOUT_SIZE}
     if keywords.get("n_critics", 2) > 100:
@@ -187,7 +196,8 @@ def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> No
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     """Return the model in an SB3 ``.zip``, ready for ``predict``.
 
-    It may be of PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, or of this package.
+    It may be of PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, or of this package. Its
+    ``vec_normalize`` are the statistics of VecNormalize that it was trained with, if any.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown
         family, parameters that are not finite, or a file that may run code of its own.
@@ -203,4 +213,42 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
             raise ConfigError(
                 f"model {path}: {parameter} contains NaN or infinity; the model is unusable"
             )
+    # A zip of this package holds all that its agent needs.
+    if not {KEY, STATISTICS} & vars(model).keys():
+        setattr(model, STATISTICS, _statistics_beside(path))
     return model
+
+
+def _statistics_beside(path: StrPath) -> VecNormalize | None:
+    """Return what is in the ``vecnormalize.pkl`` that rl_zoo3 keeps in a folder next to a zip.
+
+    None: the agent was trained without.
+
+    :raises ConfigError: a file that cannot be read, or none where the run had statistics.
+    """
+    for file in Path(path).parent.glob("*/vecnormalize.pkl"):
+        statistics = unpickle(file.read_bytes(), str(file))
+        if not isinstance(statistics, VecNormalize):
+            raise ConfigError(f"{file}: holds no VecNormalize")
+        return statistics
+    refuse_settings(path, ("normalize",))
+    return None
+
+
+def refuse_settings(path: StrPath, keys: Sequence[str] = WRAPPERS) -> None:
+    """Check that an agent was trained without some settings, by the run in whose folder it lies.
+
+    A zip of this package that says how its agent flies was.
+
+    :param keys: of settings files, of this package and of rl_zoo3.
+    :raises ConfigError: it was trained with one of them.
+    """
+    if KEY in saved_data(path):
+        return
+    for config in Path(path).parent.glob("*/config.yml"):
+        settings = read_yaml(config)
+        used = ", ".join(filter(settings.get, keys))
+        if used:
+            raise ConfigError(
+                f"{path}: was trained with {used} (see {config}), without which it flies otherwise"
+            )

@@ -4,7 +4,6 @@ folder of its own.
 
 import hashlib
 import importlib
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -330,7 +329,11 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
         # Start from scratch: all numbers in a folder are those of one command.
         for name in WRITTEN:
             (folder / name).unlink(missing_ok=True)
-        shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
+        # Those of the results alone; a reader may keep files of their own beside them.
+        made = [folder / entry.flights for entry in before.entries]
+        for file in (folder / FLIGHTS).glob("*/*.npz"):
+            if file in made:
+                file.unlink()
         return []
     kept = {job.name for job in jobs if job.repeats}
     must_repeat = before.finished and len(kept) < len(jobs)

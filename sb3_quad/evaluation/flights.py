@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, unknown
+from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict, StrPath
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
@@ -144,6 +145,7 @@ def fly(
     tolerances: Sequence[float] = TOLERANCES,
     hooks: Sequence[Hook] = (),
     reward: Reward | None = None,
+    record: StrPath | None = None,
     **environment: Any,
 ) -> Flights:
     """Fly ``n_flights`` episodes.
@@ -165,6 +167,8 @@ def fly(
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
         control step and the actions (n, 4); its sums are ``Flights.own_reward``. A class is
         instantiated for these episodes and may remember.
+    :param record: an ``.npz`` file for the observations and actions of all control steps, which
+        ``DAgger(demonstrations=...)`` and ``dataset.load`` take; an existing one is replaced.
     :raises ConfigError: an unknown backend or keyword, or fewer than one episode.
     :raises ControllerError: a controller of another kind, or a controller or reward that fails in
         flight.
@@ -178,7 +182,9 @@ def fly(
         task=task, vehicle=vehicle, noise=noise, max_episode_steps=max_steps, **environment
     )
     seeds = row_seeds(seed, n_flights)
-    return fly_settings(controller, settings, seeds, backend, tolerances, hooks, reward=reward)
+    return fly_settings(
+        controller, settings, seeds, backend, tolerances, hooks, reward=reward, record=record
+    )
 
 
 def fly_settings(
@@ -191,6 +197,7 @@ def fly_settings(
     plan: Plan | None = None,
     deterministic: bool = True,
     reward: Reward | None = None,
+    record: StrPath | None = None,
 ) -> Flights:
     """Fly the first episode of each seed, as :func:`fly` does, by one record of settings.
 
@@ -208,7 +215,7 @@ def fly_settings(
             # A reward that remembers, such as the last actions, begins afresh with these episodes.
             reward = reward()
         steps = settings.longest_episode
-        return _fly_fleet(fleet, pilot, plan or Plan(), steps, tolerances, hooks, reward)
+        return _fly_fleet(fleet, pilot, plan or Plan(), steps, tolerances, hooks, reward, record)
 
 
 # It is long because a split would hand over a dozen arrays that each step changes.
@@ -220,6 +227,7 @@ def _fly_fleet(
     tolerances: Sequence[float],
     hooks: Sequence[Hook],
     reward: Reward | None,
+    record: StrPath | None,
 ) -> Flights:
     vehicle = fleet.vehicle_list[0]
     observation = fleet.begin(plan.start)
@@ -240,6 +248,8 @@ def _fly_fleet(
     path_length = np.zeros(fleet.n)
     total = np.zeros(fleet.n)
     own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
+    observed = []  # for ``record``, as is ``acted``
+    acted = []
     for hook in hooks:
         hook.on_start(state, vehicle)
 
@@ -255,6 +265,10 @@ def _fly_fleet(
             raise ControllerError(f"{error}, after {before:.2f} s") from error
         for hook in hooks:
             hook.before_step(state, observation, fleet.total_wrench().T, flying)
+        if record is not None:
+            observed.append(observation[flying])
+            # The environment clips them, too.
+            acted.append(actions[flying].clip(-1.0, 1.0))
         observation, rewards, _ = fleet.step(actions)
         state = fleet.true_state()
 
@@ -284,6 +298,8 @@ def _fly_fleet(
                 fleet.state[TARGET, onward] = course.targets(onward).T
                 observation = fleet.observe()
 
+    if record is not None:
+        write_arrays(record, observations=np.concatenate(observed), actions=np.concatenate(acted))
     # A flight that was lost, or that did not get to its last target, has no success and no time
     # after which it stays there.
     settling_time = np.where(flying, arrivals.settling_time, np.nan)

@@ -5,7 +5,6 @@ It recovers from nearly every attitude, spin and fall, and flies to targets.
 
 import numpy as np
 
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray
 from sb3_quad.experts.geometric_gains import TrueConstants, constants_of, derived_gains
 from sb3_quad.experts.geometric_law import fly_geometric
@@ -17,23 +16,12 @@ from sb3_quad.simulation.state import (
     QuadcopterState,
     drag_forces,
 )
-from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
+from sb3_quad.vehicles.gains import GeometricGains
 from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 # Half of the drag by the vehicle's own motion stays uncompensated, because it damps.
 _DRAG_LEFT = 0.5
-# Where commands act late, ``privileged_derived`` slows the outer loop and makes the inner one
-# faster, by these factors of its gains.
-_LATE = {
-    "position": 0.85,
-    "velocity": 0.85,
-    "height_position": 0.85,
-    "height_velocity": 0.85,
-    "attitude": 0.85,
-    "descent": 0.5,
-    "body_rates": 1.25,
-}
 
 
 class GeometricExpert(Expert):
@@ -57,11 +45,6 @@ class GeometricExpert(Expert):
     :param privileged: whether it uses each vehicle's true parameters and compensates the external
         wrench, if the state holds them (``state.vehicles``, ``state.wrench``). Its gains then scale
         with the vehicle as :func:`derived_gains` do.
-    :param reserve: thrust, in weights, that it keeps back when it plans to brake a descent.
-    :param late: factors of gains by name. They act the more, the later the commands do: not up to
-        a command lag of 0.085 s, fully from 0.125 s on.
-    :raises ConfigError: a negative reserve, an unknown gain in ``late``, or either of them without
-        ``privileged``.
     """
 
     def __init__(
@@ -69,18 +52,8 @@ class GeometricExpert(Expert):
         vehicle: VehicleSource = "itm",
         gains: GeometricGains | None = None,
         privileged: bool = False,
-        reserve: float = 0.0,
-        late: dict[str, float] | None = None,
     ) -> None:
         super().__init__(vehicle)
-        late = late or {}
-        is_valid = privileged and reserve >= 0.0 and late.keys() <= set(GAIN_NAMES)
-        if (reserve or late) and not is_valid:
-            raise ConfigError(
-                f"reserve {reserve:g}, late {', '.join(late)}: they need privileged=True, "
-                f"a reserve of at least 0, and names among {', '.join(GAIN_NAMES)}"
-            )
-        self.reserve = reserve
         self.gains = gains or self.vehicle.geometric_gains or derived_gains(self.vehicle)
         # The law's constants for the vehicle as designed, and if they are known, for the true ones.
         self._nominal = constants_of(
@@ -88,7 +61,7 @@ class GeometricExpert(Expert):
             self.vehicle.control_step,
             self.gains.values()[:, None],
         )
-        self._true = TrueConstants(self.vehicle, self.gains, late) if privileged else None
+        self._true = TrueConstants(self.vehicle, self.gains) if privileged else None
 
     def actions(self, state: QuadcopterState) -> Actions:
         """Return actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
@@ -100,7 +73,7 @@ class GeometricExpert(Expert):
             if state.wrench is not None:
                 wrench = self._to_compensate(state, state.wrench)
         actions = np.empty((state.n, 4), dtype=np.float32)
-        fly_geometric(state.array, constants, wrench, self.reserve, actions)
+        fly_geometric(state.array, constants, wrench, actions)
         return actions
 
     @staticmethod
@@ -127,15 +100,6 @@ def privileged_derived(vehicle: VehicleSource = "itm") -> GeometricExpert:
     loop is slower and its inner one faster: agents that learn from it can cope with slow motors.
     """
     gains = derived_gains(load_vehicle(vehicle))
-    return GeometricExpert(vehicle, gains, privileged=True, late=_LATE)
-
-
-def privileged_cautious(vehicle: VehicleSource = "itm") -> GeometricExpert:
-    """Return a privileged expert with gentler descents and tilts.
-
-    It has 0.7 of the gains ``descent`` and ``tilt``, and 0.05 weights of thrust in reserve. It
-    teaches agents that must find out what their rotors lift before they fall too fast to stop.
-    """
-    gains = GeometricExpert(vehicle).gains
-    gentle = gains.model_copy(update={"descent": 0.7 * gains.descent, "tilt": 0.7 * gains.tilt})
-    return GeometricExpert(vehicle, gentle, privileged=True, reserve=0.05)
+    expert = GeometricExpert(vehicle, gains, privileged=True)
+    expert._true = TrueConstants(expert.vehicle, gains, is_gentle=True)
+    return expert

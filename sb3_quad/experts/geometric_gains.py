@@ -1,6 +1,5 @@
 """The constants of the geometric expert's law: gains, and what follows from a vehicle."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,18 @@ G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 # The yaw gain is this many times larger where the external torque is known. An error in the moment
 # that compensates it then makes a smaller yaw rate.
 PRIVILEGED_YAW = 4.0
-# Command lags, s, from which on the factors of ``late`` begin to act and act fully.
+# Where commands act late, ``privileged_derived`` slows the outer loop and makes the inner one
+# faster, by these factors of its gains.
+_LATE = {
+    "position": 0.85,
+    "velocity": 0.85,
+    "height_position": 0.85,
+    "height_velocity": 0.85,
+    "attitude": 0.85,
+    "descent": 0.5,
+    "body_rates": 1.25,
+}
+# Command lags, s, from which on they begin to act and act fully.
 _LATE_FROM = 0.085
 _LATE_TO = 0.125
 
@@ -118,15 +128,15 @@ class TrueConstants:
 
     :param vehicle: the vehicle that ``gains`` are for. Those of the others scale with their control
         authority, as :func:`derived_gains` do.
-    :param late: factors of gains by name, the more effective the later commands act.
+    :param is_gentle: whether the gains change where commands act late.
     """
 
-    def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: Mapping[str, float]) -> None:
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains, is_gentle: bool = False) -> None:
         self._control_step = vehicle.control_step
         own = vehicle.parameters()[:, None]
         self._scale = gains.values()[:, None] / gains_by_authority(own, self._control_step)
         self._scale[G.yaw_rate] *= PRIVILEGED_YAW
-        self._late = np.array([[late.get(name, 1.0)] for name in GAIN_NAMES])
+        self._is_gentle = is_gentle
         self._kept = self._compute(own)
 
     def of(self, vehicles: FloatArray) -> LawConstants:
@@ -142,8 +152,10 @@ class TrueConstants:
         return self._kept
 
     def _compute(self, v: FloatArray) -> LawConstants:
-        lag = command_lag(v, self._control_step)
-        lateness = np.clip((lag - _LATE_FROM) / (_LATE_TO - _LATE_FROM), 0.0, 1.0)
         gains = self._scale * gains_by_authority(v, self._control_step)
-        gains *= 1.0 + (self._late - 1.0) * lateness
+        if self._is_gentle:
+            lag = command_lag(v, self._control_step)
+            lateness = np.clip((lag - _LATE_FROM) / (_LATE_TO - _LATE_FROM), 0.0, 1.0)
+            factors = np.array([[_LATE.get(name, 1.0)] for name in GAIN_NAMES])
+            gains *= 1.0 + (factors - 1.0) * lateness
         return constants_of(v, self._control_step, gains)

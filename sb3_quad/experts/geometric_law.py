@@ -24,13 +24,12 @@ from sb3_quad.simulation.state import P, W, X
 
 
 @compiled
-def fly_geometric(state, constants, wrench, reserve, actions):
+def fly_geometric(state, constants, wrench, actions):
     """Write the actions of n vehicles, (n, 4).
 
     :param state: (STATE_SIZE, n).
     :param constants: ``LawConstants`` with n columns, or one for all vehicles.
     :param wrench: the external wrench to compensate, (WRENCH_SIZE, n) or (WRENCH_SIZE, 1).
-    :param reserve: thrust kept back for braking a descent, in weights.
     """
     # Each vehicle's gains are copied, so that they lie side by side. One column stands for all.
     gains = np.empty(constants.gains.shape[0])
@@ -60,7 +59,6 @@ def fly_geometric(state, constants, wrench, reserve, actions):
             divided(force, mass),
             gains,
             g,
-            reserve * g,
         )
         size = math.sqrt(dot(f, f))
         b = divided(rotated(rotation_inverse, f), size)
@@ -82,13 +80,12 @@ def fly_geometric(state, constants, wrench, reserve, actions):
 
 
 @compiled
-def desired_force(e, v, a, gains, g, reserve):
+def desired_force(e, v, a, gains, g):
     """Return the desired force of the rotors per mass, world frame, m/s².
 
     :param e: vector to the target, m.
     :param v: velocity, m/s.
     :param a: acceleration by the external force, m/s².
-    :param reserve: deceleration kept back for braking a descent, m/s².
     """
     ex, ey, ez = e
     vx, vy, vz = v
@@ -103,7 +100,7 @@ def desired_force(e, v, a, gains, g, reserve):
     if ez > 0.0:
         height_brake = left_to_brake(gains[G.height_deceleration], az)
     else:
-        height_brake = left_to_brake(gains[G.descent_deceleration], reserve - az)
+        height_brake = left_to_brake(gains[G.descent_deceleration], -az)
 
     # Both components brake at once, so the path is a straight line.
     way = math.sqrt((distance / brake) ** 2 + (ez / height_brake) ** 2)

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_quad.base.errors import ExportError
+from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.types import FloatArray, StrDict
+from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import (
@@ -37,13 +38,16 @@ class Reference:
 
     :ivar vehicle: in the layout that the policy knows.
     :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise.
+    :ivar clip: VecNormalize's bound of the scaled features, whose statistics are in μ and σ; 0:
+        none.
     :ivar observation: the frames that the policy sees.
     :ivar turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
 
     :param settings: how the policy flies.
     :param vehicle: that it flies; its layout may be another.
     :param output: ``thrusts`` (N) or ``speeds`` (rad/s).
-    :raises ConfigError: settings that the environment refuses, a layout that does not fit.
+    :raises ConfigError: settings that the environment refuses, a layout that does not fit;
+        statistics of more than the present features.
     """
 
     def __init__(
@@ -63,6 +67,14 @@ class Reference:
         self.mean = row.mean[:, 0]
         self.std = row.std[:, 0]
         self.observation = row.observation
+        self.clip = 0.0
+        statistics = statistics_of(model)
+        if statistics is not None:
+            if self.observation.is_extended:
+                raise ConfigError("VecNormalize with more than the present features has no export")
+            self.clip = statistics.clip_obs
+            self.mean = self.mean + self.std * statistics.obs_rms.mean
+            self.std = self.std * np.sqrt(statistics.obs_rms.var + statistics.epsilon)
         self.turn = find_turn(vehicle, layout)
 
     @property
@@ -141,6 +153,8 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
                 norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
                 compared &= np.abs(norm / limit - 1.0) > ROUNDING
         results, file_state = call(features @ turned, file_state)
+        if reference.clip:
+            observation = observation.clip(-reference.clip, reference.clip)
         actions, _ = reference.model.predict(observation, deterministic=True)
         difference = np.abs(results[:, reference.turn.order] - reference.results(actions))
         error = float(np.max(difference[compared], initial=error))  # NaN stays

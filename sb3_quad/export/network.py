@@ -31,7 +31,8 @@ class Network(th.nn.Module):
     """A deterministic policy from features in physical units to the four rotors, all of it float32,
     on the CPU.
 
-    ``a = clip(layers((features - mean) * inverse_std), -1, 1)``, then ``q = middle + half_range *
+    ``a = clip(layers((features - mean) * inverse_std), -1, 1)``, where statistics of VecNormalize
+    bound what the layers get by ``clip``, then ``q = middle + half_range *
     a`` (Eq. 3.18): thrusts, N. For speeds, middle and half_range are divided by kF, and the result
     is the root of q, rad/s (Eq. 2.4).
 
@@ -56,6 +57,7 @@ class Network(th.nn.Module):
         vehicle = reference.vehicle
         observation = reference.observation
         self.observation = observation
+        self.clip = float(reference.clip)
         self.output = reference.output
         self.result, self.unit = OUTPUTS[self.output]
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
@@ -91,6 +93,8 @@ class Network(th.nn.Module):
         state also the next one.
         """
         frame = (observation - self.mean) * self.inverse_std
+        if self.clip:
+            frame = frame.clamp(-self.clip, self.clip)
         if state is None:
             return self.command(self.layers(frame).clamp(-1.0, 1.0))
         following = []

@@ -117,16 +117,18 @@ def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = Non
     return Setting(settings.vehicle, settings, lambda seed: Plan(start))
 
 
-def scenario_setting(text: str, own: Any = None) -> Setting:
+def scenario_setting(text: str, own: Any = None, vehicle: str | None = None) -> Setting:
     """Episodes of a scenario, named by ``suite:name``.
 
     :param own: the vehicle of an agent, for a scenario that names none.
+    :param vehicle: one that flies instead of both.
     :raises ConfigError: an unknown suite or name.
     """
     suite, colon, name = text.rpartition(":")
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
-    scenario = load_suite(suite).scenario(name).flown_by(own)
+    changed = load_suite(suite).with_changes(vehicle=vehicle)
+    scenario = changed.scenario(name).flown_by(own)
     return Setting(
         scenario.nominal_vehicle(), scenario.flown_as, lambda seed: sample_plan(scenario, [seed])
     )

@@ -16,13 +16,14 @@ from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.types import Report
+from sb3_quad.controllers.statistics import STATISTICS, share_statistics
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import Progress, fly_scenario
 from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.sweep.folder import Numbers, RunResult, Sweep, read_results, write_result
 from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import Evaluation, SweepSpec
@@ -158,8 +159,8 @@ def _fly(
     model = load_model(agent)
     episodes = evaluation.episodes or EPISODES
     seed = seed_for("table", evaluation.seed or 0)
-    if job.config.task is None:
-        # An environment of others has rewards, and no scenarios.
+    if job.config.task is None or not hasattr(model, KEY):
+        # An environment of others has rewards, and no scenarios; so it is behind wrappers.
         if suite is not None:
             raise ConfigError(
                 "evaluation: suites are for this package's environments, "
@@ -167,6 +168,7 @@ def _fly(
             )
         config = job.for_evaluation()
         with closing(make_environments(config, 1, seed)) as env:
+            share_statistics(getattr(model, STATISTICS, None), env)
             rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
         return {config.env_id: {"reward": tuple(np.ravel(rewards).tolist())}}
     flights = {}

@@ -131,6 +131,7 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     for stage, planned in zip(pipeline.stages, stage_jobs(pipeline, job), strict=True):
         if planned.config.task is not None:
             first_vehicle(planned.flight_settings.vehicle)  # refuses an unknown one
+        planned.config.make_expert()
         resolved = {"conf_file": None, "settings": planned.config.settings}
         stages.append(stage.model_copy(update=resolved))
     return job, stages

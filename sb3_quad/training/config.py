@@ -50,6 +50,7 @@ _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
+NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 # For dummy and subproc. PyBullet allows about as many in a process.
 MAX_SINGLE = 1000
 
@@ -112,8 +113,8 @@ class TrainingConfig(Frozen):
     """wrappers around each environment, for dummy and subproc"""
     vec_env_wrapper: Classes = []
     """wrappers around the vectorised environment"""
-    normalize: Literal[False] | None = None
-    """its statistics would not be part of a model's zip"""
+    normalize: bool | Keywords = False
+    """true, or keywords of SB3's VecNormalize, which then is the outermost wrapper"""
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
     """action noise, for off-policy algorithms"""
     noise_std: NonNegativeFloat = 0.1
@@ -152,6 +153,17 @@ class TrainingConfig(Frozen):
         if name in self.hyperparams:
             return self.hyperparams[name]
         return constructor_parameters(self.algorithm)[name].default
+
+    @property
+    def vec_env_wrappers(self) -> list[tuple[str, StrDict]]:
+        """The wrappers around the vectorised environment, that of ``normalize`` included."""
+        if not self.normalize:
+            return self.vec_env_wrapper
+        # As rl_zoo3 gives it.
+        keywords = {"gamma": self.hyperparams.get("gamma", 0.99)}
+        if self.normalize is not True:
+            keywords |= self.normalize
+        return [*self.vec_env_wrapper, (NORMALIZE, keywords)]
 
     @property
     def is_off_policy(self) -> bool:
@@ -232,6 +244,11 @@ class TrainingConfig(Frozen):
             )
         if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
+        if "NormalizeObservation" in str(self.env_wrapper):
+            raise ConfigError(
+                "env_wrapper: NormalizeObservation has statistics of its own in each environment, "
+                "also to evaluate in; remove it, and give normalize: true"
+            )
         if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
@@ -363,8 +380,8 @@ def build_config(
     settings = dict(settings)
     for key in ENV_KEYS & settings.keys():
         settings[key] = with_vehicle_path(settings[key])
-    # The default is written out, so that config.yml names the expert.
-    if takes_expert(algorithm) and settings.get("expert") is None:
+    # The default is written out, so that config.yml names the expert. Flights of a file need none.
+    if takes_expert(algorithm) and not (settings.get("expert") or settings.get("demonstrations")):
         settings["expert"] = DEFAULT_EXPERT
 
     def source(key: str) -> str:

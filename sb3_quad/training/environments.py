@@ -90,7 +90,7 @@ def make_environments(
         raise ConfigError(
             f"{config.env_id}: cannot be made with env_kwargs {config.env_kwargs} ({error})"
         ) from error
-    for path, kwargs in config.vec_env_wrapper:
+    for path, kwargs in config.vec_env_wrappers:
         env = instance(path, "vec_env_wrapper", env, **kwargs)
     return env  # type: ignore[no-any-return]
 

@@ -11,18 +11,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import (
-    BeforeValidator,
-    Field,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, field_validator
 
-from sb3_quad.algorithms.offset_correction import correct_hover, correct_offset
+from sb3_quad.algorithms.offset_correction import correct_offset
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.process import StopSignals
@@ -32,7 +23,6 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.training.arrival_correction import OVERSHOOT_COST, correct_arrival
 from sb3_quad.training.config import (
     ENV_KEYS,
     SETTINGS,
@@ -47,36 +37,12 @@ from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train, trained_seconds
 
 STATUS_FILE = "pipeline.yml"
-# The keys that go with each kind of offset correction.
-_KEYS = {"position": ("scale",), "hover": (), "arrival": ("rounds", "overshoot_cost", "env_kwargs")}
 
 
 class Requirement(Frozen):
     """The least that a stage must reach in its best evaluation before the next stage begins."""
 
     success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
-
-
-class OffsetCorrection(Frozen):
-    """How the agent of a stage is corrected after its training."""
-
-    kind: Literal["position", "hover", "arrival"]
-    """see algorithms/offset_correction.py, and training/arrival_correction.py"""
-    scale: PositiveFloat = 1.0
-    """position: α, which becomes a part of the agent"""
-    rounds: PositiveInt = 1
-    """arrival: number of searches, each from the result of the one before"""
-    overshoot_cost: NonNegativeFloat = OVERSHOOT_COST
-    """arrival: penalty in seconds for leaving a target after reaching it"""
-    env_kwargs: StrDict = {}
-    """arrival: changes to env_kwargs of the flights that are optimised"""
-
-    @model_validator(mode="after")
-    def _keys_of_kind(self) -> "OffsetCorrection":
-        for name in self.model_fields_set - {"kind"}:
-            if name not in _KEYS[self.kind]:
-                raise ValueError(f"{name} does not go with kind: {self.kind}")
-        return self
 
 
 class Stage(Frozen):
@@ -96,11 +62,8 @@ class Stage(Frozen):
     """added to the seed, so that stages on the same task fly different episodes"""
     pass_on: Literal["best", "last"] = "best"
     """the best evaluation, as best_by of its settings says"""
-    correct_offset: Annotated[
-        OffsetCorrection | None,
-        BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value),
-    ] = None
-    """offset correction after the stage: {kind: arrival, rounds: 2}, or its kind"""
+    correct_offset: PositiveFloat | None = None
+    """offset correction after the stage: α of Eq. 4.10, such as 0.7; 1: the offset alone"""
     require: Requirement = Requirement()
     """the pipeline stops where this is missed"""
     eval_freq: int | None = None
@@ -223,12 +186,15 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
 
     :raises ConfigError: settings of a stage, or options of its job, that do not fit.
     """
-    jobs = []
+    jobs: list[TrainingJob] = []
     for stage in pipeline.stages:
         where = f"stage {stage.name!r}"
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
-            _check_correction(stage.correct_offset, config)
+            if stage.correct_offset:
+                _check_correction(config)
+            if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
+                raise ConfigError("normalize: must be as in the stage before, whose agent it has")
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.
@@ -238,18 +204,15 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     return jobs
 
 
-def _check_correction(correction: OffsetCorrection | None, config: TrainingConfig) -> None:
-    """Check that an agent with these settings can be corrected."""
-    if not correction:
-        return
+def _check_correction(config: TrainingConfig) -> None:
+    """Check that the offset of an agent with these settings can be corrected."""
     if not config.task:
         raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
-    if correction.kind == "arrival":
-        config.flight_settings.with_changes(**correction.env_kwargs)
-    elif config.flight_settings.size != OBSERVATION_SIZE:
+    if config.env_wrapper or config.vec_env_wrappers:
+        raise ConfigError("correct_offset: flies without wrappers; remove them, and normalize")
+    if config.flight_settings.size != OBSERVATION_SIZE:
         raise ConfigError(
-            f"correct_offset: {correction.kind} is for agents that see the "
-            f"{OBSERVATION_SIZE} features alone"
+            f"correct_offset is for agents that see the {OBSERVATION_SIZE} features alone"
         )
 
 
@@ -333,31 +296,17 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
     return run.model
 
 
-def _correct(
-    correction: OffsetCorrection,
-    job: TrainingJob,
-    run: RunFolder,
-    agent: Path,
-    report: Report,
-) -> None:
-    """Write the corrected agent of a run."""
+def _correct(scale: float, job: TrainingJob, run: RunFolder, agent: Path, report: Report) -> None:
+    """Write the corrected agent of a run.
+
+    :param scale: α of Eq. 4.10.
+    """
     model = load_zip(job.config.algorithm, agent, device=job.device)
-    report(f"correcting the agent's offset ({correction.kind}), which may take minutes")
-    settings = job.flight_settings
+    report("correcting the agent's offset, which may take minutes")
     seed = seed_for("correction", job.seed)
-    if correction.kind == "hover":
-        change = correct_hover(model, seed, settings)
-        line = f"action at the target {change.before:.4f} from hover, now {change.after:.4f}"
-    elif correction.kind == "position":
-        change = correct_offset(model, seed, settings, correction.scale)
-        line = f"steady offset {change.before:.3f} m, now {change.after:.3f} m"
-    else:
-        trained = job.config.flight_settings.with_changes(**correction.env_kwargs)
-        costs = []
-        for number in range(correction.rounds):
-            seed = seed_for("correction", job.seed + number)
-            change = correct_arrival(model, seed, settings, trained, correction.overshoot_cost)
-            costs.append(f"{change.before:.2f} s, now {change.after:.2f} s")
-        line = "slow arrivals, misses and crashes cost " + "; ".join(costs)
+    change = correct_offset(model, seed, job.flight_settings, scale)
     save_model(model, run.corrected_model)
-    report(f"corrected: {line}: {run.corrected_model}")
+    report(
+        f"corrected: steady offset {change.before:.3f} m, now {change.after:.3f} m: "
+        f"{run.corrected_model}"
+    )

@@ -21,6 +21,7 @@ from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.types import Arrays, Report, StrDict
+from sb3_quad.controllers.statistics import STATISTICS, share_statistics
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.runs import RunFolder
@@ -178,6 +179,7 @@ def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) 
         force_reset=batch is None,
         **attributes,
     )
+    share_statistics(getattr(model, STATISTICS, None), env, training=True)
     _check(state, {"timesteps": np.array(0), **_surroundings(env, model)})
     _require(int(state["episodes"]) >= 0, "episodes is negative")
     _require(model.num_timesteps == state["timesteps"], "timesteps is not that of model")
@@ -247,8 +249,11 @@ def _misfit(path: Path, problem: object) -> ConfigError:
 
 
 def _batch(env: VecEnv) -> Any:
-    """Return the batch of the batched environment, which can be restored; None for others."""
-    return getattr(env.unwrapped, "batch", None)
+    """Return the batch of the batched environment, which can be restored; None for others, and
+    behind wrappers.
+    """
+    # Wrappers have a state of their own, which begins with the episodes.
+    return None if env is not env.unwrapped else getattr(env, "batch", None)
 
 
 def _stores(model: Any) -> StrDict:

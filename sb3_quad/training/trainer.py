@@ -6,6 +6,7 @@ that was not interrupted; elsewhere the episodes start again.
 """
 
 import copy
+import pickle
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -23,9 +24,10 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_text
+from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
@@ -33,9 +35,10 @@ from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.statistics import STATISTICS
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import instance, takes_expert
+from sb3_quad.training.algorithms import instance
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
@@ -166,7 +169,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
 
 def _expert(config: TrainingConfig) -> StrDict:
     """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
-    return {"expert": config.make_expert()} if takes_expert(config.algorithm) else {}
+    return {} if config.expert is None else {"expert": config.make_expert()}
 
 
 def _user_callbacks(config: TrainingConfig) -> list[BaseCallback]:
@@ -190,10 +193,10 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
     model = _construct(config, env, keywords)
     # An expert that fails does so before there is a run folder.
-    will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
+    will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: False)
     if will_clone():
         observation: Any = env.reset()
-        Controller.for_env(keywords["expert"], env).labels(observation)
+        Controller.for_env(keywords.get("expert"), env).labels(observation)
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):
@@ -282,8 +285,10 @@ class _Training:
     def run_to_end(self) -> TrainingResult:
         """Train until the job is done, or a signal or an error ends it, and save the model."""
         config = self.job.config
+        statistics = self.model.get_vec_normalize_env()
+        setattr(self.model, STATISTICS, statistics)
         # A zip says how its agent flies, but a flight cannot have the user's wrappers.
-        if config.task and not (config.env_wrapper or config.vec_env_wrapper):
+        if config.task and flight_settings_of(self.model.get_env()) is not None:
             self.job.flight_settings.write_into(self.model)
         self.run.error.unlink(missing_ok=True)
         start = time.perf_counter()
@@ -301,6 +306,9 @@ class _Training:
         if self.signals.received:
             self._save_interrupted()
         else:
+            # Those at the end, where rl_zoo3 has them.
+            if statistics is not None:
+                write_bytes(self.run.config.with_name("vecnormalize.pkl"), pickle.dumps(statistics))
             save_model(self.model, self.run.model)
             self.run.resume_state.unlink(missing_ok=True)
             self._refuse_removed_folder()

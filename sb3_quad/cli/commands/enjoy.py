@@ -14,7 +14,7 @@ examples:
   sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
   sb3-quad enjoy agent.zip --scenario thesis:side_hit -o hit.mp4 --speed 0.5
   # your own vehicle without noise, printed only
-  sb3-quad enjoy geometric --env-kwargs noise:0 vehicle:my_vehicle.yaml \
+  sb3-quad enjoy geometric --vehicle my_vehicle.yaml --env-kwargs noise:0 \
     -n 3000 --no-render
 
 A controller is pid, geometric, the path of an SB3 zip or a run folder, or
@@ -111,6 +111,7 @@ FLAGS: Flags = {
     "--n-envs N": (positive, 1, "number of parallel episodes, with consecutive seeds (1)"),
     "--seed N": (natural, 0, "seed of the first episode; later ones count up (0)"),
     "--env-kwargs": (PAIRS, {}, "environment keywords, such as noise:0"),
+    "--vehicle": "vehicle, by name or YAML file (the scenario's, else the first agent's own)",
     "--target": (
         {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")},
         None,
@@ -227,7 +228,7 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     elif options.env_kwargs or options.target:
         raise ConfigError("--scenario describes a whole flight; remove --env-kwargs and --target")
     else:
-        setting = scenario_setting(options.scenario, first and first.vehicle)
+        setting = scenario_setting(options.scenario, first and first.vehicle, options.vehicle)
     controllers = {}
     # What an agent observes stays as in its training, unless the command line says otherwise.
     observed = {}
@@ -255,6 +256,8 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
     if task and task != settings.task:
         # The agent's changes to its own task do not fit another one.
         changes = {"task": task, "task_kwargs": None}
+    if options.vehicle:
+        changes["vehicle"] = options.vehicle
     return settings.with_changes(**changes | options.env_kwargs)
 
 
@@ -262,8 +265,7 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     """Return label and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and
     ``--load-…`` name.
 
-    :raises ConfigError: No such run or file, settings that cannot be read, or a wrapper that this
-        command does not have.
+    :raises ConfigError: No such run or file.
     """
     from sb3_quad.training.algorithms import get_algorithm
     from sb3_quad.training.runs import find_run
@@ -283,13 +285,6 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     if not path.is_file():
         zips = sorted(file.name for file in run.path.glob("*.zip"))
         raise ConfigError(f"{path}: no such file; the run holds {', '.join(zips)}")
-    settings, _ = run.read_yaml()
-    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
-        if settings.get(key):
-            raise ConfigError(
-                f"{run.path}: was trained with {key}, which enjoy does not put around the "
-                "environment"
-            )
     return f"{options.algo} {path.name}", str(path)
 
 

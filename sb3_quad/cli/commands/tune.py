@@ -137,8 +137,7 @@ def _make_search(options: Namespace) -> Any:
 
 def _print_results(search: Any) -> None:
     """Print the best trial, its agent on fresh episodes, and where everything is."""
-    from sb3_quad.cli.closing import agent_and_expert
-    from sb3_quad.cli.output import console
+    from sb3_quad.cli.closing import print_agent
     from sb3_quad.controllers.zips import load_model
     from sb3_quad.training.runs import open_run
     from sb3_quad.tuning.results import count_trials, train_command, trial_line
@@ -152,7 +151,7 @@ def _print_results(search: Any) -> None:
         if search.job.config.task and path.is_dir():
             model = open_run(path).model
             job = search.job.model_copy(update={"config": search.config(best)})
-            console().print(agent_and_expert(job, load_model(model)))
+            print_agent(job, load_model(model))
             print(f"agent: {model}")
         print(f"to train: {train_command(search)}")
     print(f"{count_trials(search)}; saved in {search.job.log_folder}")

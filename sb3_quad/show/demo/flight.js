@@ -16,6 +16,7 @@
  * @property {ObservationSettings} [observation]
  * @property {number[]} [mean] μ of Eq. 3.16
  * @property {number[]} [std] σ
+ * @property {number} [clip] VecNormalize's bound of scaled features; 0: none
  * @property {Layer[]} [layers]
  *
  * @typedef {object} Start
@@ -64,7 +65,7 @@ export class Flight {
       if (!turn) throw new Error(`${agent.label} knows other rotors than ${vehicle.name} has`);
       this.turn = turn;
       const settings = agent.observation ?? { last_action: false, history: null, position_integral: null };
-      this.observer = new Observer(settings, vehicle.control_step, { mean: agent.mean, std: agent.std, turn, normal });
+      this.observer = new Observer(settings, vehicle.control_step, { mean: agent.mean, std: agent.std, clip: agent.clip, turn, normal });
     } else {
       this.law = EXPERTS[agent.kind](vehicle);
     }

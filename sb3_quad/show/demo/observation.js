@@ -46,10 +46,11 @@ export class Observer {
    * @param {object} how the scaling, the turn to the layout that the policy knows, and standard normals for the noise
    * @param {number[]} [how.mean]
    * @param {number[]} [how.std]
+   * @param {number} [how.clip] bound of the scaled features; 0: none
    * @param {Turn} [how.turn]
    * @param {() => number} [how.normal]
    */
-  constructor(settings, controlStep, { mean = Array(OBSERVATION_SIZE).fill(0), std = DEFAULT_STD, turn = NO_TURN, normal = () => 0 } = {}) {
+  constructor(settings, controlStep, { mean = Array(OBSERVATION_SIZE).fill(0), std = DEFAULT_STD, clip = 0, turn = NO_TURN, normal = () => 0 } = {}) {
     this.ages = settings.history ?? [0];
     this.size = OBSERVATION_SIZE + (settings.last_action ? 4 : 0);
     this.depth = this.ages[this.ages.length - 1] + 1;
@@ -57,6 +58,7 @@ export class Observer {
     this.controlStep = controlStep;
     this.mean = Float32Array.from(mean);
     this.inverse = Float32Array.from(std, (each) => 1 / f32(each));
+    this.clip = clip;
     this.turn = turn;
     this.normal = normal;
     this.noise = 0; // relative
@@ -99,6 +101,7 @@ export class Observer {
     for (let k = 0; k < OBSERVATION_SIZE; k++) {
       if (this.noise > 0) x[k] *= f32(1 + this.noise * this.normal());
       x[k] = f32(x[k] - this.mean[k]) * this.inverse[k];
+      if (this.clip) x[k] = Math.min(Math.max(x[k], -this.clip), this.clip);
     }
   }
 

@@ -156,6 +156,7 @@ def describe(spec: ControllerSpec) -> StrDict:
         "observation": reference.observation.model_dump(mode="json"),
         "mean": reference.mean.tolist(),
         "std": reference.std.tolist(),
+        "clip": reference.clip,
         "shapes": network.shapes,
         **pack(network),
     }

@@ -187,6 +187,7 @@ export async function readAgent(label, content) {
     const after = last ? (data.use_sde && data.policy_kwargs?.squash_output ? "tanh" : family.end) : inner;
     layers.push({ inputs, outputs, activation: after, weight: weight.values, bias: bias.values });
   }
+  if (data.vec_normalize?.norm_obs) throw new Error("it was trained with VecNormalize; sb3-quad demo makes a page of it");
   const settings = data.flight_settings ?? {};
   const { last_action = false, history = null, position_integral = null } = settings;
   const size = (history ?? [0]).length * (OBSERVATION_SIZE + (last_action ? 4 : 0));

@@ -1,0 +1,134 @@
+"""APG: it learns, its zips are stock, it resumes, and what it cannot differentiate is refused."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor
+
+from sb3_quad import APG, DAgger, QuadcopterVecEnv, fly, load_pretrained
+from sb3_quad.algorithms.flight_cost import flight_cost
+from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.controllers.zips import load_model, saved_algorithm
+
+TASKS = {"state_recovery": 0.5, "target_tracking": 0.5}
+EXAMPLE = Path(__file__).resolve().parent.parent / "examples/gradient_of_your_environment.py"
+
+
+def weights(model):
+    return [tensor.clone() for tensor in model.policy.state_dict().values()]
+
+
+def test_a_clone_becomes_faster_and_survives_more_recoveries():
+    env = QuadcopterVecEnv(240, task=TASKS, seed=0)
+    clone = DAgger("MlpPolicy", env, expert="geometric", seed=0).learn(240_000)
+    env = QuadcopterVecEnv(256, task=TASKS, seed=1)
+    agent = APG("MlpPolicy", env, initial_policy=clone, learning_rate=1e-3, seed=0)
+    agent.learn(40 * 256 * 300)
+    before, after = (fly(model, "target_tracking", 120, seed=3) for model in (clone, agent))
+    assert after.survival.mean() > 0.95
+    assert np.median(after.time_to[0.5]) < np.median(before.time_to[0.5]) - 0.1
+    before, after = (fly(model, "state_recovery", 480, seed=4) for model in (clone, agent))
+    assert after.survival.mean() > before.survival.mean()
+
+
+def test_its_zip_loads_in_stock_ppo_and_says_how_it_flies(tmp_path):
+    env = QuadcopterVecEnv(64, task="target_tracking", last_action=True, seed=0)
+    agent = APG("MlpPolicy", env, n_steps=5, seed=0).learn(64 * 5)
+    agent.save(tmp_path / "agent.zip")
+    assert saved_algorithm(tmp_path / "agent.zip") == "APG"
+    observations = env.reset()
+    for loaded in (PPO.load(tmp_path / "agent.zip"), load_model(tmp_path / "agent.zip")):
+        actions, _ = loaded.predict(observations, deterministic=True)
+        np.testing.assert_array_equal(actions, agent.predict(observations, deterministic=True)[0])
+    assert fly(loaded, n_flights=2, last_action=True, max_steps=5).n == 2
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_one_others():
+    def train(seed):
+        env = QuadcopterVecEnv(16, task=TASKS, seed=seed)
+        initial = load_pretrained("itm-recovery")
+        agent = APG("MlpPolicy", env, initial_policy=initial, n_steps=30, seed=seed)
+        return weights(agent.learn(2 * 16 * 30))
+
+    first, again, other = train(0), train(0), train(1)
+    assert all(th.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not all(th.equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+def test_the_critic_stays_and_the_environment_is_as_it_was():
+    env = QuadcopterVecEnv(8, task="target_tracking", max_episode_steps=20, seed=0)
+    agent = APG("MlpPolicy", env, n_steps=30, seed=0)
+    critic = agent.policy.value_net.weight.clone()
+    agent.learn(8 * 30)
+    assert th.equal(agent.policy.value_net.weight, critic)
+    env.reset()
+    ended = [env.step(np.zeros((8, 4)))[2] for _ in range(20)]
+    assert ended[-1].all()
+
+
+def test_flights_that_carry_on_continue_where_they_were():
+    env = QuadcopterVecEnv(8, task="target_tracking", seed=0)
+    tape = env.record(5)
+    tape.reset(carry_on=False)
+    for _ in range(5):
+        tape.step(np.zeros((8, 4), np.float32))
+    end = env.batch.state.copy()
+    tape.reset(carry_on=True)
+    np.testing.assert_array_equal(env.batch.state, end)
+    tape.reset(carry_on=False)
+    assert not np.array_equal(env.batch.state, end)
+
+
+def test_a_cost_of_ones_own_is_what_is_minimised():
+    def level(flown):
+        return 1.0 - flown.r33 + 0.01 * flight_cost(flown)
+
+    def tilt(agent):
+        env = QuadcopterVecEnv(64, task="target_tracking", seed=5)
+        tape = env.record(60)
+        observations = tape.reset()
+        for _ in range(60):
+            observations = tape.step(agent.predict(observations, deterministic=True)[0])
+        x, y = np.moveaxis(tape.states[1:, 4:6], 1, 0)
+        return float(np.mean(2.0 * (x**2 + y**2)))
+
+    env = QuadcopterVecEnv(64, task="target_tracking", seed=0)
+    agent = APG("MlpPolicy", env, initial_policy="itm-recovery", n_steps=60, cost=level, seed=0)
+    before = tilt(agent)
+    agent.learn(30 * 64 * 60)
+    assert tilt(agent) < 0.7 * before
+
+
+def test_what_cannot_be_differentiated_is_refused():
+    env = QuadcopterVecEnv(2, seed=0)
+    with pytest.raises(ConfigError, match="VecFrameStack: APG differentiates the environment"):
+        APG("MlpPolicy", VecFrameStack(env, 2), n_steps=5).learn(10)
+    APG("MlpPolicy", VecMonitor(env), n_steps=5).learn(10)
+    with pytest.raises(ConfigError, match="has no record"):
+        APG("MlpPolicy", "Pendulum-v1", n_steps=5).learn(5)
+    fast = QuadcopterVecEnv(2, randomize={"motor_gain": [10.0, 10.0]}, seed=0)
+    with pytest.raises(ConfigError, match="substeps 1: too few for motors"):
+        APG("MlpPolicy", fast, n_steps=5, substeps=1).learn(10)
+    with pytest.raises(ConfigError, match="learning_rate"):
+        APG("MlpPolicy", env, learning_rate=-1.0)
+
+
+def test_a_gradient_that_is_not_finite_leaves_the_weights_alone():
+    env = QuadcopterVecEnv(4, seed=0)
+    agent = APG("MlpPolicy", env, n_steps=5, cost=lambda flown: flown.distance * np.nan, seed=0)
+    before = weights(agent)
+    with pytest.raises(TrainingError, match="not finite"):
+        agent.learn(20)
+    assert all(th.equal(a, b) for a, b in zip(before, weights(agent), strict=True))
+
+
+def test_the_protocol_serves_an_environment_in_pytorch():
+    command = [sys.executable, str(EXAMPLE), "--updates", "60"]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    before, after = (float(line.split("cost ")[1].split(",")[0]) for line in lines)
+    assert after < 0.5 * before
