@@ -2,6 +2,7 @@
 it can be thrown.
 """
 
+import dataclasses
 import functools
 import json
 import math
@@ -349,6 +350,16 @@ def test_a_feature_that_the_page_does_not_compute_is_refused(monkeypatch):
 @functools.cache
 def default_page():
     return make_page(parse_controllers(DEFAULT_AGENTS))
+
+
+def test_names_are_no_html():
+    """Of a zip that somebody else has named, and whose network is large enough to be rounded."""
+    name = "<img src=x onerror=alert(1)>"
+    (spec,) = parse_controllers(["any-quadcopter"])
+    page, _, rounded = make_page([dataclasses.replace(spec, label=name)])
+    assert rounded == [name]
+    assert "<img" not in page
+    assert "Weights of &lt;img src=x onerror=alert(1)&gt; are rounded" in page
 
 
 @pytest.mark.slow

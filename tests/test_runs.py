@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -30,6 +31,19 @@ def test_the_latest_run_is_the_latest_with_an_agent(tmp_path):
     first.model.write_bytes(b"")
     assert find_run(tmp_path, "dagger", ENV).path == first.path
     assert find_run(tmp_path, "dagger", ENV, 2).path == empty.path
+
+
+def test_a_run_that_never_began_keeps_no_half_written_file(tmp_path):
+    for number, age in ((1, 60), (2, 0), (3, 60)):
+        run = claim_run(tmp_path, "dagger", "Env-v0")
+        run.config.parent.mkdir()
+        half = run.config.with_name(f".config.yml.{number}.tmp")
+        half.write_text("n_times")
+        os.utime(half, (time.time() - age,) * 2)
+    run.arguments.write_text("algo: dagger")
+    claim_run(tmp_path, "dagger", "Env-v0")
+    # The second may be about to begin, the third has begun and cleans up when it goes on.
+    assert sorted(path.name[-6:] for path in tmp_path.rglob(".*.tmp")) == [".2.tmp", ".3.tmp"]
 
 
 def test_a_uuid_keeps_the_number(tmp_path):

@@ -10,6 +10,13 @@ from sb3_quad.base.yaml_files import YamlFolder
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 SETTINGS = YamlFolder("settings", "sb3_quad.zoo_configs", ".yml", folders=("thesis",))
 
+# A few hundred bytes that stand for a billion values.
+ALIASES = b"a0: &a0 [1, 1]\n" + b"".join(
+    b"a%d: &a%d [*a%d, *a%d, *a%d, *a%d, *a%d, *a%d, *a%d, *a%d]\n" % (n, n, *[n - 1] * 8)
+    for n in range(1, 10)
+)
+MERGES = ALIASES.replace(b"[1, 1]", b"{x: 1}").replace(b"[", b"{<<: [").replace(b"]", b"]}")
+
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
@@ -45,6 +52,11 @@ def test_a_users_file_comes_before_the_packages_of_the_same_name(here):
     assert SETTINGS.read("dagger.yml") == ({"mine": 1}, "dagger.yml")
 
 
+def test_aliases_are_read(here):
+    (here / "mine.yaml").write_text("a: &a {x: 1}\nb: {<<: *a, y: *a}")
+    assert VEHICLES.read("mine.yaml")[0]["b"] == {"x": 1, "y": {"x": 1}}
+
+
 def test_what_messages_call_a_file(here):
     (here / "mine.yaml").write_text("a: 1")
     assert VEHICLES.text("mine.yaml") == ("a: 1", "mine.yaml")
@@ -66,6 +78,9 @@ def test_what_messages_call_a_file(here):
         ("bad.yaml", b"\xff\xfe\x00\x01", "bad.yaml: cannot be read"),
         ("bad.yaml", b"mass: [1, 2", "bad.yaml: not valid YAML"),
         ("bad.yaml", b"", "bad.yaml: must hold keys and values"),
+        ("bad.yaml", ALIASES, "bad.yaml: not valid YAML (too many values"),
+        ("bad.yaml", MERGES, "bad.yaml: not valid YAML (too many values"),
+        ("bad.yaml", b"a: &a [*a]", "bad.yaml: not valid YAML (too many values"),
     ],
 )
 def test_what_is_wrong_is_one_line(here, source, content, message):

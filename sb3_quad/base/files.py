@@ -1,6 +1,7 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -72,8 +73,7 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         # This file system has no locks.
         pass
     try:
-        for temporary in folder.rglob(".*.tmp"):
-            temporary.unlink(missing_ok=True)
+        remove_half_written(folder)
         yield
     finally:
         # Removed while it is held, so that no other process can lock a file without a name.
@@ -81,6 +81,15 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         with suppress(OSError):
             (folder / LOCK).unlink()
         lock.release()
+
+
+def remove_half_written(folder: Path, seconds: float = 0.0) -> None:
+    """Remove files that a killed process was writing, so many seconds ago or longer."""
+    latest = time.time() - seconds
+    for temporary in folder.rglob(".*.tmp"):
+        with suppress(OSError):
+            if temporary.stat().st_mtime <= latest:
+                temporary.unlink()
 
 
 def write_text(path: StrPath, text: str) -> None:

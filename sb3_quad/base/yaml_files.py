@@ -9,14 +9,21 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text
+from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrPath
 
 
 class Loader(yaml.SafeLoader):
     """PyYAML's SafeLoader, which refuses two equal keys, and reads what rl_zoo3 writes.
 
-    That is ordered mappings, tuples and names of classes. No class is imported.
+    That is ordered mappings, tuples and names of classes. No class is imported. Aliases that make
+    much of a short text are refused.
     """
+
+    def get_single_node(self) -> Any:
+        root = super().get_single_node()
+        walk(root, _parts, 100_000 + len(self.buffer))
+        return root
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
@@ -37,6 +44,12 @@ class Loader(yaml.SafeLoader):
             _, package, *_, name = tag.split(".")
             return f"{package}.{name}"
         raise ValueError(f"{tag}: no such value in settings")
+
+
+def _parts(node: Any) -> list[Any]:
+    """Return what a node of YAML holds, where a mapping holds pairs."""
+    parts = getattr(node, "value", node)
+    return [] if isinstance(parts, str) else list(parts or ())
 
 
 Loader.add_multi_constructor("tag:yaml.org,2002:python/", Loader.construct_python)

@@ -1,6 +1,7 @@
 """The flight settings of the agent in a zip, as training wrote them into or next to it."""
 
 from pathlib import Path
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping
@@ -27,9 +28,9 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
         runs next to the zip; or of a run with wrappers, which flights here do not have.
     """
     # Zips of this package say it themselves.
-    record = saved_data(zip_file).get(KEY)
-    if isinstance(record, dict):
-        return _settings_of_zip(record, f"{zip_file}: {KEY}"), Path(zip_file)
+    data = saved_data(zip_file)
+    if KEY in data:
+        return _settings_of_zip(data[KEY], f"{zip_file}: {KEY}"), Path(zip_file)
 
     # Other zips, such as those of rl_zoo3, lie in a run folder.
     folder = Path(zip_file).parent
@@ -59,7 +60,9 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
     return warning
 
 
-def _settings_of_zip(record: StrDict, where: str) -> FlightSettings:
+def _settings_of_zip(record: Any, where: str) -> FlightSettings:
+    if not isinstance(record, dict):
+        raise ConfigError(f"{where}: must be a mapping of names to values")
     # A path in a stranger's zip could name a device file, which is read forever. Both a vehicle and
     # a distribution may be given by a name, which could be a path.
     distribution = record.get("vehicles")

@@ -4,40 +4,60 @@ Python's own reader calls any function that a pickle names (docs/security.md). T
 it, but knows only the opcodes that SB3's pickles use. It looks names up in the tables of this file
 alone. It calls only functions of this file, which check their arguments, and changes only objects
 that the same pickle has made. So nothing outside the result changes.
+
+Small pickles can hold objects whose hash, copy or text crashes Python or never ends: very deep
+ones, and those that hold others many times, or themselves. So keys are plain, and what is used or
+returned is a tree of limited size.
 """
 
 import base64
 import io
+import math
 import pickle
 import pkgutil
 import re
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.random import PCG64, Generator, SeedSequence
+from gymnasium.spaces import Box
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import TRUST_VARIABLE, trusted
+from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict
 
 WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {TRUST_VARIABLE}=1)"
 _UNLIKE_SB3 = "is not what Stable-Baselines3 pickles"
+# Steps of reading a pickle; action noise for 10,000 environments needs as many.
+_STEPS = 1_500_000
 
 
-def unpickle(text: str, where: str) -> Any:
+def unpickle(content: str | bytes, where: str) -> Any:
     """Return the object that an entry of an SB3 zip holds. :func:`trusted` files may hold any.
 
-    :param text: base64 of a pickle, as SB3 writes it.
+    Tensors become None.
+
+    :param content: a pickle, or its text in base64, as SB3 writes it.
     :param where: what messages call the entry.
     :raises ConfigError: the pickle names or does something that SB3's own pickles do not. Nothing
         of that has been imported or called.
     """
-    read = pickle.Unpickler if trusted() else _Reader
     try:
-        return read(io.BytesIO(base64.b64decode(text))).load()
+        if isinstance(content, str):
+            content = base64.b64decode(content)
+        if trusted():
+            return pickle.loads(content)
+        steps = _Steps(content)
+        # Those of SB3 need up to two for each byte.
+        steps.left = min(_STEPS, 10_000 + 5 * len(content))
+        reader = _Reader(steps)
+        reader.steps = steps
+        found = reader.load()
+        reader.walk(found)
+        return found
     except _Refusal as error:
         fault = str(error)
     except Exception as error:  # what wrong types raise depends on the types
@@ -58,6 +78,15 @@ def _check(fits: bool, what: str) -> None:
 def _is_one_of(value: Any, names: StrDict) -> bool:
     """Compare by identity: equality could be an object's own method."""
     return any(value is candidate for candidate in names.values())
+
+
+def held(item: Any) -> Collection[Any]:
+    """Return what an object of a pickle holds. Keys are plain."""
+    if _is_one_of(type(item), _WITH_ATTRIBUTES):
+        item = vars(item)
+    if isinstance(item, dict):
+        return item.values()
+    return item if isinstance(item, (list, tuple, deque)) else ()
 
 
 # Functions that stand for those that SB3's pickles call, and for the methods that set a state.
@@ -91,102 +120,101 @@ def _check_dtype(dtype: Any, state: Any) -> None:
     _check(state[1:5] == (dtype.str[0], None, None, None), "a dtype")
 
 
-def _set_bit_generator(bit_generator: Any, state: Any) -> None:
-    # NumPy 2 adds the seeds. Only further generators would need them, and a space spawns none.
-    if type(state) is tuple:
-        state, _ = state
-    bit_generator.state = state
+def _check_tensor(stored: Any, offset: Any, shape: Any, *_: Any) -> None:
+    """Refuse a tensor of more numbers than a file stores for it, which repeats them."""
+    _check({*map(type, (stored, offset, *shape))} == {int}, "a tensor")
+    _check(offset + math.prod(shape) <= stored, "a tensor")
 
 
-def _generator(bit_generator: Any, *_: Any) -> Generator:
-    """Do what ``numpy.random._pickle.__generator_ctor`` does.
-
-    NumPy 1 passes the name of the bit generator, whose state follows.
-    """
-    return Generator(bit_generator if type(bit_generator) is PCG64 else PCG64(0))
-
-
-def _set_generator(generator: Any, state: Any) -> None:
-    generator.bit_generator.state = state
+def _none(*_: Any) -> None:
+    """Stand for what is not needed."""
 
 
 # Tables: what a pickle may name.
 
 
-def _by_name(*names: str) -> StrDict:
-    return {name: pkgutil.resolve_name(name) for name in names}
+def _by_name(names: str) -> StrDict:
+    return {name: pkgutil.resolve_name(name) for name in names.split()}
 
 
 # Instances of these classes are made, and get attributes.
 _WITH_ATTRIBUTES = _by_name(
-    "gymnasium.spaces.box.Box",
-    "gymnasium.spaces.dict.Dict",
-    "gymnasium.spaces.discrete.Discrete",
-    "gymnasium.spaces.multi_binary.MultiBinary",
-    "gymnasium.spaces.multi_discrete.MultiDiscrete",
-    "stable_baselines3.common.noise.NormalActionNoise",
-    "stable_baselines3.common.noise.OrnsteinUhlenbeckActionNoise",
-    "stable_baselines3.common.noise.VectorizedActionNoise",
-    "stable_baselines3.common.running_mean_std.RunningMeanStd",
-    "stable_baselines3.common.utils.ConstantSchedule",
-    "stable_baselines3.common.utils.FloatSchedule",
-    "stable_baselines3.common.utils.LinearSchedule",
-    "stable_baselines3.common.vec_env.vec_normalize.VecNormalize",
+    """
+    gymnasium.spaces.box.Box
+    gymnasium.spaces.dict.Dict
+    gymnasium.spaces.discrete.Discrete
+    gymnasium.spaces.multi_binary.MultiBinary
+    gymnasium.spaces.multi_discrete.MultiDiscrete
+    stable_baselines3.common.noise.NormalActionNoise
+    stable_baselines3.common.noise.OrnsteinUhlenbeckActionNoise
+    stable_baselines3.common.noise.VectorizedActionNoise
+    stable_baselines3.common.running_mean_std.RunningMeanStd
+    stable_baselines3.common.utils.ConstantSchedule
+    stable_baselines3.common.utils.FloatSchedule
+    stable_baselines3.common.utils.LinearSchedule
+    stable_baselines3.common.vec_env.vec_normalize.VecNormalize
+    """
 )
 # The others of these are only named, but for TrainFreq, a named tuple.
 _CLASSES = _WITH_ATTRIBUTES | _by_name(
-    "numpy.float32",
-    "numpy.float64",
-    "stable_baselines3.common.buffers.DictReplayBuffer",
-    "stable_baselines3.common.buffers.DictRolloutBuffer",
-    "stable_baselines3.common.buffers.NStepReplayBuffer",
-    "stable_baselines3.common.buffers.ReplayBuffer",
-    "stable_baselines3.common.buffers.RolloutBuffer",
-    "stable_baselines3.common.policies.ActorCriticCnnPolicy",
-    "stable_baselines3.common.policies.ActorCriticPolicy",
-    "stable_baselines3.common.policies.MultiInputActorCriticPolicy",
-    "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
-    "stable_baselines3.common.torch_layers.CombinedExtractor",
-    "stable_baselines3.common.torch_layers.FlattenExtractor",
-    "stable_baselines3.common.torch_layers.NatureCNN",
-    "stable_baselines3.common.type_aliases.TrainFreq",
-    "stable_baselines3.sac.policies.CnnPolicy",
-    "stable_baselines3.sac.policies.MultiInputPolicy",
-    "stable_baselines3.sac.policies.SACPolicy",
-    "stable_baselines3.td3.policies.CnnPolicy",
-    "stable_baselines3.td3.policies.MultiInputPolicy",
-    "stable_baselines3.td3.policies.TD3Policy",
-    "torch.nn.modules.activation.CELU",
-    "torch.nn.modules.activation.ELU",
-    "torch.nn.modules.activation.GELU",
-    "torch.nn.modules.activation.Hardswish",
-    "torch.nn.modules.activation.Hardtanh",
-    "torch.nn.modules.activation.LeakyReLU",
-    "torch.nn.modules.activation.Mish",
-    "torch.nn.modules.activation.ReLU",
-    "torch.nn.modules.activation.ReLU6",
-    "torch.nn.modules.activation.SELU",
-    "torch.nn.modules.activation.SiLU",
-    "torch.nn.modules.activation.Sigmoid",
-    "torch.nn.modules.activation.Softplus",
-    "torch.nn.modules.activation.Softsign",
-    "torch.nn.modules.activation.Tanh",
-    "torch.optim.adagrad.Adagrad",
-    "torch.optim.adam.Adam",
-    "torch.optim.adamax.Adamax",
-    "torch.optim.adamw.AdamW",
-    "torch.optim.nadam.NAdam",
-    "torch.optim.radam.RAdam",
-    "torch.optim.rmsprop.RMSprop",
-    "torch.optim.sgd.SGD",
+    """
+    numpy.float32
+    numpy.float64
+    stable_baselines3.common.buffers.DictReplayBuffer
+    stable_baselines3.common.buffers.DictRolloutBuffer
+    stable_baselines3.common.buffers.NStepReplayBuffer
+    stable_baselines3.common.buffers.ReplayBuffer
+    stable_baselines3.common.buffers.RolloutBuffer
+    stable_baselines3.common.policies.ActorCriticCnnPolicy
+    stable_baselines3.common.policies.ActorCriticPolicy
+    stable_baselines3.common.policies.MultiInputActorCriticPolicy
+    stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike
+    stable_baselines3.common.torch_layers.CombinedExtractor
+    stable_baselines3.common.torch_layers.FlattenExtractor
+    stable_baselines3.common.torch_layers.NatureCNN
+    stable_baselines3.common.type_aliases.TrainFreq
+    stable_baselines3.sac.policies.CnnPolicy
+    stable_baselines3.sac.policies.MultiInputPolicy
+    stable_baselines3.sac.policies.SACPolicy
+    stable_baselines3.td3.policies.CnnPolicy
+    stable_baselines3.td3.policies.MultiInputPolicy
+    stable_baselines3.td3.policies.TD3Policy
+    torch.nn.modules.activation.CELU
+    torch.nn.modules.activation.ELU
+    torch.nn.modules.activation.GELU
+    torch.nn.modules.activation.Hardswish
+    torch.nn.modules.activation.Hardtanh
+    torch.nn.modules.activation.LeakyReLU
+    torch.nn.modules.activation.Mish
+    torch.nn.modules.activation.ReLU
+    torch.nn.modules.activation.ReLU6
+    torch.nn.modules.activation.SELU
+    torch.nn.modules.activation.SiLU
+    torch.nn.modules.activation.Sigmoid
+    torch.nn.modules.activation.Softplus
+    torch.nn.modules.activation.Softsign
+    torch.nn.modules.activation.Tanh
+    torch.optim.adagrad.Adagrad
+    torch.optim.adam.Adam
+    torch.optim.adamax.Adamax
+    torch.optim.adamw.AdamW
+    torch.optim.nadam.NAdam
+    torch.optim.radam.RAdam
+    torch.optim.rmsprop.RMSprop
+    torch.optim.sgd.SGD
+    """
 )
 # The function that is called for a name. Items and state of its result follow in the pickle.
 _FUNCTIONS: StrDict = {
     "numpy.dtype": _dtype,
-    # Gymnasium's spaces have no other bit generator.
-    "numpy.random._pickle.__bit_generator_ctor": lambda *_: PCG64(0),
-    "numpy.random._pickle.__generator_ctor": _generator,
-    "numpy.random.bit_generator.__pyx_unpickle_SeedSequence": lambda *_: SeedSequence(0),
+    # Random numbers: a space without a generator makes its own, which SB3 seeds.
+    "numpy.random._pickle.__bit_generator_ctor": _none,
+    "numpy.random._pickle.__generator_ctor": _none,
+    "numpy.random._pickle.__randomstate_ctor": _none,
+    "numpy.random.bit_generator.__pyx_unpickle_SeedSequence": _none,
+    # SB3 removes the device that a policy was made on.
+    "torch.device": _none,
+    "torch._utils._rebuild_tensor_v2": _check_tensor,
     "numpy.core.numeric._frombuffer": _array,
     "numpy.core.multiarray._reconstruct": lambda *_: np.empty(0, np.int8),
     "numpy.core.multiarray.scalar": lambda dtype, content: _array(content, dtype, (), "C")[()],
@@ -202,61 +230,56 @@ _ARGUMENTS = {
     "numpy.ndarray": "an array",
     "numpy.random._pcg64.PCG64": "a bit generator",
     "numpy.random.bit_generator.SeedSequence": "seeds",
+    "torch.DoubleStorage": "numbers",
+    "torch.FloatStorage": "numbers",
+    "torch.HalfStorage": "numbers",
+    "torch.LongStorage": "numbers",
 }
 _KNOWN = _CLASSES | _FUNCTIONS | _ARGUMENTS
-# How an object that has been made gets its state. For others that is by attributes.
-_CHANGES: dict[type, Any] = {
-    np.ndarray: _fill_array,
-    PCG64: _set_bit_generator,
-    Generator: _set_generator,
-    SeedSequence: lambda *_: None,
-}
-# Opcodes that only put plain values on the stack, or move what is there.
-_HARMLESS = (
-    "PROTO",
-    "FRAME",
-    "STOP",
-    "NONE",
-    "NEWTRUE",
-    "NEWFALSE",
-    "BININT",
-    "BININT1",
-    "BININT2",
-    "LONG1",
-    "BINFLOAT",
-    "SHORT_BINUNICODE",
-    "BINUNICODE",
-    "SHORT_BINBYTES",
-    "BINBYTES",
-    "BYTEARRAY8",
-    "EMPTY_TUPLE",
-    "EMPTY_LIST",
-    "EMPTY_DICT",
-    "TUPLE",
-    "TUPLE1",
-    "TUPLE2",
-    "TUPLE3",
-    "MARK",
-    # The memo is how a pickle names an object twice.
-    "MEMOIZE",
-    "BINGET",
-    "LONG_BINGET",
-    # They ask _Reader.find_class.
-    "GLOBAL",
-    "STACK_GLOBAL",
-)
+# Opcodes that only put plain values on the stack, or move what is there, also from and to the memo,
+# by which a pickle names an object twice; and those that ask _Reader.find_class or
+# _Reader.persistent_load.
+_HARMLESS = """
+    PROTO STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT
+    SHORT_BINUNICODE BINUNICODE SHORT_BINBYTES BINBYTES
+    EMPTY_TUPLE EMPTY_LIST EMPTY_DICT TUPLE TUPLE1 TUPLE2 TUPLE3 MARK
+    MEMOIZE BINPUT LONG_BINPUT BINGET LONG_BINGET
+    GLOBAL STACK_GLOBAL BINPERSID
+    """
+
+
+class _Steps(io.BytesIO):
+    """The content of a pickle, which is read in a limited number of steps."""
+
+    left: int
+
+    def read(self, size: int | None = -1) -> bytes:
+        self.left -= 1
+        _check(self.left > 0, "its size")
+        return super().read(size)
 
 
 class _Reader(pickle._Unpickler):
     """Python's reader for few opcodes, which checks what they name, call and change."""
 
+    steps: _Steps
     # Python's, which have no public types.
     stack: list[Any]
+    read: Callable[[int], bytes]
     pop_mark: Callable[[], list[Any]]
 
+    def walk(self, value: Any) -> None:
+        """Walk over an object before anything else does."""
+        self.steps.left = walk(value, held, self.steps.left)
+
+    def persistent_load(self, stored: Any) -> Any:
+        """Return how many numbers a storage of PyTorch has."""
+        return stored[-1]
+
     def find_class(self, module: str, name: str) -> Any:
-        # NumPy 2 moved its core.
+        # NumPy 2 moved its core, and Gymnasium's spaces were gym's.
         full_name = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
+        full_name = full_name.replace("gym.spaces.", "gymnasium.spaces.")
         if full_name not in _KNOWN:
             shown = full_name.encode("unicode_escape").decode()[:200]
             raise _Refusal(f"names {shown}, which may run anything")
@@ -266,6 +289,7 @@ class _Reader(pickle._Unpickler):
         arguments = self.stack.pop()
         function = self.stack.pop()
         _check(_is_one_of(function, _FUNCTIONS) and type(arguments) is tuple, "a call")
+        self.walk(arguments)
         self.stack.append(function(*arguments))
 
     def make(self) -> None:
@@ -280,18 +304,34 @@ class _Reader(pickle._Unpickler):
         state = self.stack.pop()
         instance = self.stack[-1]
         kind = type(instance)
+        self.walk(state)
         if isinstance(instance, np.dtype):
             _check_dtype(instance, state)
-        elif kind in _CHANGES:
-            _CHANGES[kind](instance, state)
-        else:
+        elif kind is np.ndarray:
+            # The content is copied.
+            self.steps.left -= len(state[-1]) // 128
+            _fill_array(instance, state)
+        # None stands for random numbers; PyTorch notes versions at its OrderedDict.
+        elif instance is not None and kind is not OrderedDict:
             _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")
             are_plain = all(type(name) is str and not name.startswith("__") for name in state)
             _check(are_plain, "attributes")
+            vars(instance).update(state)
+            # It may hold itself now.
+            self.walk(instance)
             if hasattr(kind, "__setstate__"):
                 kind.__setstate__(instance, state)
-            else:
-                instance.__dict__.update(state)
+            if kind is Box:
+                _check(instance.low.shape == instance.high.shape == instance._shape, "a Box")
+
+    def skip_frame(self) -> None:
+        # It says how much to read at once.
+        self.read(8)
+
+    def read_array(self) -> None:
+        # Python's makes room for whatever size is named.
+        size = int.from_bytes(self.read(8), "little")
+        self.stack.append(bytearray(self.read(size)))
 
     def drop(self) -> None:
         # Python's would also take a mark, which no pickler writes.
@@ -318,10 +358,14 @@ class _Reader(pickle._Unpickler):
 
     def update(self, new: list[Any]) -> None:
         items = self.stack[-1]
+        keys = new[::2]
         _check(type(items) in (dict, OrderedDict), "a container")
-        items.update(zip(new[::2], new[1::2], strict=True))
+        _check({*map(type, keys)} <= {str, int}, "a key")
+        items.update(zip(keys, new[1::2], strict=True))
 
     dispatch: ClassVar[dict[int, Any]] = {
+        pickle.FRAME[0]: skip_frame,
+        pickle.BYTEARRAY8[0]: read_array,
         pickle.POP[0]: drop,
         pickle.REDUCE[0]: call,
         pickle.NEWOBJ[0]: make,
@@ -333,6 +377,6 @@ class _Reader(pickle._Unpickler):
     }
 
 
-for _name in _HARMLESS:
+for _name in _HARMLESS.split():
     _opcode = getattr(pickle, _name)[0]
     _Reader.dispatch[_opcode] = pickle._Unpickler.dispatch[_opcode]

@@ -1,6 +1,5 @@
 """Loading a saved SB3 model whose algorithm is not known beforehand."""
 
-import base64
 import io
 import json
 import warnings
@@ -12,15 +11,15 @@ from typing import Any, TypeVar
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.process import trusted
+from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.statistics import STATISTICS
-from sb3_quad.controllers.unpickle import unpickle
+from sb3_quad.controllers.unpickle import WAY_OUT, held, unpickle
 from sb3_quad.simulation.settings import KEY
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
@@ -51,6 +50,11 @@ DAMAGED = "not a complete SB3 zip"
 WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 # What SB3 saves apart from policies and optimisers. Loading another one would set any attribute.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
+_VARIABLE_FILES = ("pytorch_variables.pth", "tensors.pth")
+# Values in spaces and in the policy's keywords; each layer takes time.
+_LARGEST = 1000
+# Keywords that say nothing of a policy's layers, and that not all policies or devices take.
+_WITHOUT_SIZE = ("device", "optimizer_class", "optimizer_kwargs", "squash_output", "use_sde")
 
 
 def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
@@ -68,8 +72,21 @@ def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
         if not Path(path).is_file():
             raise ConfigError(f"{where}: no such file")
     # What a damaged archive raises depends on where the damage is.
-    with raised_as(ConfigError, f"{where}: {DAMAGED}"), zipfile.ZipFile(path) as archive:
+    with raised_as(ConfigError, f"{where}: {DAMAGED}"), _open(path, where) as archive:
         return dict(json.loads(archive.read("data")))
+
+
+def _open(file: Any, where: str) -> zipfile.ZipFile:
+    """Open a zip whose parts need no more memory than it has bytes, as SB3 and PyTorch write it.
+
+    :raises ConfigError: parts are compressed, or overlap.
+    """
+    archive = zipfile.ZipFile(file)
+    parts = archive.infolist()
+    size = sum(part.file_size for part in parts)
+    if size > archive.start_dir or any(part.compress_type for part in parts):
+        raise ConfigError(f"{where}: is compressed, as no zip of SB3 is; pack it with zip -0")
+    return archive
 
 
 def saved_algorithm(path: StrPath) -> str:
@@ -134,15 +151,46 @@ def load_zip(
     with raised_as(ConfigError, f"{where}: cannot be loaded"), warnings.catch_warnings():
         # SB3 takes the buffer of n-step returns, its own choice, for the user's.
         warnings.filterwarnings("ignore", "`n_steps=")
+        # It reads the layers of older zips, too.
+        warnings.filterwarnings("ignore", "As shared layers")
         if data:
-            # SB3 sets variables by their names, on any part of the model.
-            variables = load_from_zip_file(path, load_data=False, device="cpu")[2] or {}
-            if variables.keys() - _VARIABLES:
-                raise ConfigError(
-                    f"{where}: holds variables that no algorithm has; "
-                    f"known are {', '.join(sorted(_VARIABLES))}"
-                )
+            with _open(path, where) as archive:
+                _check_parameters(archive, data | objects, where)
         return algorithm.load(path, custom_objects=objects, **kwargs)
+
+
+def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> None:
+    """Check what PyTorch and the policy's class make of a zip, neither of which limits its size."""
+    for part in archive.namelist():
+        if not part.endswith(".pth"):
+            continue
+        its = f"{where}: its {part}"
+        with (
+            raised_as(ConfigError, f"{its} is not what PyTorch saves since 1.6; {WAY_OUT}"),
+            _open(archive.open(part), its) as weights,
+        ):
+            (name,) = [name for name in weights.namelist() if name.endswith("/data.pkl")]
+            content = unpickle(weights.read(name), its)
+        # SB3 sets variables by their names, on any part of the model.
+        if part in _VARIABLE_FILES and content and content.keys() - _VARIABLES:
+            raise ConfigError(
+                f"{where}: holds variables that no algorithm has; "
+                f"known are {', '.join(sorted(_VARIABLES))}"
+            )
+    walk([data.get(key) for key in _TO_FLY], held, _LARGEST)
+    given = data["policy_kwargs"]
+    keywords = {key: given[key] for key in given if key not in _WITHOUT_SIZE}
+    if keywords.get("n_critics", 2) > 100:
+        raise ConfigError(f"{where}: asks for more than 100 critics")
+    # Parameters on this device take no memory.
+    meta = th.device("meta")
+    sketch: Any = type("Sketch", (data["policy_class"],), {"device": meta})
+    with meta:
+        policy = sketch(data["observation_space"], data["action_space"], lambda _: 0.0, **keywords)
+    asked = sum(parameter.numel() for parameter in policy.parameters())
+    # Half precision is the least that somebody may have saved.
+    if 2 * asked > archive.getinfo("policy.pth").file_size:
+        raise ConfigError(f"{where}: asks for {asked:,} parameters, policy.pth holds fewer")
 
 
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
@@ -179,7 +227,7 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
     :raises ConfigError: a file that cannot be read, or none where the run had statistics.
     """
     for file in Path(path).parent.glob("*/vecnormalize.pkl"):
-        statistics = unpickle(base64.b64encode(file.read_bytes()).decode(), str(file))
+        statistics = unpickle(file.read_bytes(), str(file))
         if not isinstance(statistics, VecNormalize):
             raise ConfigError(f"{file}: holds no VecNormalize")
         return statistics

@@ -383,8 +383,11 @@ class QuadcopterBatch:
             std = DEFAULT_STD
         means = per_row("observation_mean", mean, self.n, OBSERVATION_SIZE)
         stds = per_row("observation_std", std, self.n, OBSERVATION_SIZE)
-        if (stds <= 0).any():
-            raise ConfigError("observation_std: every value must be positive")
+        # Beyond these, features would vanish or overflow.
+        if not ((stds >= 1e-6) & (stds <= 1e6)).all():
+            raise ConfigError("observation_std: every value must be of 1e-6 to 1e6")
+        if not (np.abs(means) <= 1e6).all():
+            raise ConfigError("observation_mean: every value must be of -1e6 to 1e6")
         self._scaling_of_rows = np.vstack([means, stds, np.zeros((2, self.n))])
 
     def _bind(self) -> None:

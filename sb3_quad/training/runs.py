@@ -12,7 +12,7 @@ import yaml
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import make_folder, write_text
+from sb3_quad.base.files import make_folder, remove_half_written, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import BEST, CORRECTED, run_agent
@@ -154,8 +154,13 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     :raises ConfigError: a folder that cannot be made.
     """
     make_folder(parent, "log folder", "-f")
+    folders = _numbered(parent, name)
+    # A run that was killed before it had settings is nobody's. Another may be about to have some.
+    for folder in folders.values():
+        if not any(folder.glob("*/args.yml")):
+            remove_half_written(folder, seconds=3.0)
     # Numbers of removed runs before the last one are not used again.
-    number = max(_numbered(parent, name), default=0) + 1
+    number = max(folders, default=0) + 1
     while True:
         ending = f"_{uuid.uuid4()}" if unique else ""
         path = parent / f"{name}_{number}{ending}"

@@ -58,10 +58,8 @@ SETTINGS = {
     "sac": OFF_POLICY,
     "sac_bc": OFF_POLICY,
 }
-MARKS = {
-    "pipeline": "pipeline.yml",
-    "sweep": "plan.json",
-}  # what a folder has that somebody resumes from; a run */args.yml
+# What a folder has that somebody resumes from; a run has */args.yml.
+MARKS = {"pipeline": "pipeline.yml", "sweep": "plan.json"}
 NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline|sweep)_\d+"
 SUITE = """
 name: one
@@ -113,16 +111,8 @@ def command(kind: str, folder: Path) -> list[str]:
     folder.mkdir(exist_ok=True)
     if kind == "evaluate":
         settings.write_text(SUITE)
-        return [
-            "evaluate",
-            "pid",
-            "geometric",
-            "itm-recovery",
-            "--suite",
-            str(settings),
-            "-o",
-            str(logs / kind / "out"),
-        ]
+        given = f"evaluate pid geometric itm-recovery --suite {settings} -o {logs / kind / 'out'}"
+        return given.split()
     small = {"QuadTargetTracking-v0": SETTINGS.get(kind, TINY)}
     settings.write_text(yaml.safe_dump({"stages": STAGES} if kind == "pipeline" else small))
     if kind == "sweep":
@@ -132,27 +122,12 @@ def command(kind: str, folder: Path) -> list[str]:
     if kind == "tune":
         space = folder / "space.yml"
         space.write_text("learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}\n")
-        more += [
-            "--search-space",
-            str(space),
-            "--storage",
-            str(folder / "study.log"),
-            "--max-total-trials",
-            "3",
-        ]
+        more += f"--search-space {space} --storage {folder / 'study.log'}".split()
+        more += ["--max-total-trials", "3"]
         return ["tune", "--algo", "dagger", *more, "--eval-episodes", "4", "--n-evaluations", "2"]
     single = [] if kind == "pipeline" else ["--algo", kind, "--env", "QuadTargetTracking-v0"]
-    often = [
-        "--eval-freq",
-        "1500",
-        "--eval-episodes",
-        "4",
-        "--save-freq",
-        "4000",
-        "--snapshot-every",
-        "0.2",
-    ]
-    return ["train", *single, *more, *often]
+    often = "--eval-freq 1500 --eval-episodes 4 --save-freq 4000 --snapshot-every 0.2"
+    return ["train", *single, *more, *often.split()]
 
 
 def forked(arguments: list[str], log: Path, folder: str | Path = ".", seconds: int = 0) -> int:

@@ -34,73 +34,23 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 SECONDS, MEMORY = 60.0, 3 * 2**30  # bytes; the imports take half a GB
 OUTSIDE = "../escaped"
 TEXTS = [  # as arguments; values that are only large are those of the corpus
-    *(
-        "",
-        " ",
-        "-1",
-        "0",
-        "nan",
-        "inf",
-        "1e400",
-        "1e-400",
-        "0x10",
-        "1,2",
-        "a:b",
-        "a:b:c",
-        "[[",
-        "{a: b}",
-        "(1, 2)",
-        "lin_x",
-    ),
-    *(".", "no/such/file", "x" * 5000, "\udcff", "ü<b>", "None", "os.system", "os:system"),
-    *(
-        "!!python/object/apply:os.system ['touch escaped']",
-        "__import__('os').system('touch escaped')",
-        "-",
-        "--",
-        "a=b=c",
-    ),
+    *("", " ", "-1", "0", "nan", "inf", "1e400", "1e-400", "0x10", "1,2", "a:b", "a:b:c", "[["),
+    *("{a: b}", "(1, 2)", "lin_x", ".", "no/such/file", "x" * 5000, "\udcff", "ü<b>", "None"),
+    *("os.system", "os:system", "-", "--", "a=b=c", "__import__('os').system('touch escaped')"),
+    "!!python/object/apply:os.system ['touch escaped']",
 ]
 VALUES: list[Any] = [  # in YAML
-    *(
-        None,
-        True,
-        "",
-        "x",
-        "nan",
-        -1,
-        0,
-        0.5,
-        float("nan"),
-        float("inf"),
-        10**30,
-        [],
-        [[]],
-        [None],
-        {},
-        {"a": "b"},
-        {1: 2},
-    ),
-    *(
-        "os.system",
-        {"os.system": {}},
-        "lin_x",
-        "../escaped",
-        "__import__('os').system('touch escaped')",
-    ),
+    *(None, True, "", "x", "nan", -1, 0, 0.5, float("nan"), float("inf"), 10**30, [], [[]], [None]),
+    *({}, {"a": "b"}, {1: 2}, "os.system", {"os.system": {}}, "lin_x", "../escaped"),
     *("x" * 5000, "\x00", [1, 2], [1, 2, 3], ["a"] * 4, [float("nan")] * 3, {"name": {"name": {}}}),
+    "__import__('os').system('touch escaped')",
 ]
 SUITE = {
     "name": "one",
     "scenarios": [{"name": "near", "target": {"distance": 1.0}, "duration": 2.0, "episodes": 2}],
 }
-SETTINGS = {
-    "n_timesteps": 20,
-    "n_envs": 2,
-    "n_steps": 10,
-    "batch_size": 20,
-    "policy_kwargs": {"net_arch": [4]},
-}
+SETTINGS: dict[str, Any] = {"n_timesteps": 20, "n_envs": 2, "n_steps": 10, "batch_size": 20}
+SETTINGS |= {"policy_kwargs": {"net_arch": [4]}}
 BASES = {
     "benchmark": "--no-training --seconds 0.001 --sizes 2 --n-envs 1",
     "check-vehicle": "itm -n 1",
