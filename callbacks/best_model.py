@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
@@ -104,8 +104,7 @@ class BestModel(EveryTimesteps):
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
-        if by not in RATES:
-            raise ConfigError(unknown("share", by, RATES))
+        refuse_unknown("share", [by], RATES)
         if n_episodes < 1:
             raise ConfigError(f"BestModel: n_episodes is {n_episodes}, must be at least 1")
         self._n_episodes = n_episodes
@@ -119,8 +118,9 @@ class BestModel(EveryTimesteps):
         # By the prefix of their part of a report.
         self._evaluations = {"": self._own}
         for name, other in (others or {}).items():
-            further = _Evaluations(other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}")
-            self._evaluations[f"{name}: "] = further
+            self._evaluations[f"{name}: "] = _Evaluations(
+                other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}"
+            )
         self._start = 0.0
         self._last = 0
         self.stopped = False  # by ``should_continue``

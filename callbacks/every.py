@@ -150,7 +150,6 @@ class EpisodeLog(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._start = time.time()
-        header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
         is_new = not self._path.exists()
         if not is_new:
             # A crash may have cut the last row.
@@ -161,7 +160,10 @@ class EpisodeLog(BaseCallback):
             if rows:
                 self._start -= float(rows[-1].split(",")[2])
         self._writer = ResultsWriter(
-            str(self._path), header, ("is_success",), override_existing=is_new
+            str(self._path),
+            {"t_start": self._start, "env_id": self._env_id},
+            ("is_success",),
+            override_existing=is_new,
         )
 
     def _on_step(self) -> bool:
@@ -169,13 +171,14 @@ class EpisodeLog(BaseCallback):
         for row in np.flatnonzero(self.locals["dones"]):
             info = self.locals["infos"][row]
             if "episode" in info:
-                values = {
-                    "r": round(float(info["episode"]["r"]), 6),
-                    "l": int(info["episode"]["l"]),
-                    "t": seconds,
-                    "is_success": info.get("is_success", ""),
-                }
-                self._writer.write_row(values)
+                self._writer.write_row(
+                    {
+                        "r": round(float(info["episode"]["r"]), 6),
+                        "l": int(info["episode"]["l"]),
+                        "t": seconds,
+                        "is_success": info.get("is_success", ""),
+                    }
+                )
         return True
 
     def _on_training_end(self) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Container, Sequence
 from pathlib import Path
 
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
 from sb3_quad.base.process import interrupts_leave, trusting
 from sb3_quad.cli import commands
 from sb3_quad.cli.parser import TRACEBACK, Parser, add_flags
@@ -107,8 +107,8 @@ def _parse(arguments: list[str]) -> Namespace | None:
     # Python represents bytes that are not text as lone surrogates.
     if any("\ud800" <= letter <= "\udfff" for letter in "".join(arguments)):
         raise ConfigError(f"arguments {' '.join(arguments)!r}: not valid UTF-8")
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-        raise ConfigError(unknown("command", arguments[0], COMMANDS))
+    if arguments and not arguments[0].startswith("-"):
+        refuse_unknown("command", arguments[:1], COMMANDS)
     try:
         options = parser.parse_args(arguments or ["--help"])
     except SystemExit:

@@ -78,16 +78,12 @@ class RunFolder:
 
         :raises ConfigError: the run has no checkpoint.
         """
-        steps = []
-        for checkpoint in self.path.glob(self.checkpoint("*").name):
-            number = checkpoint.name.split("_")[2]
-            if number.isdigit():
-                steps.append(int(number))
-        if not steps:
+        checkpoints = _numbered(self.path, "rl_model")
+        if not checkpoints:
             raise ConfigError(
                 f"{self.path}: holds no checkpoint; train with --save-freq to have some"
             )
-        return self.checkpoint(max(steps))
+        return self.checkpoint(max(checkpoints))
 
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
@@ -173,13 +169,13 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
 
 
 def _numbered(parent: Path, name: str) -> dict[int, Path]:
-    """Return the folders ``<parent>/<name>_<number>…`` by their numbers."""
-    folders = {}
-    for folder in sorted(parent.glob(f"{name}_*")):
-        number = folder.name.removeprefix(f"{name}_").split("_")[0]
+    """Return the folders or files ``<parent>/<name>_<number>…`` by their numbers."""
+    paths = {}
+    for path in sorted(parent.glob(f"{name}_*")):
+        number = path.name.removeprefix(f"{name}_").split("_")[0]
         if number.isdigit():
-            folders[int(number)] = folder
-    return folders
+            paths[int(number)] = path
+    return paths
 
 
 def open_run(path: StrPath) -> RunFolder:
