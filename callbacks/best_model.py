@@ -219,8 +219,9 @@ class _Evaluations:
                 f"{self.path}: evaluations of {flown} episodes; "
                 f"n_episodes (--eval-episodes) must be {flown}"
             )
-        rows = zip(*arrays.values(), strict=False)
-        self.rows = [dict(zip(arrays, row, strict=True)) for row in rows]
+        self.rows = [
+            dict(zip(arrays, row, strict=True)) for row in zip(*arrays.values(), strict=False)
+        ]
 
     def append(self, row: StrDict) -> None:
         """Add an evaluation and write the file.
@@ -242,8 +243,7 @@ def score(row: StrDict, by: str) -> Score:
 
     :param by: the array of the rate.
     """
-    rate = np.nan_to_num(np.mean(row.get(by, 0.0)))
-    return float(rate), float(np.mean(row["results"]))
+    return float(np.nan_to_num(np.mean(row.get(by, 0.0)))), float(np.mean(row["results"]))
 
 
 def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:

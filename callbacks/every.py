@@ -120,8 +120,7 @@ class ProgressLine(BaseCallback):
             line += f", mean reward {safe_mean([episode['r'] for episode in episodes]):.2f}"
         # A resumed training is timed from where it continues.
         seconds_per_step = elapsed / (self.num_timesteps - self._first_timestep)
-        minutes = seconds_per_step * (total - self.num_timesteps) / 60
-        return f"{line}, {minutes:.0f} min left"
+        return f"{line}, {seconds_per_step * (total - self.num_timesteps) / 60:.0f} min left"
 
 
 class EpisodeLog(BaseCallback):

@@ -57,9 +57,8 @@ def make_parser() -> Parser:
     siblings: dict[str, Container[str]] = {}
     for name, command in COMMANDS.items():
         text, heading, rest = str(command.__doc__).partition("examples:\n")
-        summary = text.partition("\n\n")[0]
         subparser = subparsers.add_parser(
-            name, help=summary, description=text, epilog=heading + rest
+            name, help=text.partition("\n\n")[0], description=text, epilog=heading + rest
         )
         add_flags(subparser, {**command.FLAGS, **TRACEBACK})
         subparser.siblings = siblings
@@ -126,8 +125,6 @@ def _unexpected(error: BaseException) -> str:
     """Return the message of an exception that no check foresaw, with the place that raised it."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'a file'}: {error.strerror}"
-    notes = getattr(error, "__notes__", ())
-    text = "; ".join([f"{type(error).__name__}: {error}", *notes])
+    text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())])
     last = traceback.extract_tb(error.__traceback__)[-1]
-    place = f"{Path(last.filename).name}, line {last.lineno}"
-    return f"{text} ({place}; add --traceback for all of it)"
+    return f"{text} ({Path(last.filename).name}, line {last.lineno}; add --traceback for all of it)"

@@ -81,6 +81,5 @@ def write_result(folder: Path, result: RunResult) -> None:
 
 def read_results(folder: Path) -> dict[str, RunResult]:
     """Read the results of all runs that ended, by name."""
-    paths = (folder / RECORDS).rglob("*.json")
-    results = [read_record(path, RunResult) for path in paths]
+    results = [read_record(path, RunResult) for path in (folder / RECORDS).rglob("*.json")]
     return {result.name: result for result in results}

@@ -129,9 +129,8 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     """
     columns = []
     for name, seeds in summary.configurations.items():
-        columns.append(
-            Column(f"{name} (1 seed)" if len(seeds) == 1 else f"{name} ({len(seeds)} seeds)")
-        )
+        noun = "seed" if len(seeds) == 1 else "seeds"
+        columns.append(Column(f"{name} ({len(seeds)} {noun})"))
     tables = []
     comparisons = []
     for scenario, group in flights.groupby(level="scenario", sort=False):
@@ -169,8 +168,9 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     # There are comparisons if there are several configurations.
     if comparisons:
         columns = [Column("is", align="left"), Column("difference")]
-        title = "better, worse, cannot tell"
-        tables.append(Table(columns, comparisons, title=title, caption=PAIRED))
+        tables.append(
+            Table(columns, comparisons, title="better, worse, cannot tell", caption=PAIRED)
+        )
     return tables
 
 
@@ -216,12 +216,14 @@ def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) 
     """Write the report of the finished runs: a section for each table, and the learning curves."""
     parts: list[Section] = []
     for table in tables:
-        anchor = f"table-{len(parts)}"
-        parts.append(Section(anchor, table.title, tables=[table], facts=table.caption))
+        parts.append(
+            Section(f"table-{len(parts)}", table.title, tables=[table], facts=table.caption)
+        )
     plots = _curves(folder, summary)
     if plots:
-        description = "Mean over seeds, with their range."
-        parts.append(Section("curves", "Learning curves", description, plots=plots))
+        parts.append(
+            Section("curves", "Learning curves", "Mean over seeds, with their range.", plots=plots)
+        )
     facts = f"{summary.finished} of {summary.runs} runs are finished."
     write_page(folder, f"Sweep: {summary.sweep}", facts, parts)
 

@@ -425,8 +425,8 @@ def check_environment(env_id: str) -> None:
     if env_id in gymnasium.registry:
         return
     raise ConfigError(
-        f"unknown environment {env_id!r}: {did_you_mean(env_id, gymnasium.registry)}(of this package: {', '.join(ENVIRONMENTS)}; "
-        "others: --gym-packages)"
+        f"unknown environment {env_id!r}: {did_you_mean(env_id, gymnasium.registry)}"
+        f"(of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)"
     )
 
 

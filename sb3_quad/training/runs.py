@@ -113,16 +113,17 @@ def made_with() -> dict[str, str]:
     The commit has a mark where files differ from it.
     """
     command = shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'")
-    here = Path(__file__).parent
     try:
-        commit = subprocess.check_output(command, cwd=here, text=True, stderr=subprocess.DEVNULL)
+        commit = subprocess.check_output(
+            command, cwd=Path(__file__).parent, text=True, stderr=subprocess.DEVNULL
+        )
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"
-    versions = (
-        f"sb3_quad {__version__}, stable-baselines3 {stable_baselines3.__version__}, "
-        f"torch {torch.__version__}"
-    )
-    return {"commit": commit.strip(), "versions": versions}
+    return {
+        "commit": commit.strip(),
+        "versions": f"sb3_quad {__version__}, stable-baselines3 {stable_baselines3.__version__}, "
+        f"torch {torch.__version__}",
+    }
 
 
 def file_name(env_id: str) -> str:
@@ -158,8 +159,7 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     # Numbers of removed runs before the last one are not used again.
     number = max(folders, default=0) + 1
     while True:
-        ending = f"_{uuid.uuid4()}" if unique else ""
-        path = parent / f"{name}_{number}{ending}"
+        path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
         try:
             path.mkdir()
             return path

@@ -94,8 +94,10 @@ def count_trials(search: Search) -> str:
 def train_command(search: Search) -> str:
     """The command that trains with the best settings, as the trials did."""
     config = search.job.config
-    file = Path(search.job.log_folder, BEST)
-    command = f"sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {file}"
+    command = (
+        f"sb3-quad train --algo {config.algo} --env {config.env_id} "
+        f"--conf-file {Path(search.job.log_folder, BEST)}"
+    )
     if search.job.trained_agent:
         command += f" -i {search.job.trained_agent}"
     return command

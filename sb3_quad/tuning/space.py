@@ -140,10 +140,13 @@ def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchS
             raise ConfigError(f"{where}: {unknown(f'setting of {config.algo}', name, valid)}")
     if MINIBATCHES in content and "batch_size" in content:
         raise ConfigError(f"{where}: {MINIBATCHES} sets batch_size; remove one of them")
-    dimensions = {}
-    for name, values in content.items():
-        dimensions[name] = _dimension(config, name, values, f"{where}: {name}")
-    return SearchSpace(config, dimensions)
+    return SearchSpace(
+        config,
+        {
+            name: _dimension(config, name, values, f"{where}: {name}")
+            for name, values in content.items()
+        },
+    )
 
 
 def _current(config: TrainingConfig, name: str) -> Any:

@@ -81,8 +81,11 @@ def run(options: Namespace) -> int:
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
-        names = ("sweep", *SweepSpec.model_fields, "suite", "episodes")
-        refuse(options, names, "--resume keeps the sweep's own settings; remove {}")
+        refuse(
+            options,
+            ("sweep", *SweepSpec.model_fields, "suite", "episodes"),
+            "--resume keeps the sweep's own settings; remove {}",
+        )
         folder = Path(options.resume)
         return _execute(options, read_sweep(folder), folder)
     spec = _spec(options)
@@ -153,11 +156,13 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
     with start_executor(options.executor, workers, options.address, **resources) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
-            parent = Path(options.log_folder or "logs") / "sweep"
-            folder = claim_folder(parent, sweep.spec.name or "sweep")
+            folder = claim_folder(
+                Path(options.log_folder or "logs") / "sweep", sweep.spec.name or "sweep"
+            )
             write_sweep(folder, sweep)
-        parallel = f"{executor.workers} in parallel, executor {options.executor}"
-        print(f"sweep {folder}: {runs}, {parallel}")
+        print(
+            f"sweep {folder}: {runs}, {executor.workers} in parallel, executor {options.executor}"
+        )
         with (
             locked(folder, "sweep folder"),
             StopSignals() as signals,

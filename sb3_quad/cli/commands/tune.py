@@ -80,8 +80,10 @@ def run(options: Namespace) -> int:
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
-        where = f"results go to {search.job.log_folder}"
-        print(f"study {search.name} in {search.storage}: {count_trials(search)}; {where}")
+        print(
+            f"study {search.name} in {search.storage}: {count_trials(search)}; "
+            f"results go to {search.job.log_folder}"
+        )
         with progress_bar(options.progress) as show:
             try:
                 for number in range(options.n_trials):
@@ -155,5 +157,7 @@ def _print_results(search: Any) -> None:
             print(f"agent: {model}")
         print(f"to train: {train_command(search)}")
     print(f"{count_trials(search)}; saved in {search.job.log_folder}")
-    study = f"--storage {search.storage} --study-name {search.name}"
-    print(f"to continue, run the same command with {study}")
+    print(
+        "to continue, run the same command with "
+        f"--storage {search.storage} --study-name {search.name}"
+    )
