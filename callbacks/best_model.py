@@ -230,9 +230,9 @@ class _Evaluations:
         update.
         """
         self.rows.append(row)
-        example = dict(ChainMap(*self.rows))
         arrays: StrDict = {}
-        for name, value in example.items():
+        # Of each array, an example.
+        for name, value in ChainMap(*self.rows).items():
             nothing = np.full(np.shape(value), np.nan)
             arrays[name] = [row.get(name, nothing) for row in self.rows]
         write_arrays(self.path, **arrays)

@@ -112,8 +112,10 @@ class ProgressLine(BaseCallback):
 
     def _line(self, elapsed: float) -> str:
         total = self._last_timestep
-        line = f"{self.num_timesteps:>12,} of {total:,} timesteps"
-        line += f" ({100 * self.num_timesteps / total:.0f} %)"
+        line = (
+            f"{self.num_timesteps:>12,} of {total:,} timesteps"
+            f" ({100 * self.num_timesteps / total:.0f} %)"
+        )
         # Monitor fills this buffer where an episode ends.
         episodes = self.model.ep_info_buffer
         if episodes:

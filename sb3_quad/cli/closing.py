@@ -55,13 +55,12 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     """
     how = dict(job.flight_settings)
     controllers = {"agent": model, "expert": job.for_evaluation().make_expert()}
-    agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
     return compare(
         controllers,
         [how.pop("task")],
         FRESH_EPISODES,
         seed_for("table", job.seed),
-        thesis_columns=(agent, "expert"),
+        thesis_columns=("IL-agent" if job.config.algo == "dagger" else "RL-agent", "expert"),
         **how,
     ).tables[0]
 

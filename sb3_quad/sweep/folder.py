@@ -59,8 +59,10 @@ class Sweep(Frozen):
 
 def write_sweep(folder: Path, sweep: Sweep) -> None:
     """Write a sweep, before its first run."""
-    spec = sweep.spec.model_dump(mode="json", exclude_defaults=True)
-    write_text(folder / "sweep.yaml", yaml.safe_dump(spec, sort_keys=False))
+    write_text(
+        folder / "sweep.yaml",
+        yaml.safe_dump(sweep.spec.model_dump(mode="json", exclude_defaults=True), sort_keys=False),
+    )
     write_text(folder / PLAN, sweep.model_dump_json(indent=1) + "\n")
 
 

@@ -108,10 +108,19 @@ def write_results(
             part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
             parts[run.configuration, run.seed, scenario] = part
             # All are means but for the final error, which is a median.
-            statistics = {**part.mean(), "final_error": part["final_error"].quantile()}
-            lines.append({**line, "scenario": scenario, "episodes": len(part), **statistics})
-    table = pd.DataFrame(lines, columns=COLUMNS)
-    write_text(folder / "results.csv", table.to_csv(index=False, float_format="%.9g"))
+            lines.append(
+                {
+                    **line,
+                    "scenario": scenario,
+                    "episodes": len(part),
+                    **part.mean(),
+                    "final_error": part["final_error"].quantile(),
+                }
+            )
+    write_text(
+        folder / "results.csv",
+        pd.DataFrame(lines, columns=COLUMNS).to_csv(index=False, float_format="%.9g"),
+    )
     tables = []
     if parts:
         tables = _compare(summary, pd.concat(parts, names=LEVELS))
@@ -158,12 +167,13 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
                 if difference is not None:
                     key |= {"first": first, "second": second, "verdict": verdict(difference)}
                     summary.comparisons.append({**dict(difference), **key})
-                    name = f"{scenario}, {row.heading}: {first} than {second}"
                     cells = [
                         Cell(words=key["verdict"]),
                         estimate_cell(difference, factor, decimals),
                     ]
-                    comparisons.append(Row(name, cells=cells))
+                    comparisons.append(
+                        Row(f"{scenario}, {row.heading}: {first} than {second}", cells=cells)
+                    )
         tables.append(Table(columns, rows, title=scenario, caption=CAPTION))
     # There are comparisons if there are several configurations.
     if comparisons:
@@ -224,8 +234,12 @@ def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) 
         parts.append(
             Section("curves", "Learning curves", "Mean over seeds, with their range.", plots=plots)
         )
-    facts = f"{summary.finished} of {summary.runs} runs are finished."
-    write_page(folder, f"Sweep: {summary.sweep}", facts, parts)
+    write_page(
+        folder,
+        f"Sweep: {summary.sweep}",
+        f"{summary.finished} of {summary.runs} runs are finished.",
+        parts,
+    )
 
 
 def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
@@ -245,6 +259,11 @@ def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
     for kind, groups in curves.items():
         # An environment of others may report neither success nor reward.
         with suppress(ConfigError):
-            caption = f"{kind}: success and reward along the training."
-            plots.append(Plot(f"curves_{len(plots)}", caption, plot_curves(groups, {}, kind)))
+            plots.append(
+                Plot(
+                    f"curves_{len(plots)}",
+                    f"{kind}: success and reward along the training.",
+                    plot_curves(groups, {}, kind),
+                )
+            )
     return plots

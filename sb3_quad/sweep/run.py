@@ -145,8 +145,12 @@ def _train(run: Run, place: Path) -> PipelineResult:
         settings = place / f"stage_{number}.yml"
         write_text(settings, yaml.safe_dump({stage.env: stage.settings}, sort_keys=False))
         stages.append(stage.model_copy(update={"conf_file": str(settings), "settings": {}}))
-    job = {**run.job, "seed": run.seed, "log_folder": str(place)}
-    return run_pipeline(Pipeline(stages=tuple(stages)), job, "pipeline", report)
+    return run_pipeline(
+        Pipeline(stages=tuple(stages)),
+        {**run.job, "seed": run.seed, "log_folder": str(place)},
+        "pipeline",
+        report,
+    )
 
 
 def _fly(

@@ -89,8 +89,11 @@ def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
         types = {}
     parameters = {}
     for name, parameter in inspect.signature(algorithm).parameters.items():
-        is_setting = name not in _SET_BY_JOB and not name.startswith("_")
-        if is_setting and parameter.kind is not parameter.VAR_KEYWORD:
+        if (
+            name not in _SET_BY_JOB
+            and not name.startswith("_")
+            and parameter.kind is not parameter.VAR_KEYWORD
+        ):
             parameters[name] = parameter.replace(annotation=types.get(name, Any))
     return parameters
 

@@ -264,8 +264,10 @@ class TrainingJob(JobOptions):
 
         :param changes: to the keywords of the environments.
         """
-        keywords = {**self.config.env_kwargs, **self.config.eval_env_kwargs, **changes}
-        return self.config.model_copy(update={"env_kwargs": keywords})
+        config = self.config
+        return config.model_copy(
+            update={"env_kwargs": {**config.env_kwargs, **config.eval_env_kwargs, **changes}}
+        )
 
     @property
     def flight_settings(self) -> FlightSettings:
@@ -351,8 +353,10 @@ def merged(settings: StrMapping, changes: StrMapping, where: str) -> StrDict:
     """
     result = {**settings, **changes}
     for key in ENV_KEYS & changes.keys():
-        own = parse_mapping(settings.get(key), f"{where}: {key}")
-        result[key] = {**own, **parse_mapping(changes[key], key)}
+        result[key] = {
+            **parse_mapping(settings.get(key), f"{where}: {key}"),
+            **parse_mapping(changes[key], key),
+        }
     return result
 
 
@@ -422,12 +426,11 @@ def check_environment(env_id: str) -> None:
 
     :raises ConfigError: it does not; the message names the nearest.
     """
-    if env_id in gymnasium.registry:
-        return
-    raise ConfigError(
-        f"unknown environment {env_id!r}: {did_you_mean(env_id, gymnasium.registry)}"
-        f"(of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)"
-    )
+    if env_id not in gymnasium.registry:
+        raise ConfigError(
+            f"unknown environment {env_id!r}: {did_you_mean(env_id, gymnasium.registry)}"
+            f"(of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)"
+        )
 
 
 def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict:

@@ -275,8 +275,9 @@ def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Pa
         return agent
     model = load_zip(job.config.algorithm, agent, device=job.device)
     report("correcting the agent's offset, which may take minutes")
-    seed = seed_for("correction", job.seed)
-    change = correct_offset(model, seed, job.flight_settings, stage.correct_offset)
+    change = correct_offset(
+        model, seed_for("correction", job.seed), job.flight_settings, stage.correct_offset
+    )
     save_model(model, run.corrected_model)
     report(
         f"corrected: steady offset {change.before:.3f} m, now {change.after:.3f} m: "

@@ -209,9 +209,9 @@ def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> Ru
         with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
         exp_id = max(with_agent or folders)
     if exp_id not in folders:
-        existing = ", ".join(folder.name for folder in folders.values())
         raise ConfigError(
-            f"{parent}: there is no run {name}_{exp_id}; there is {existing}; "
+            f"{parent}: there is no run {name}_{exp_id}; "
+            f"there is {', '.join(folder.name for folder in folders.values())}; "
             "give another with --exp-id"
         )
     return RunFolder(folders[exp_id], name)

@@ -116,8 +116,7 @@ class SnapshotFile(BaseCallback):
                 self.write()
             except ConfigError as error:
                 self._report(f"warning: no new snapshot, the one before is kept: {error}")
-            took = time.monotonic() - start
-            self._next_write = start + max(self._every, took / SHARE)
+            self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
 
     def write(self) -> None:
         """Write the latest snapshot; until that is whole, the file holds the one before.
@@ -346,8 +345,10 @@ def random_state() -> Arrays:
     They are torch's, Python's and NumPy's.
     """
     states = [random.getstate(), np.random.get_state(legacy=False)]  # noqa: NPY002
-    text = json.dumps(states, default=np.ndarray.tolist)
-    return {"torch": th.get_rng_state().numpy().copy(), "random": np.array(text)}
+    return {
+        "torch": th.get_rng_state().numpy().copy(),
+        "random": np.array(json.dumps(states, default=np.ndarray.tolist)),
+    }
 
 
 def set_random_state(state: Arrays) -> None:

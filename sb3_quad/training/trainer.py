@@ -193,8 +193,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
     model = _construct(config, env, keywords)
     # An expert that fails does so before there is a run folder.
-    will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: False)
-    if will_clone():
+    if getattr(model, "will_clone", lambda: False)():
         observation: Any = env.reset()
         Controller.for_env(keywords.get("expert"), env).labels(observation)
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.

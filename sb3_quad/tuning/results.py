@@ -26,9 +26,10 @@ def write_results(search: Search) -> None:
     # The table is written after each trial, so that an interruption loses none.
     columns = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds"]
     columns += [*search.space.dimensions, RUN, ERROR]
-    rows = [_row(search, trial) for trial in search.trials()]
     # A cell is empty where its row lacks the key. Keys without a column are ignored.
-    table = pd.DataFrame(rows, columns=columns, dtype=object)
+    table = pd.DataFrame(
+        [_row(search, trial) for trial in search.trials()], columns=columns, dtype=object
+    )
     write_text(folder / TRIALS, table.to_csv(index=False))
     best = search.best
     if best is None:

@@ -251,8 +251,10 @@ class NumberedSampler(BaseSampler):
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> Any:
         # A retry has the parameters of an earlier trial, and no number of its own.
-        before = study.get_trials(deepcopy=False)[: trial.number]
-        number = sum("again" not in earlier.user_attrs for earlier in before)
+        number = sum(
+            "again" not in earlier.user_attrs
+            for earlier in study.get_trials(deepcopy=False)[: trial.number]
+        )
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
         self._sampler = SAMPLERS[self.kind](n_startup_trials=self.n_startup_trials, seed=seed)
         return self._sampler.infer_relative_search_space(study, trial)

@@ -113,8 +113,9 @@ def run(options: Namespace) -> int:
     labels = [spec.label for spec in controllers]
     columns = [label for label in labels if label in flown]
     if columns:
-        scenarios = {"scenarios": list(suite.scenarios)}
-        console().print(overview(results.model_copy(update=scenarios), columns))
+        console().print(
+            overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), columns)
+        )
     if flown:
         print(
             f"{time.perf_counter() - start:.1f} s; "

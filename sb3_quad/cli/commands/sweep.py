@@ -174,8 +174,10 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
             results, tables = write_results(folder, sweep, ended)
             for table in tables:
                 console().print(table)
-    seconds = time.perf_counter() - start
-    print(f"{results.finished} of {runs} finished, {len(results.failed)} failed; {seconds:.1f} s")
+    print(
+        f"{results.finished} of {runs} finished, {len(results.failed)} failed; "
+        f"{time.perf_counter() - start:.1f} s"
+    )
     report = ", report.md, report.html" if results.finished else ""
     print(f"saved in {folder}: results.csv, results.json, runs/{report}")
     for name, message in results.failed.items():

@@ -113,12 +113,15 @@ def _make_search(options: Namespace) -> Any:
 
     config = make_config(options)
     space = load_space(config, options.search_space)
-    arguments = {
-        "config": config,
-        "eval_episodes": EPISODES[config.vec_env],
-        **given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes"),
-    }
-    job = validate(TrainingJob, arguments, "command line")
+    job = validate(
+        TrainingJob,
+        {
+            "config": config,
+            "eval_episodes": EPISODES[config.vec_env],
+            **given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes"),
+        },
+        "command line",
+    )
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     try:
         return Search(
