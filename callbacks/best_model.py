@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
@@ -104,8 +104,7 @@ class BestModel(EveryTimesteps):
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
-        if by not in RATES:
-            raise ConfigError(unknown("share", by, RATES))
+        refuse_unknown("share", [by], RATES)
         if n_episodes < 1:
             raise ConfigError(f"BestModel: n_episodes is {n_episodes}, must be at least 1")
         self._n_episodes = n_episodes
@@ -119,8 +118,9 @@ class BestModel(EveryTimesteps):
         # By the prefix of their part of a report.
         self._evaluations = {"": self._own}
         for name, other in (others or {}).items():
-            further = _Evaluations(other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}")
-            self._evaluations[f"{name}: "] = further
+            self._evaluations[f"{name}: "] = _Evaluations(
+                other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}"
+            )
         self._start = 0.0
         self._last = 0
         self.stopped = False  # by ``should_continue``
@@ -219,8 +219,9 @@ class _Evaluations:
                 f"{self.path}: evaluations of {flown} episodes; "
                 f"n_episodes (--eval-episodes) must be {flown}"
             )
-        rows = zip(*arrays.values(), strict=False)
-        self.rows = [dict(zip(arrays, row, strict=True)) for row in rows]
+        self.rows = [
+            dict(zip(arrays, row, strict=True)) for row in zip(*arrays.values(), strict=False)
+        ]
 
     def append(self, row: StrDict) -> None:
         """Add an evaluation and write the file.
@@ -229,9 +230,9 @@ class _Evaluations:
         update.
         """
         self.rows.append(row)
-        example = dict(ChainMap(*self.rows))
         arrays: StrDict = {}
-        for name, value in example.items():
+        # Of each array, an example.
+        for name, value in ChainMap(*self.rows).items():
             nothing = np.full(np.shape(value), np.nan)
             arrays[name] = [row.get(name, nothing) for row in self.rows]
         write_arrays(self.path, **arrays)
@@ -242,8 +243,7 @@ def score(row: StrDict, by: str) -> Score:
 
     :param by: the array of the rate.
     """
-    rate = np.nan_to_num(np.mean(row.get(by, 0.0)))
-    return float(rate), float(np.mean(row["results"]))
+    return float(np.nan_to_num(np.mean(row.get(by, 0.0)))), float(np.mean(row["results"]))
 
 
 def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:

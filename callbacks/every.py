@@ -112,16 +112,17 @@ class ProgressLine(BaseCallback):
 
     def _line(self, elapsed: float) -> str:
         total = self._last_timestep
-        line = f"{self.num_timesteps:>12,} of {total:,} timesteps"
-        line += f" ({100 * self.num_timesteps / total:.0f} %)"
+        line = (
+            f"{self.num_timesteps:>12,} of {total:,} timesteps"
+            f" ({100 * self.num_timesteps / total:.0f} %)"
+        )
         # Monitor fills this buffer where an episode ends.
         episodes = self.model.ep_info_buffer
         if episodes:
             line += f", mean reward {safe_mean([episode['r'] for episode in episodes]):.2f}"
         # A resumed training is timed from where it continues.
         seconds_per_step = elapsed / (self.num_timesteps - self._first_timestep)
-        minutes = seconds_per_step * (total - self.num_timesteps) / 60
-        return f"{line}, {minutes:.0f} min left"
+        return f"{line}, {seconds_per_step * (total - self.num_timesteps) / 60:.0f} min left"
 
 
 class EpisodeLog(BaseCallback):
@@ -150,7 +151,6 @@ class EpisodeLog(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._start = time.time()
-        header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
         is_new = not self._path.exists()
         if not is_new:
             # A crash may have cut the last row.
@@ -161,7 +161,10 @@ class EpisodeLog(BaseCallback):
             if rows:
                 self._start -= float(rows[-1].split(",")[2])
         self._writer = ResultsWriter(
-            str(self._path), header, ("is_success",), override_existing=is_new
+            str(self._path),
+            {"t_start": self._start, "env_id": self._env_id},
+            ("is_success",),
+            override_existing=is_new,
         )
 
     def _on_step(self) -> bool:
@@ -169,13 +172,14 @@ class EpisodeLog(BaseCallback):
         for row in np.flatnonzero(self.locals["dones"]):
             info = self.locals["infos"][row]
             if "episode" in info:
-                values = {
-                    "r": round(float(info["episode"]["r"]), 6),
-                    "l": int(info["episode"]["l"]),
-                    "t": seconds,
-                    "is_success": info.get("is_success", ""),
-                }
-                self._writer.write_row(values)
+                self._writer.write_row(
+                    {
+                        "r": round(float(info["episode"]["r"]), 6),
+                        "l": int(info["episode"]["l"]),
+                        "t": seconds,
+                        "is_success": info.get("is_success", ""),
+                    }
+                )
         return True
 
     def _on_training_end(self) -> None:

@@ -5,7 +5,7 @@ with code 2.
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 
@@ -59,6 +59,16 @@ def raised_as(error: type[SB3QuadError], what: str) -> Iterator[None]:
     except (Exception, SystemExit) as failure:
         reason = " ".join(str(failure).split())[:200]
         raise error(f"{what} ({type(failure).__name__}: {reason})") from failure
+
+
+def refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str]) -> None:
+    """Refuse names that are not among the valid ones.
+
+    :raises ConfigError: as :func:`unknown` says.
+    """
+    for name in names:
+        if name not in valid:
+            raise ConfigError(unknown(kind, name, valid))
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Container, Sequence
 from pathlib import Path
 
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
 from sb3_quad.base.process import interrupts_leave, trusting
 from sb3_quad.cli import commands
 from sb3_quad.cli.parser import TRACEBACK, Parser, add_flags
@@ -57,9 +57,8 @@ def make_parser() -> Parser:
     siblings: dict[str, Container[str]] = {}
     for name, command in COMMANDS.items():
         text, heading, rest = str(command.__doc__).partition("examples:\n")
-        summary = text.partition("\n\n")[0]
         subparser = subparsers.add_parser(
-            name, help=summary, description=text, epilog=heading + rest
+            name, help=text.partition("\n\n")[0], description=text, epilog=heading + rest
         )
         add_flags(subparser, {**command.FLAGS, **TRACEBACK})
         subparser.siblings = siblings
@@ -107,8 +106,8 @@ def _parse(arguments: list[str]) -> Namespace | None:
     # Python represents bytes that are not text as lone surrogates.
     if any("\ud800" <= letter <= "\udfff" for letter in "".join(arguments)):
         raise ConfigError(f"arguments {' '.join(arguments)!r}: not valid UTF-8")
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-        raise ConfigError(unknown("command", arguments[0], COMMANDS))
+    if arguments and not arguments[0].startswith("-"):
+        refuse_unknown("command", arguments[:1], COMMANDS)
     try:
         options = parser.parse_args(arguments or ["--help"])
     except SystemExit:
@@ -126,8 +125,6 @@ def _unexpected(error: BaseException) -> str:
     """Return the message of an exception that no check foresaw, with the place that raised it."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'a file'}: {error.strerror}"
-    notes = getattr(error, "__notes__", ())
-    text = "; ".join([f"{type(error).__name__}: {error}", *notes])
+    text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())])
     last = traceback.extract_tb(error.__traceback__)[-1]
-    place = f"{Path(last.filename).name}, line {last.lineno}"
-    return f"{text} ({place}; add --traceback for all of it)"
+    return f"{text} ({Path(last.filename).name}, line {last.lineno}; add --traceback for all of it)"

@@ -42,8 +42,9 @@ def print_tables(
 
     :param settings: how the controllers fly in any task: vehicle, noise and scaling.
     """
-    result = compare(controllers, n_flights=n, seed=seed, thesis_columns=thesis_columns, **settings)
-    for table in result.tables:
+    for table in compare(
+        controllers, n_flights=n, seed=seed, thesis_columns=thesis_columns, **settings
+    ).tables:
         console().print(table)
 
 
@@ -54,16 +55,14 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     """
     how = dict(job.flight_settings)
     controllers = {"agent": model, "expert": job.for_evaluation().make_expert()}
-    agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
-    result = compare(
+    return compare(
         controllers,
         [how.pop("task")],
         FRESH_EPISODES,
         seed_for("table", job.seed),
-        thesis_columns=(agent, "expert"),
+        thesis_columns=("IL-agent" if job.config.algo == "dagger" else "RL-agent", "expert"),
         **how,
-    )
-    return result.tables[0]
+    ).tables[0]
 
 
 def print_agent(job: TrainingJob, model: Any) -> None:
@@ -126,16 +125,15 @@ def _print_next(run: RunFolder) -> None:
 
     Environments of other packages have no such commands, nor agents behind wrappers.
     """
-    if run.name not in ENVIRONMENTS:
-        return
-    if KEY not in saved_data(run.result):
+    if run.name not in ENVIRONMENTS or KEY not in saved_data(run.result):
         return
     # An agent of many vehicles has none that export could take by itself.
     settings, _ = agent_settings(run.result)
-    text = NEXT.format(
-        agent=shlex.quote(str(run.result)),
-        label=shlex.quote(f"{run.path.parent.name}_{run.path.name}"),
-        env=run.name,
-        vehicle=" --vehicle itm" if settings.vehicles else "",
+    print(
+        NEXT.format(
+            agent=shlex.quote(str(run.result)),
+            label=shlex.quote(f"{run.path.parent.name}_{run.path.name}"),
+            env=run.name,
+            vehicle=" --vehicle itm" if settings.vehicles else "",
+        )
     )
-    print(text)

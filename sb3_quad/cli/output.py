@@ -32,9 +32,7 @@ def warn(line: str) -> None:
 
 def shows_progress(wanted: bool | None) -> bool:
     """Whether to show a progress bar: as ``wanted``, or with None, in a terminal."""
-    if wanted is None:
-        return sys.stderr.isatty()
-    return wanted
+    return sys.stderr.isatty() if wanted is None else wanted
 
 
 @contextmanager

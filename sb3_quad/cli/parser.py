@@ -237,8 +237,8 @@ PROGRESS: Flags = {"-P --progress": (YES_OR_NO, None, "show a progress bar (yes 
 
 def given(options: Namespace, *names: str) -> StrDict:
     """Return those of some options that the command has and that were given."""
-    values = {name: getattr(options, name, None) for name in names}
-    return {name: value for name, value in values.items() if value is not None}
+    values = vars(options)
+    return {name: values[name] for name in names if values.get(name) is not None}
 
 
 def refuse(options: Namespace, names: Iterable[str], message: str) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.types import Report
 from sb3_quad.executors.local import LocalExecutor
@@ -40,8 +40,7 @@ def start_executor(
     :raises ConfigError: An unknown kind, fewer than one worker, or an address that does not answer.
         :class:`~sb3_quad.base.errors.MissingExtra` without Ray.
     """
-    if kind not in EXECUTORS:
-        raise ConfigError(unknown("executor", kind, EXECUTORS))
+    refuse_unknown("executor", [kind], EXECUTORS)
     if kind == "local":
         if address is not None:
             raise ConfigError(f"address {address}: goes with --executor ray")

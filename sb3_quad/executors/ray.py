@@ -38,11 +38,12 @@ class RayExecutor:
         self._ray = require("ray", "ray", "--executor ray")
         self._options = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
         self._references = list[Any]()
-        variables = {
-            "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
-            TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0"),
+        environment: StrDict = {
+            "env_vars": {
+                "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
+                TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0"),
+            }
         }
-        environment: StrDict = {"env_vars": variables}
         options: StrDict = {
             "runtime_env": environment,
             "log_to_driver": False,
@@ -75,8 +76,9 @@ class RayExecutor:
             self.workers = max(1, int(total.get("CPU", 0) // num_cpus))
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        name = getattr(function, "__name__", "call")
-        call = self._ray.remote(_call).options(name=name, **self._options)
+        call = self._ray.remote(_call).options(
+            name=getattr(function, "__name__", "call"), **self._options
+        )
         reference = call.remote(sys.argv, os.getcwd(), function, *arguments)
         self._references.append(reference)
         future = Future[Any]()
@@ -107,8 +109,12 @@ class RayExecutor:
         elif isinstance(error, self._ray.exceptions.RayTaskError):
             future.set_exception(error.cause)
         else:
-            ending = f"and {RETRIES} more after it ({one_line(error)[:120]})"
-            future.set_exception(WorkerDied(f"its worker on the cluster ended, {ending}"))
+            future.set_exception(
+                WorkerDied(
+                    f"its worker on the cluster ended, and {RETRIES} more after it "
+                    f"({one_line(error)[:120]})"
+                )
+            )
 
 
 def _check_address(address: str) -> None:

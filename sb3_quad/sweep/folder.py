@@ -59,8 +59,10 @@ class Sweep(Frozen):
 
 def write_sweep(folder: Path, sweep: Sweep) -> None:
     """Write a sweep, before its first run."""
-    spec = sweep.spec.model_dump(mode="json", exclude_defaults=True)
-    write_text(folder / "sweep.yaml", yaml.safe_dump(spec, sort_keys=False))
+    write_text(
+        folder / "sweep.yaml",
+        yaml.safe_dump(sweep.spec.model_dump(mode="json", exclude_defaults=True), sort_keys=False),
+    )
     write_text(folder / PLAN, sweep.model_dump_json(indent=1) + "\n")
 
 
@@ -81,6 +83,5 @@ def write_result(folder: Path, result: RunResult) -> None:
 
 def read_results(folder: Path) -> dict[str, RunResult]:
     """Read the results of all runs that ended, by name."""
-    paths = (folder / RECORDS).rglob("*.json")
-    results = [read_record(path, RunResult) for path in paths]
+    results = [read_record(path, RunResult) for path in (folder / RECORDS).rglob("*.json")]
     return {result.name: result for result in results}

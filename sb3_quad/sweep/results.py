@@ -108,10 +108,19 @@ def write_results(
             part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
             parts[run.configuration, run.seed, scenario] = part
             # All are means but for the final error, which is a median.
-            statistics = {**part.mean(), "final_error": part["final_error"].quantile()}
-            lines.append({**line, "scenario": scenario, "episodes": len(part), **statistics})
-    table = pd.DataFrame(lines, columns=COLUMNS)
-    write_text(folder / "results.csv", table.to_csv(index=False, float_format="%.9g"))
+            lines.append(
+                {
+                    **line,
+                    "scenario": scenario,
+                    "episodes": len(part),
+                    **part.mean(),
+                    "final_error": part["final_error"].quantile(),
+                }
+            )
+    write_text(
+        folder / "results.csv",
+        pd.DataFrame(lines, columns=COLUMNS).to_csv(index=False, float_format="%.9g"),
+    )
     tables = []
     if parts:
         tables = _compare(summary, pd.concat(parts, names=LEVELS))
@@ -129,9 +138,8 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     """
     columns = []
     for name, seeds in summary.configurations.items():
-        columns.append(
-            Column(f"{name} (1 seed)" if len(seeds) == 1 else f"{name} ({len(seeds)} seeds)")
-        )
+        noun = "seed" if len(seeds) == 1 else "seeds"
+        columns.append(Column(f"{name} ({len(seeds)} {noun})"))
     tables = []
     comparisons = []
     for scenario, group in flights.groupby(level="scenario", sort=False):
@@ -159,18 +167,20 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
                 if difference is not None:
                     key |= {"first": first, "second": second, "verdict": verdict(difference)}
                     summary.comparisons.append({**dict(difference), **key})
-                    name = f"{scenario}, {row.heading}: {first} than {second}"
                     cells = [
                         Cell(words=key["verdict"]),
                         estimate_cell(difference, factor, decimals),
                     ]
-                    comparisons.append(Row(name, cells=cells))
+                    comparisons.append(
+                        Row(f"{scenario}, {row.heading}: {first} than {second}", cells=cells)
+                    )
         tables.append(Table(columns, rows, title=scenario, caption=CAPTION))
     # There are comparisons if there are several configurations.
     if comparisons:
         columns = [Column("is", align="left"), Column("difference")]
-        title = "better, worse, cannot tell"
-        tables.append(Table(columns, comparisons, title=title, caption=PAIRED))
+        tables.append(
+            Table(columns, comparisons, title="better, worse, cannot tell", caption=PAIRED)
+        )
     return tables
 
 
@@ -216,14 +226,20 @@ def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) 
     """Write the report of the finished runs: a section for each table, and the learning curves."""
     parts: list[Section] = []
     for table in tables:
-        anchor = f"table-{len(parts)}"
-        parts.append(Section(anchor, table.title, tables=[table], facts=table.caption))
+        parts.append(
+            Section(f"table-{len(parts)}", table.title, tables=[table], facts=table.caption)
+        )
     plots = _curves(folder, summary)
     if plots:
-        description = "Mean over seeds, with their range."
-        parts.append(Section("curves", "Learning curves", description, plots=plots))
-    facts = f"{summary.finished} of {summary.runs} runs are finished."
-    write_page(folder, f"Sweep: {summary.sweep}", facts, parts)
+        parts.append(
+            Section("curves", "Learning curves", "Mean over seeds, with their range.", plots=plots)
+        )
+    write_page(
+        folder,
+        f"Sweep: {summary.sweep}",
+        f"{summary.finished} of {summary.runs} runs are finished.",
+        parts,
+    )
 
 
 def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
@@ -243,6 +259,11 @@ def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
     for kind, groups in curves.items():
         # An environment of others may report neither success nor reward.
         with suppress(ConfigError):
-            caption = f"{kind}: success and reward along the training."
-            plots.append(Plot(f"curves_{len(plots)}", caption, plot_curves(groups, {}, kind)))
+            plots.append(
+                Plot(
+                    f"curves_{len(plots)}",
+                    f"{kind}: success and reward along the training.",
+                    plot_curves(groups, {}, kind),
+                )
+            )
     return plots

@@ -69,8 +69,7 @@ def execute(
             # Finished runs stay as they are; failed ones are tried again.
             if results[run.name].state == "finished":
                 continue
-            message = results.pop(run.name).message
-            report(f"{run.name}: failed before ({message}); is tried again")
+            report(f"{run.name}: failed before ({results.pop(run.name).message}); is tried again")
         elif pipeline_folder(place) is not None:
             report(f"{run.name}: resumes where it stopped")
         calls[executor.submit(work, run, place, sweep.spec, sweep.suite)] = run
@@ -128,10 +127,8 @@ def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResu
 
 def pipeline_folder(place: Path) -> Path | None:
     """The folder of a run's training, if it has begun."""
-    begun = sorted(place.glob(f"*/*/{STATUS_FILE}"))
-    if begun:
-        return begun[0].parent
-    return None
+    status = min(place.glob(f"*/*/{STATUS_FILE}"), default=None)
+    return status and status.parent
 
 
 def _train(run: Run, place: Path) -> PipelineResult:
@@ -148,8 +145,12 @@ def _train(run: Run, place: Path) -> PipelineResult:
         settings = place / f"stage_{number}.yml"
         write_text(settings, yaml.safe_dump({stage.env: stage.settings}, sort_keys=False))
         stages.append(stage.model_copy(update={"conf_file": str(settings), "settings": {}}))
-    job = {**run.job, "seed": run.seed, "log_folder": str(place)}
-    return run_pipeline(Pipeline(stages=tuple(stages)), job, "pipeline", report)
+    return run_pipeline(
+        Pipeline(stages=tuple(stages)),
+        {**run.job, "seed": run.seed, "log_folder": str(place)},
+        "pipeline",
+        report,
+    )
 
 
 def _fly(

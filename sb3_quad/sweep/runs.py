@@ -58,8 +58,9 @@ def make_runs(spec: SweepSpec) -> list[Run]:
     # Every configuration is checked before the first run starts.
     runs: dict[str, Run] = {}
     for label, data in _cells(spec):
-        where = f"configuration {label!r}" if label else "sweep"
-        configuration = validate(Configuration, data, where)
+        configuration = validate(
+            Configuration, data, f"configuration {label!r}" if label else "sweep"
+        )
         words = [configuration.algo, Path(configuration.conf_file or "").stem]
         label = label or "-".join(filter(None, words))
         name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,")[:LONGEST] or "run"
@@ -88,8 +89,9 @@ def suite_of(spec: SweepSpec) -> Suite | None:
     """Return the scenarios that the agents of a sweep fly; None: fresh episodes of both tasks."""
     evaluation = spec.evaluation
     if evaluation.suite is not None:
-        suite = load_suite(evaluation.suite)
-        return suite.with_changes(evaluation.scenario, evaluation.episodes, evaluation.seed)
+        return load_suite(evaluation.suite).with_changes(
+            evaluation.scenario, evaluation.episodes, evaluation.seed
+        )
     if evaluation.scenario:
         raise ConfigError("evaluation: scenario goes with a suite")
     return None
@@ -132,8 +134,9 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
         if planned.config.task is not None:
             first_vehicle(planned.flight_settings.vehicle)  # refuses an unknown one
         planned.config.make_expert()
-        resolved = {"conf_file": None, "settings": planned.config.settings}
-        stages.append(stage.model_copy(update=resolved))
+        stages.append(
+            stage.model_copy(update={"conf_file": None, "settings": planned.config.settings})
+        )
     return job, stages
 
 

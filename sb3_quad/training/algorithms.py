@@ -14,11 +14,10 @@ import gymnasium
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from sb3_quad.base.errors import ConfigError, raised_as, unknown
+from sb3_quad.base.errors import ConfigError, raised_as, refuse_unknown
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.literals import parse_mapping, parse_value
 from sb3_quad.base.types import StrDict
@@ -68,17 +67,8 @@ def get_algorithm(name: str) -> type[BaseAlgorithm]:
 
     :raises ConfigError: an unknown name.
     """
-    if name not in ALGORITHMS:
-        raise ConfigError(unknown("algorithm", name, ALGORITHMS))
+    refuse_unknown("algorithm", [name], ALGORITHMS)
     return pkgutil.resolve_name(ALGORITHMS[name])  # type: ignore[no-any-return]
-
-
-def is_off_policy(algorithm: type[BaseAlgorithm]) -> bool:
-    """Whether the algorithm learns from a replay buffer, such as SAC.
-
-    Its rollouts are ``train_freq`` steps long.
-    """
-    return issubclass(algorithm, OffPolicyAlgorithm)
 
 
 def takes_expert(algorithm: type[BaseAlgorithm]) -> bool:
@@ -99,8 +89,11 @@ def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
         types = {}
     parameters = {}
     for name, parameter in inspect.signature(algorithm).parameters.items():
-        is_setting = name not in _SET_BY_JOB and not name.startswith("_")
-        if is_setting and parameter.kind is not parameter.VAR_KEYWORD:
+        if (
+            name not in _SET_BY_JOB
+            and not name.startswith("_")
+            and parameter.kind is not parameter.VAR_KEYWORD
+        ):
             parameters[name] = parameter.replace(annotation=types.get(name, Any))
     return parameters
 
@@ -124,8 +117,9 @@ def convert(
     """
     is_linear = isinstance(value, str) and value.startswith(_LINEAR)
     if is_linear:
-        start = value.removeprefix(_LINEAR)
-        converted = check(float, start, f"{where}: the number after {_LINEAR}")
+        converted = check(
+            float, value.removeprefix(_LINEAR), f"{where}: the number after {_LINEAR}"
+        )
     else:
         if isinstance(value, str):
             value = parse_value(value)

@@ -6,7 +6,7 @@ constructor. There, ``lin_1e-3`` falls linearly to 0 over the training; a learni
 n-th part, which it has in the last of n updates.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -19,9 +19,10 @@ from pydantic import (
     model_validator,
 )
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_quad.algorithms.common import LIMITS
-from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
+from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
@@ -39,7 +40,6 @@ from sb3_quad.training.algorithms import (
     constructor_parameters,
     convert,
     get_algorithm,
-    is_off_policy,
     qualified_classes,
     takes_expert,
 )
@@ -53,12 +53,6 @@ VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
 NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 # For dummy and subproc. PyBullet allows about as many in a process.
 MAX_SINGLE = 1000
-
-
-def _refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str]) -> None:
-    for name in names:
-        if name not in valid:
-            raise ConfigError(unknown(kind, name, valid))
 
 
 Whole: TypeAlias = Annotated[
@@ -143,10 +137,11 @@ class TrainingConfig(Frozen):
 
         :raises SB3QuadError: see :func:`~sb3_quad.controllers.resolve.resolve_expert`.
         """
-        vehicle = self.env_kwargs.get("vehicle", "itm")
-        layout = self.env_kwargs.get("rotor_layout")
-        expert = DEFAULT_EXPERT if self.expert is None else self.expert
-        return resolve_expert(expert, vehicle, layout=layout)
+        return resolve_expert(
+            DEFAULT_EXPERT if self.expert is None else self.expert,
+            self.env_kwargs.get("vehicle", "itm"),
+            layout=self.env_kwargs.get("rotor_layout"),
+        )
 
     def keyword(self, name: str) -> Any:
         """Return what the algorithm's constructor is given as ``name``, or its default."""
@@ -167,8 +162,11 @@ class TrainingConfig(Frozen):
 
     @property
     def is_off_policy(self) -> bool:
-        """Whether the algorithm learns from a replay buffer."""
-        return is_off_policy(self.algorithm)
+        """Whether the algorithm learns from a replay buffer, such as SAC.
+
+        Its rollouts are ``train_freq`` steps long.
+        """
+        return issubclass(self.algorithm, OffPolicyAlgorithm)
 
     @property
     def rollout_steps(self) -> int:
@@ -182,9 +180,7 @@ class TrainingConfig(Frozen):
         if isinstance(train_freq, int):
             return train_freq
         number, unit = train_freq
-        if unit != "step":
-            return 1
-        return int(number)
+        return int(number) if unit == "step" else 1
 
     @property
     def rollout(self) -> int:
@@ -201,7 +197,7 @@ class TrainingConfig(Frozen):
             return {}
         if self.is_off_policy:
             return {"train_freq": n_steps}
-        if "batch_size" not in constructor_parameters(get_algorithm(self.algo)):
+        if "batch_size" not in constructor_parameters(self.algorithm):
             return {"n_steps": n_steps}
         rollout = n_steps * self.n_envs
         # PPOBC chooses a batch size of its own unless it is given one.
@@ -209,25 +205,22 @@ class TrainingConfig(Frozen):
         return {"n_steps": n_steps, "batch_size": batch_size}
 
     @model_validator(mode="after")
-    def _fits_environment(self) -> "TrainingConfig":
+    def _consistent(self) -> "TrainingConfig":
         if self.task:
             keywords = {**self.env_kwargs, **self.eval_env_kwargs}
-            _refuse_unknown(f"keyword of {self.env_id}", keywords, FlightSettings.model_fields)
+            refuse_unknown(f"keyword of {self.env_id}", keywords, FlightSettings.model_fields)
             # Evaluations fly with both; each of the two must fit.
             self.flight_settings.with_changes(**self.eval_env_kwargs)
-            _refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
+            refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
         elif self.eval_tasks:
             raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
-        return self
-
-    @model_validator(mode="after")
-    def _consistent(self) -> "TrainingConfig":
         aliases = self.algorithm.policy_aliases
-        _refuse_unknown("policy", [self.policy], aliases)
+        refuse_unknown("policy", [self.policy], aliases)
         # The constructor of the policy takes these, not that of the algorithm.
         policy = aliases[self.policy]
-        kind = f"keyword of {policy.__name__}"
-        _refuse_unknown(kind, self.policy_kwargs, constructor_parameters(policy))
+        refuse_unknown(
+            f"keyword of {policy.__name__}", self.policy_kwargs, constructor_parameters(policy)
+        )
         check(NetArch, self.policy_kwargs.get("net_arch"), "policy_kwargs: net_arch")
         if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
             raise ConfigError(
@@ -271,8 +264,10 @@ class TrainingJob(JobOptions):
 
         :param changes: to the keywords of the environments.
         """
-        keywords = {**self.config.env_kwargs, **self.config.eval_env_kwargs, **changes}
-        return self.config.model_copy(update={"env_kwargs": keywords})
+        config = self.config
+        return config.model_copy(
+            update={"env_kwargs": {**config.env_kwargs, **config.eval_env_kwargs, **changes}}
+        )
 
     @property
     def flight_settings(self) -> FlightSettings:
@@ -301,8 +296,10 @@ def describe(job: TrainingJob) -> str:
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
     if timesteps != config.n_timesteps:
         line += f" ({config.n_timesteps:,} were asked for)"
-    line += f", rollouts of {config.rollout_steps} steps"
-    line += f", {config.n_envs} environments ({config.vec_env})"
+    line += (
+        f", rollouts of {config.rollout_steps} steps"
+        f", {config.n_envs} environments ({config.vec_env})"
+    )
     task = config.env_kwargs.get("task")
     if isinstance(task, Mapping):
         line += f", tasks {in_words(task)}"
@@ -356,8 +353,10 @@ def merged(settings: StrMapping, changes: StrMapping, where: str) -> StrDict:
     """
     result = {**settings, **changes}
     for key in ENV_KEYS & changes.keys():
-        own = parse_mapping(settings.get(key), f"{where}: {key}")
-        result[key] = {**own, **parse_mapping(changes[key], key)}
+        result[key] = {
+            **parse_mapping(settings.get(key), f"{where}: {key}"),
+            **parse_mapping(changes[key], key),
+        }
     return result
 
 
@@ -377,9 +376,7 @@ def build_config(
     algorithm = get_algorithm(algo)
     parameters = constructor_parameters(algorithm)
     check_environment(env_id)
-    settings = dict(settings)
-    for key in ENV_KEYS & settings.keys():
-        settings[key] = with_vehicle_path(settings[key])
+    settings = with_vehicle_paths(settings)
     # The default is written out, so that config.yml names the expert. Flights of a file need none.
     if takes_expert(algorithm) and not (settings.get("expert") or settings.get("demonstrations")):
         settings["expert"] = DEFAULT_EXPERT
@@ -391,8 +388,9 @@ def build_config(
     hyperparams = {}
     for key, value in settings.items():
         if key in parameters:
-            limits = LIMITS.get(key, ())
-            hyperparams[key] = convert(value, parameters[key], f"{source(key)}: {key}", *limits)
+            hyperparams[key] = convert(
+                value, parameters[key], f"{source(key)}: {key}", *LIMITS.get(key, ())
+            )
         elif key not in JOB_KEYS:
             message = unknown(f"key of {algo}", key, [*JOB_KEYS, *parameters])
             raise ConfigError(f"{source(key)}: {message}")
@@ -402,14 +400,17 @@ def build_config(
     return validate(TrainingConfig, fields, source)
 
 
-def with_vehicle_path(env_kwargs: Any) -> Any:
-    """Return ``env_kwargs`` with absolute paths of vehicle files.
+def with_vehicle_paths(settings: StrDict) -> StrDict:
+    """Return the settings with absolute paths of vehicle files.
 
     A run may be flown and resumed later, from another folder.
     """
-    if isinstance(env_kwargs, dict) and "vehicle" in env_kwargs:
-        return {**env_kwargs, "vehicle": _absolute(env_kwargs["vehicle"])}
-    return env_kwargs
+    settings = dict(settings)
+    for key in ENV_KEYS & settings.keys():
+        keywords = settings[key]
+        if isinstance(keywords, dict) and "vehicle" in keywords:
+            settings[key] = {**keywords, "vehicle": _absolute(keywords["vehicle"])}
+    return settings
 
 
 def _absolute(vehicle: Any) -> Any:
@@ -425,13 +426,11 @@ def check_environment(env_id: str) -> None:
 
     :raises ConfigError: it does not; the message names the nearest.
     """
-    if env_id in gymnasium.registry:
-        return
-    hint = did_you_mean(env_id, gymnasium.registry)
-    raise ConfigError(
-        f"unknown environment {env_id!r}: {hint}(of this package: {', '.join(ENVIRONMENTS)}; "
-        "others: --gym-packages)"
-    )
+    if env_id not in gymnasium.registry:
+        raise ConfigError(
+            f"unknown environment {env_id!r}: {did_you_mean(env_id, gymnasium.registry)}"
+            f"(of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)"
+        )
 
 
 def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict:
@@ -450,13 +449,12 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
     observed = own.observed
-    del observed["rotor_layout"]
-    integral = observed.pop("position_integral")
+    del observed["rotor_layout"], observed["position_integral"]
     adopted = {
         **changes,
         "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
         # The changes to these are in the settings already.
-        "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
+        "eval_env_kwargs": {"position_integral": own.position_integral, **config.eval_env_kwargs},
     }
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:

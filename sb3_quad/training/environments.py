@@ -72,15 +72,20 @@ def make_environments(
                     "env_wrapper: the batched environment has no single environments to wrap; "
                     "use vec_env dummy"
                 )
-            keywords = {"task": config.task, **config.env_kwargs}
-            env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **keywords)
+            env = QuadcopterVecEnv(
+                n_envs,
+                seed=seed,
+                staggered=staggered,
+                **{"task": config.task, **config.env_kwargs},
+            )
         else:
             # A worker process could not say that PyBullet is missing.
             if config.task:
                 importlib.import_module("sb3_quad.base.bullet")
             phases = n_envs if staggered else 1
-            makers: list[Any] = [partial(_make_row, config, row, phases) for row in range(n_envs)]
-            env = SINGLE[config.vec_env](makers)
+            env = SINGLE[config.vec_env](
+                [partial(_make_row, config, row, phases) for row in range(n_envs)]
+            )
             env.seed(seed)
     except SB3QuadError:
         raise

@@ -24,14 +24,13 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.config import (
-    ENV_KEYS,
     SETTINGS,
     TrainingConfig,
     TrainingJob,
     describe,
     load_config,
     merged,
-    with_vehicle_path,
+    with_vehicle_paths,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train, trained_seconds
@@ -149,10 +148,8 @@ def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
     """
     stages = []
     for stage in pipeline.stages:
-        settings = merged(stage.settings, changes, stage.name)
         # The pipeline may be resumed from another folder.
-        for key in ENV_KEYS & settings.keys():
-            settings[key] = with_vehicle_path(settings[key])
+        settings = with_vehicle_paths(merged(stage.settings, changes, stage.name))
         stages.append(stage.model_copy(update={"settings": settings}))
     return pipeline.model_copy(update={"stages": tuple(stages)})
 
@@ -271,10 +268,21 @@ def _write_status(folder: Path, content: StrDict) -> None:
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
     """Return the zip that a stage passes on, after the offset correction where it has one."""
+    if stage.correct_offset and run.corrected_model.is_file():
+        return run.corrected_model
+    agent = _passed_on(stage, run)
     if not stage.correct_offset:
-        return _passed_on(stage, run)
-    if not run.corrected_model.is_file():
-        _correct(stage.correct_offset, job, run, _passed_on(stage, run), report)
+        return agent
+    model = load_zip(job.config.algorithm, agent, device=job.device)
+    report("correcting the agent's offset, which may take minutes")
+    change = correct_offset(
+        model, seed_for("correction", job.seed), job.flight_settings, stage.correct_offset
+    )
+    save_model(model, run.corrected_model)
+    report(
+        f"corrected: steady offset {change.before:.3f} m, now {change.after:.3f} m: "
+        f"{run.corrected_model}"
+    )
     return run.corrected_model
 
 
@@ -294,19 +302,3 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
     if stage.pass_on == "best" and run.best_model.is_file():
         return run.best_model
     return run.model
-
-
-def _correct(scale: float, job: TrainingJob, run: RunFolder, agent: Path, report: Report) -> None:
-    """Write the corrected agent of a run.
-
-    :param scale: α of Eq. 4.10.
-    """
-    model = load_zip(job.config.algorithm, agent, device=job.device)
-    report("correcting the agent's offset, which may take minutes")
-    seed = seed_for("correction", job.seed)
-    change = correct_offset(model, seed, job.flight_settings, scale)
-    save_model(model, run.corrected_model)
-    report(
-        f"corrected: steady offset {change.before:.3f} m, now {change.after:.3f} m: "
-        f"{run.corrected_model}"
-    )

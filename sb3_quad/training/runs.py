@@ -78,16 +78,12 @@ class RunFolder:
 
         :raises ConfigError: the run has no checkpoint.
         """
-        steps = []
-        for checkpoint in self.path.glob(self.checkpoint("*").name):
-            number = checkpoint.name.split("_")[2]
-            if number.isdigit():
-                steps.append(int(number))
-        if not steps:
+        checkpoints = _numbered(self.path, "rl_model")
+        if not checkpoints:
             raise ConfigError(
                 f"{self.path}: holds no checkpoint; train with --save-freq to have some"
             )
-        return self.checkpoint(max(steps))
+        return self.checkpoint(max(checkpoints))
 
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
@@ -117,16 +113,17 @@ def made_with() -> dict[str, str]:
     The commit has a mark where files differ from it.
     """
     command = shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'")
-    here = Path(__file__).parent
     try:
-        commit = subprocess.check_output(command, cwd=here, text=True, stderr=subprocess.DEVNULL)
+        commit = subprocess.check_output(
+            command, cwd=Path(__file__).parent, text=True, stderr=subprocess.DEVNULL
+        )
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"
-    versions = (
-        f"sb3_quad {__version__}, stable-baselines3 {stable_baselines3.__version__}, "
-        f"torch {torch.__version__}"
-    )
-    return {"commit": commit.strip(), "versions": versions}
+    return {
+        "commit": commit.strip(),
+        "versions": f"sb3_quad {__version__}, stable-baselines3 {stable_baselines3.__version__}, "
+        f"torch {torch.__version__}",
+    }
 
 
 def file_name(env_id: str) -> str:
@@ -162,8 +159,7 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     # Numbers of removed runs before the last one are not used again.
     number = max(folders, default=0) + 1
     while True:
-        ending = f"_{uuid.uuid4()}" if unique else ""
-        path = parent / f"{name}_{number}{ending}"
+        path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
         try:
             path.mkdir()
             return path
@@ -173,13 +169,13 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
 
 
 def _numbered(parent: Path, name: str) -> dict[int, Path]:
-    """Return the folders ``<parent>/<name>_<number>…`` by their numbers."""
-    folders = {}
-    for folder in sorted(parent.glob(f"{name}_*")):
-        number = folder.name.removeprefix(f"{name}_").split("_")[0]
+    """Return the folders or files ``<parent>/<name>_<number>…`` by their numbers."""
+    paths = {}
+    for path in sorted(parent.glob(f"{name}_*")):
+        number = path.name.removeprefix(f"{name}_").split("_")[0]
         if number.isdigit():
-            folders[int(number)] = folder
-    return folders
+            paths[int(number)] = path
+    return paths
 
 
 def open_run(path: StrPath) -> RunFolder:
@@ -213,9 +209,9 @@ def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> Ru
         with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
         exp_id = max(with_agent or folders)
     if exp_id not in folders:
-        existing = ", ".join(folder.name for folder in folders.values())
         raise ConfigError(
-            f"{parent}: there is no run {name}_{exp_id}; there is {existing}; "
+            f"{parent}: there is no run {name}_{exp_id}; "
+            f"there is {', '.join(folder.name for folder in folders.values())}; "
             "give another with --exp-id"
         )
     return RunFolder(folders[exp_id], name)

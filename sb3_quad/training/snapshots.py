@@ -69,8 +69,8 @@ class SnapshotFile(BaseCallback):
         # The log of a resumed run is to say what it would have said without the interruption.
         if not path.is_file():
             return
-        records = LOG.validate_json(str(read_arrays(path, "log")["log"]))
-        for name, (value, count, excluded) in records.items():
+        log = read_arrays(path, "log")["log"]
+        for name, (value, count, excluded) in LOG.validate_json(str(log)).items():
             self.logger.name_to_value[name] = value
             self.logger.name_to_count[name] = count
             self.logger.name_to_excluded[name] = excluded
@@ -85,8 +85,8 @@ class SnapshotFile(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         start = time.monotonic()
-        is_off_policy = isinstance(self.model, OffPolicyAlgorithm)
-        if is_off_policy and start < self._next_taken and not self._signals.received:
+        is_early = isinstance(self.model, OffPolicyAlgorithm) and start < self._next_taken
+        if is_early and not self._signals.received:
             return
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
@@ -116,8 +116,7 @@ class SnapshotFile(BaseCallback):
                 self.write()
             except ConfigError as error:
                 self._report(f"warning: no new snapshot, the one before is kept: {error}")
-            took = time.monotonic() - start
-            self._next_write = start + max(self._every, took / SHARE)
+            self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
 
     def write(self) -> None:
         """Write the latest snapshot; until that is whole, the file holds the one before.
@@ -232,8 +231,10 @@ def _check(state: Arrays, expected: Arrays) -> None:
             fits = array.dtype.kind == like.dtype.kind and array.ndim == like.ndim
         else:
             fits = array.dtype == like.dtype and array.shape == like.shape
-        kinds = f"{array.dtype} {array.shape}, must be {like.dtype} {like.shape}"
-        _require(fits, f"{name} is {kinds}")
+        _require(
+            fits,
+            f"{name} is {array.dtype} {array.shape}, must be {like.dtype} {like.shape}",
+        )
 
 
 def _require(fits: bool, problem: str) -> None:
@@ -258,8 +259,9 @@ def _batch(env: VecEnv) -> Any:
 
 def _stores(model: Any) -> StrDict:
     """Return what a model keeps beyond a rollout, by name."""
-    stores = {name: getattr(model, name, None) for name in COUNTERS}
-    return {name: store for name, store in stores.items() if store is not None}
+    return {
+        name: getattr(model, name) for name in COUNTERS if getattr(model, name, None) is not None
+    }
 
 
 def _filled(name: str, store: Any) -> Arrays:
@@ -281,8 +283,10 @@ def _fill(name: str, store: Any, state: Arrays) -> None:
     """Put a snapshot's rows into a store."""
     for counter in COUNTERS[name]:
         value = state[f"{name}.{counter}"].item()
-        fits = 0 <= value < getattr(store, "buffer_size", np.inf)
-        _require(fits, f"{name}.{counter} is beyond its rows")
+        _require(
+            0 <= value < getattr(store, "buffer_size", np.inf),
+            f"{name}.{counter} is beyond its rows",
+        )
         setattr(store, counter, value)
     for key, rows in _filled(name, store).items():
         # What was written later than the counters may hold more rows.
@@ -327,8 +331,11 @@ def log_state(logger: Logger) -> Any:
     records = {}
     for name, value in logger.name_to_value.items():
         if isinstance(value, (int, float, np.number)):
-            count = logger.name_to_count[name]
-            records[name] = (float(value), count, logger.name_to_excluded[name])
+            records[name] = (
+                float(value),
+                logger.name_to_count[name],
+                logger.name_to_excluded[name],
+            )
     return np.array(json.dumps(records))
 
 
@@ -338,8 +345,10 @@ def random_state() -> Arrays:
     They are torch's, Python's and NumPy's.
     """
     states = [random.getstate(), np.random.get_state(legacy=False)]  # noqa: NPY002
-    text = json.dumps(states, default=np.ndarray.tolist)
-    return {"torch": th.get_rng_state().numpy().copy(), "random": np.array(text)}
+    return {
+        "torch": th.get_rng_state().numpy().copy(),
+        "random": np.array(json.dumps(states, default=np.ndarray.tolist)),
+    }
 
 
 def set_random_state(state: Arrays) -> None:

@@ -92,10 +92,9 @@ def train(
             with locked(run.path, "run folder"):
                 run.write_yaml(job.config.settings, job.arguments() | made_with())
                 on_start(run)
-                training = _Training(
+                return _Training(
                     job, run, model, eval_envs, callbacks, signals, report, should_continue
-                )
-                return training.run_to_end()
+                ).run_to_end()
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -136,8 +135,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         report(f"resuming after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         callbacks = _user_callbacks(config)
         with tracked(job):
-            training = _Training(job, run, model, eval_envs, callbacks, signals, report)
-            return training.run_to_end()
+            return _Training(job, run, model, eval_envs, callbacks, signals, report).run_to_end()
 
 
 @contextmanager
@@ -151,8 +149,9 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
     eval_envs: dict[str, VecEnv] = {}
     with ExitStack() as stack:
         seed = seed_for("training", job.seed)
-        env = make_environments(config, config.n_envs, seed, staggered=True)
-        stack.enter_context(closing(env))
+        env = stack.enter_context(
+            closing(make_environments(config, config.n_envs, seed, staggered=True))
+        )
         if job.eval_episodes > 0:
             # The batched environment flies all episodes of an evaluation at once.
             n_envs = job.n_eval_envs
@@ -162,8 +161,9 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
             seed = seed_for("evaluation", job.seed)
             for task in (OWN_TASK, *config.eval_tasks):
                 eval_config = job.for_evaluation(**({"task": task} if task else {}))
-                eval_env = make_environments(eval_config, n_envs, seed)
-                eval_envs[task] = stack.enter_context(closing(eval_env))
+                eval_envs[task] = stack.enter_context(
+                    closing(make_environments(eval_config, n_envs, seed))
+                )
         yield env, eval_envs
 
 
@@ -193,8 +193,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
     model = _construct(config, env, keywords)
     # An expert that fails does so before there is a run folder.
-    will_clone: Callable[[], bool] = getattr(model, "will_clone", lambda: False)
-    if will_clone():
+    if getattr(model, "will_clone", lambda: False)():
         observation: Any = env.reset()
         Controller.for_env(keywords.get("expert"), env).labels(observation)
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
@@ -372,8 +371,9 @@ class _Training:
         where += f"; the traceback is in {self.run.error}"
         if isinstance(error, (EOFError, ConnectionError)):
             raise TrainingError(f"{WORKER_ENDED}{where}") from error
-        parameters = self.model.policy.parameters()
-        if isinstance(error, ValueError) and not all(th.isfinite(p).all() for p in parameters):
+        if isinstance(error, ValueError) and not all(
+            th.isfinite(parameter).all() for parameter in self.model.policy.parameters()
+        ):
             raise TrainingError(
                 f"the policy's parameters are no longer finite; lower learning_rate{where}"
             ) from error
@@ -393,12 +393,11 @@ class HyperparameterLog(BaseCallback):
 
     def __init__(self, job: TrainingJob) -> None:
         super().__init__()
-        config = job.config
         self._shown = {
-            "algo": config.algo,
-            "env": config.env_id,
+            "algo": job.config.algo,
+            "env": job.config.env_id,
             "seed": job.seed,
-            **config.settings,
+            **job.config.settings,
         }
 
     def _on_training_start(self) -> None:
@@ -407,8 +406,11 @@ class HyperparameterLog(BaseCallback):
             name: value if isinstance(value, (bool, int, float)) else str(value)
             for name, value in self._shown.items()
         }
-        parameters = HParam(shown, dict.fromkeys(METRICS, 0.0))
-        self.logger.record("hparams", parameters, exclude=("stdout", "log", "json", "csv"))
+        self.logger.record(
+            "hparams",
+            HParam(shown, dict.fromkeys(METRICS, 0.0)),
+            exclude=("stdout", "log", "json", "csv"),
+        )
 
     def _on_step(self) -> bool:
         return True

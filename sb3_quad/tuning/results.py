@@ -26,9 +26,10 @@ def write_results(search: Search) -> None:
     # The table is written after each trial, so that an interruption loses none.
     columns = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds"]
     columns += [*search.space.dimensions, RUN, ERROR]
-    rows = [_row(search, trial) for trial in search.trials()]
     # A cell is empty where its row lacks the key. Keys without a column are ignored.
-    table = pd.DataFrame(rows, columns=columns, dtype=object)
+    table = pd.DataFrame(
+        [_row(search, trial) for trial in search.trials()], columns=columns, dtype=object
+    )
     write_text(folder / TRIALS, table.to_csv(index=False))
     best = search.best
     if best is None:
@@ -94,8 +95,10 @@ def count_trials(search: Search) -> str:
 def train_command(search: Search) -> str:
     """The command that trains with the best settings, as the trials did."""
     config = search.job.config
-    file = Path(search.job.log_folder, BEST)
-    command = f"sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {file}"
+    command = (
+        f"sb3-quad train --algo {config.algo} --env {config.env_id} "
+        f"--conf-file {Path(search.job.log_folder, BEST)}"
+    )
     if search.job.trained_agent:
         command += f" -i {search.job.trained_agent}"
     return command

@@ -25,7 +25,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
 from sb3_quad.base.files import kind_and_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
@@ -97,10 +97,8 @@ class Search:
     n_evaluations: int
 
     def __post_init__(self) -> None:
-        if self.sampler not in SAMPLERS:
-            raise ConfigError(unknown("sampler", self.sampler, SAMPLERS))
-        if self.pruner not in PRUNERS:
-            raise ConfigError(unknown("pruner", self.pruner, PRUNERS))
+        refuse_unknown("sampler", [self.sampler], SAMPLERS)
+        refuse_unknown("pruner", [self.pruner], PRUNERS)
         # Only trials of one kind compare. This is the kind, as a storage gives it back.
         wanted = json.loads(json.dumps(self._shared(), default=str))
         self.study = open_study(self.name, self.storage)
@@ -160,9 +158,12 @@ class Search:
 
         :raises ConfigError: they do not go together.
         """
-        known = self.job.config
-        settings = self.space.settings(trial.params)
-        return build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
+        return build_config(
+            self.job.config.algo,
+            self.job.config.env_id,
+            self.space.settings(trial.params),
+            f"trial {trial.number}",
+        )
 
     def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
         """Train as a trial says; return its value and state. Whatever happens to a choice of
@@ -184,8 +185,11 @@ class Search:
         config = self.config(trial)
         # A training ends with a whole rollout.
         total = math.ceil(config.n_timesteps / config.rollout) * config.rollout
-        eval_freq = math.ceil(total / self.n_evaluations)
-        changes = {"config": config, "eval_freq": eval_freq, "snapshot_every": 0}
+        changes = {
+            "config": config,
+            "eval_freq": math.ceil(total / self.n_evaluations),
+            "snapshot_every": 0,
+        }
         values: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
@@ -247,11 +251,12 @@ class NumberedSampler(BaseSampler):
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> Any:
         # A retry has the parameters of an earlier trial, and no number of its own.
-        before = study.get_trials(deepcopy=False)[: trial.number]
-        number = sum("again" not in earlier.user_attrs for earlier in before)
+        number = sum(
+            "again" not in earlier.user_attrs
+            for earlier in study.get_trials(deepcopy=False)[: trial.number]
+        )
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
-        make = SAMPLERS[self.kind]
-        self._sampler = make(n_startup_trials=self.n_startup_trials, seed=seed)
+        self._sampler = SAMPLERS[self.kind](n_startup_trials=self.n_startup_trials, seed=seed)
         return self._sampler.infer_relative_search_space(study, trial)
 
     def sample_relative(self, *arguments: Any) -> Any:

@@ -26,11 +26,7 @@ from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.training.algorithms import (
-    constructor_parameters,
-    get_algorithm,
-    takes_whole,
-)
+from sb3_quad.training.algorithms import constructor_parameters, takes_whole
 from sb3_quad.training.config import TrainingConfig, build_config
 
 SPACES = YamlFolder("search space", "sb3_quad.zoo_configs.search_spaces", ".yml")
@@ -130,7 +126,7 @@ def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchS
             f"{where}: must hold settings with their ranges, such as 'learning_rate: {{around: 5}}'"
         )
     # The algorithm's arguments and the training's own settings may vary.
-    valid = [*constructor_parameters(get_algorithm(config.algo)), *JOB_SETTINGS]
+    valid = [*constructor_parameters(config.algorithm), *JOB_SETTINGS]
     if {"n_steps", "batch_size"} <= {*valid} and not config.is_off_policy:
         valid.append(MINIBATCHES)
     # Of mappings, any entry may vary.
@@ -140,10 +136,13 @@ def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchS
             raise ConfigError(f"{where}: {unknown(f'setting of {config.algo}', name, valid)}")
     if MINIBATCHES in content and "batch_size" in content:
         raise ConfigError(f"{where}: {MINIBATCHES} sets batch_size; remove one of them")
-    dimensions = {}
-    for name, values in content.items():
-        dimensions[name] = _dimension(config, name, values, f"{where}: {name}")
-    return SearchSpace(config, dimensions)
+    return SearchSpace(
+        config,
+        {
+            name: _dimension(config, name, values, f"{where}: {name}")
+            for name, values in content.items()
+        },
+    )
 
 
 def _current(config: TrainingConfig, name: str) -> Any:
@@ -170,7 +169,7 @@ def _dimension(config: TrainingConfig, name: str, values: Any, where: str) -> Ba
         raise ConfigError(
             f"{where}: {values!r} must be {{low: …, high: …}}, {{around: …}} or a list of values"
         )
-    parameter = constructor_parameters(get_algorithm(config.algo)).get(name)
+    parameter = constructor_parameters(config.algorithm).get(name)
     whole = name in (MINIBATCHES, "n_envs") or (parameter is not None and takes_whole(parameter))
     if "around" in values:
         values = _around(_current(config, name), values, whole, where)

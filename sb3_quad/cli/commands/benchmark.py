@@ -79,8 +79,14 @@ def run(options: Namespace) -> int:
         rates = np.median(_measure(subjects, options.seconds), axis=0)
     lines = []
     for subject, rate in zip(subjects, rates, strict=True):
-        relative = f"{rate / rates[0]:,.1f} x"
-        lines.append((subject.name, f"{subject.rows:,}", f"{rate:,.0f}", relative))
+        lines.append(
+            (
+                subject.name,
+                f"{subject.rows:,}",
+                f"{rate:,.0f}",
+                f"{rate / rates[0]:,.1f} x",
+            )
+        )
     title = f"control steps per second (median of {REPETITIONS})"
     screen.print(text_table(title, ("", "rows", "steps/s", "to the first line"), lines))
     return 0
@@ -129,8 +135,7 @@ def _environments(stack: ExitStack, sizes: list[int], n_envs: int) -> list[Subje
 
     def add_vectorised(name: str, kind: str, rows: int, **env_kwargs: Any) -> None:
         settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": env_kwargs}
-        env = make_environments(build_config("ppo", ENV_ID, settings), rows, 0)
-        add(name, rows, env, rows)
+        add(name, rows, make_environments(build_config("ppo", ENV_ID, settings), rows, 0), rows)
 
     add("PyBullet, one environment", 1, Autoreset(gymnasium.make(ENV_ID)))
     add_vectorised("PyBullet, DummyVecEnv", "dummy", n_envs)

@@ -100,8 +100,12 @@ def run(options: Namespace) -> int:
             "PID": PIDExpert(vehicle),
             f"geometric, gains {gains}": GeometricExpert(vehicle),
         }
-        true_state = {"vehicle": vehicle, "noise": 0.0}
-        print_tables(controllers, true_state, options.episodes, seed_for("expert", options.seed))
+        print_tables(
+            controllers,
+            {"vehicle": vehicle, "noise": 0.0},
+            options.episodes,
+            seed_for("expert", options.seed),
+        )
         if derived:
             print(
                 "to search for gains, which are mostly better: "

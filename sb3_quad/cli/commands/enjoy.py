@@ -144,27 +144,29 @@ def run(options: Namespace) -> int:
     _check(options, window)
     setting, controllers = _setting(options)
     with Console(file=sys.stderr).status("flying"):
-        flights = fly_all(
-            controllers,
-            setting,
-            options.seed,
-            options.n_timesteps,
-            not options.stochastic,
-            options.n_envs,
+        episodes = list(
+            fly_all(
+                controllers,
+                setting,
+                options.seed,
+                options.n_timesteps,
+                not options.stochastic,
+                options.n_envs,
+            )
         )
-        episodes = list(flights)
     for number, episode in enumerate(episodes, 1):
         for flight in episode:
             prefix = f"episode {number}, " if len(episodes) > 1 else ""
             end = flight.lost or f"{flight.state.distance[-1]:.3f} m from its target"
-            seconds = f"{flight.times[-1]:.2f} s"
-            print(f"{prefix}{flight.name}: {end} after {seconds}, reward {flight.reward:.2f}")
+            print(
+                f"{prefix}{flight.name}: {end} after {flight.times[-1]:.2f} s, "
+                f"reward {flight.reward:.2f}"
+            )
     size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
         if _is_picture(file):
             picture = io.BytesIO()
-            pixels = Image.fromarray(sequence(episodes[0], *size))
-            pixels.save(picture, format="png", optimize=True)
+            Image.fromarray(sequence(episodes[0], *size)).save(picture, format="png", optimize=True)
             write_bytes(file, picture.getvalue())
             print(f"saved {file}")
         else:
@@ -190,8 +192,9 @@ def _check(options: Namespace, window: bool) -> None:
         )
     env_id = options.env or DEFAULT_ENV
     if env_id not in ENVIRONMENTS:
-        message = unknown("environment", env_id, ENVIRONMENTS)
-        raise ConfigError(f"{message}; rl_zoo3.enjoy shows others")
+        raise ConfigError(
+            f"{unknown('environment', env_id, ENVIRONMENTS)}; rl_zoo3.enjoy shows others"
+        )
     if options.size:
         check_size(*options.size)
     for file in options.output:
@@ -236,8 +239,9 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     for spec in specs:
         warn(spec.notice(vehicle))
         controllers[spec.label] = resolve_expert(spec.spec, vehicle, "controller")
-        kept = spec.observed.keys() - options.env_kwargs.keys()
-        observed[spec.label] = {name: spec.observed[name] for name in kept}
+        observed[spec.label] = {
+            name: spec.observed[name] for name in spec.observed.keys() - options.env_kwargs.keys()
+        }
     return setting._replace(own=observed), controllers
 
 

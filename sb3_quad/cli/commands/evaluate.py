@@ -113,11 +113,14 @@ def run(options: Namespace) -> int:
     labels = [spec.label for spec in controllers]
     columns = [label for label in labels if label in flown]
     if columns:
-        scenarios = {"scenarios": list(suite.scenarios)}
-        console().print(overview(results.model_copy(update=scenarios), columns))
+        console().print(
+            overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), columns)
+        )
     if flown:
-        seconds = time.perf_counter() - start
-        print(f"{seconds:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
+        print(
+            f"{time.perf_counter() - start:.1f} s; "
+            f"results in {folder}: results.json, episodes.csv, flights/"
+        )
     if flown and options.report:
         report(folder, overwrite=True)
     failures = [failure for failure in results.failures if failure.controller in labels]

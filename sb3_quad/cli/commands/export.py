@@ -23,7 +23,7 @@ of a C header needs a C compiler.
 from argparse import Namespace
 from pathlib import Path
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import (
     OVERWRITE,
@@ -68,8 +68,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.export.c_header import c_name
     from sb3_quad.export.policy import FORMATS, export_policy
 
-    if options.format not in FORMATS:
-        raise ConfigError(unknown("format", options.format, FORMATS))
+    refuse_unknown("format", [options.format], FORMATS)
     model = Path(options.model)
     file = Path(options.file or "")
     # Without a suffix it is a folder; without -o, this one.

@@ -81,8 +81,11 @@ def run(options: Namespace) -> int:
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
-        names = ("sweep", *SweepSpec.model_fields, "suite", "episodes")
-        refuse(options, names, "--resume keeps the sweep's own settings; remove {}")
+        refuse(
+            options,
+            ("sweep", *SweepSpec.model_fields, "suite", "episodes"),
+            "--resume keeps the sweep's own settings; remove {}",
+        )
         folder = Path(options.resume)
         return _execute(options, read_sweep(folder), folder)
     spec = _spec(options)
@@ -153,11 +156,13 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
     with start_executor(options.executor, workers, options.address, **resources) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
-            parent = Path(options.log_folder or "logs") / "sweep"
-            folder = claim_folder(parent, sweep.spec.name or "sweep")
+            folder = claim_folder(
+                Path(options.log_folder or "logs") / "sweep", sweep.spec.name or "sweep"
+            )
             write_sweep(folder, sweep)
-        parallel = f"{executor.workers} in parallel, executor {options.executor}"
-        print(f"sweep {folder}: {runs}, {parallel}")
+        print(
+            f"sweep {folder}: {runs}, {executor.workers} in parallel, executor {options.executor}"
+        )
         with (
             locked(folder, "sweep folder"),
             StopSignals() as signals,
@@ -169,8 +174,10 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
             results, tables = write_results(folder, sweep, ended)
             for table in tables:
                 console().print(table)
-    seconds = time.perf_counter() - start
-    print(f"{results.finished} of {runs} finished, {len(results.failed)} failed; {seconds:.1f} s")
+    print(
+        f"{results.finished} of {runs} finished, {len(results.failed)} failed; "
+        f"{time.perf_counter() - start:.1f} s"
+    )
     report = ", report.md, report.html" if results.finished else ""
     print(f"saved in {folder}: results.csv, results.json, runs/{report}")
     for name, message in results.failed.items():

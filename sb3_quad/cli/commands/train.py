@@ -134,8 +134,7 @@ def run(options: Namespace) -> int:
         stages = pipeline.with_settings(stages, changed_settings(options))
         result = pipeline.run_pipeline(stages, job, Path(options.conf_file).stem)
     else:
-        content = {"config": make_config(options), **job}
-        checked = validate(TrainingJob, content, "command line")
+        checked = validate(TrainingJob, {"config": make_config(options), **job}, "command line")
         print(describe(checked))
         return close_run(train(checked))
     return close_pipeline(result, time.perf_counter() - start)

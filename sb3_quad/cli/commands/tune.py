@@ -80,8 +80,10 @@ def run(options: Namespace) -> int:
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
-        where = f"results go to {search.job.log_folder}"
-        print(f"study {search.name} in {search.storage}: {count_trials(search)}; {where}")
+        print(
+            f"study {search.name} in {search.storage}: {count_trials(search)}; "
+            f"results go to {search.job.log_folder}"
+        )
         with progress_bar(options.progress) as show:
             try:
                 for number in range(options.n_trials):
@@ -111,12 +113,15 @@ def _make_search(options: Namespace) -> Any:
 
     config = make_config(options)
     space = load_space(config, options.search_space)
-    arguments = {
-        "config": config,
-        "eval_episodes": EPISODES[config.vec_env],
-        **given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes"),
-    }
-    job = validate(TrainingJob, arguments, "command line")
+    job = validate(
+        TrainingJob,
+        {
+            "config": config,
+            "eval_episodes": EPISODES[config.vec_env],
+            **given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes"),
+        },
+        "command line",
+    )
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     try:
         return Search(
@@ -155,5 +160,7 @@ def _print_results(search: Any) -> None:
             print(f"agent: {model}")
         print(f"to train: {train_command(search)}")
     print(f"{count_trials(search)}; saved in {search.job.log_folder}")
-    study = f"--storage {search.storage} --study-name {search.name}"
-    print(f"to continue, run the same command with {study}")
+    print(
+        "to continue, run the same command with "
+        f"--storage {search.storage} --study-name {search.name}"
+    )
