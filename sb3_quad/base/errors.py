@@ -78,7 +78,7 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
     "unknown task 'state_recovry': did you mean 'state_recovery'? (valid: state_recovery,
     target_tracking)"
     """
-    names = sorted(str(option) for option in valid)
+    names = sorted(map(str, valid))
     return f"unknown {kind} {str(name)!r}: {did_you_mean(name, names)}(valid: {', '.join(names)})"
 
 

@@ -173,8 +173,7 @@ def save_model(model: Any, path: StrPath) -> None:
 
 def one_line(error: BaseException) -> str:
     """Return the message of an exception as one line of at most 200 characters."""
-    text = " ".join(str(error).split())
-    return (text or type(error).__name__)[:200]
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]
 
 
 def kind_and_line(error: BaseException) -> str:

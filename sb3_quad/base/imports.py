@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import os
 import pkgutil
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -41,18 +42,12 @@ def import_name(text: str, where: str) -> Any:
     """
     # The module's own code may raise anything.
     with raised_as(ConfigError, f"{where} {text}: cannot be imported"):
-        search_present_folder(text.partition(":")[0])
+        # Python searches the working directory only for scripts, not for installed commands.
+        here = os.getcwd()
+        package = re.split("[.:]", text)[0]
+        if here not in sys.path and importlib.util.find_spec(package) is None:
+            sys.path.append(here)
         return pkgutil.resolve_name(text)
-
-
-def search_present_folder(module: str) -> None:
-    """Let a module that is not installed be imported from the working directory.
-
-    Python searches it only for scripts, not for installed commands.
-    """
-    here = os.getcwd()
-    if here not in sys.path and importlib.util.find_spec(module.partition(".")[0]) is None:
-        sys.path.append(here)
 
 
 def import_packages(packages: Iterable[str], where: str) -> None:

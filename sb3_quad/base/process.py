@@ -58,8 +58,7 @@ class StopSignals:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 # Under nohup the program is meant to survive a closed terminal.
-                under_nohup = signal.getsignal(number) is signal.SIG_IGN
-                if number != _SIGHUP or not under_nohup:
+                if number != _SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                     self._previous[number] = signal.signal(number, self._note)
         return self
 
@@ -97,8 +96,9 @@ def interrupts_leave() -> Iterator[None]:
         yield
     finally:
         # A command has begun like this, see sb3_quad/__init__.py.
-        leaves = before is signal.SIG_DFL
-        signal.signal(signal.SIGINT, signal.default_int_handler if leaves else before)
+        if before is signal.SIG_DFL:
+            before = signal.default_int_handler
+        signal.signal(signal.SIGINT, before)
 
 
 def ignore_interrupts() -> None:

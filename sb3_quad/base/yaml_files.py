@@ -134,10 +134,9 @@ class YamlFolder:
         return parse_keys(text, where), where
 
     def _files(self) -> StrDict:
-        package = resources.files(self.package)
         files = {}
         for folder in ("", *self.folders):
-            for file in package.joinpath(folder).iterdir():
+            for file in resources.files(self.package).joinpath(folder).iterdir():
                 if file.name.endswith(self.suffix):
                     name = f"{folder}/{file.name}".removeprefix("/")
                     files[name if self.folders else name.removesuffix(self.suffix)] = file

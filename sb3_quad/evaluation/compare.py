@@ -131,8 +131,7 @@ def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, Flig
                 }
     settings = {}
     for label in controllers:
-        how = FlightSettings(**own.get(label, shared))
-        settings[label] = how.with_changes(**env_kwargs)
+        settings[label] = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
     return settings
 
 

@@ -243,9 +243,18 @@ def fly_scenario(
     size = PART_SIZES.get(backend, 1)
     for first in range(0, len(seeds), size):
         part = seeds[first : first + size]
-        plan = sample_plan(scenario, part)
-        how = (settings, part, backend, scenario.tolerances, hooks, plan)
-        parts.append(fly_settings(controller, *how, reward=reward))
+        parts.append(
+            fly_settings(
+                controller,
+                settings,
+                part,
+                backend,
+                scenario.tolerances,
+                hooks,
+                sample_plan(scenario, part),
+                reward=reward,
+            )
+        )
         # Only flights of the first part are recorded.
         hooks = []
     return Flights.concatenate(parts), recorder.arrays()
@@ -336,8 +345,7 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
                 file.unlink()
         return []
     kept = {job.name for job in jobs if job.repeats}
-    must_repeat = before.finished and len(kept) < len(jobs)
-    if before.digest != digest or must_repeat:
+    if before.digest != digest or (before.finished and len(kept) < len(jobs)):
         raise ConfigError(
             f"{folder}: holds results already; give another folder with -o,"
             " or remove them with --overwrite"

@@ -27,8 +27,9 @@ class Fleet(QuadcopterBatch):
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        endless = settings.with_changes(max_episode_steps=ENDLESS)
-        super().__init__(len(seeds), endless, autoreset=False)
+        super().__init__(
+            len(seeds), settings.with_changes(max_episode_steps=ENDLESS), autoreset=False
+        )
         self.seed(seeds)
 
     def begin(self, start: Mapping[str, FloatArray]) -> Float32Array:

@@ -54,8 +54,7 @@ class Recorder(Hook):
         self._samples = np.zeros(min(self._m, state.n), dtype=np.int64)
         self._wrench = np.zeros((len(self._samples), 6))
         # No action has been given at the start.
-        no_actions = np.full((state.n, 4), np.nan, np.float32)
-        self._sample(state, no_actions, np.ones(state.n, bool))
+        self._sample(state, np.full((state.n, 4), np.nan, np.float32), np.ones(state.n, bool))
 
     def before_step(
         self,
@@ -144,9 +143,8 @@ class Track(NamedTuple):
     @property
     def targets(self) -> Float32Array:
         """The targets, one after the other, (n, 3), m."""
-        # The first sample of each target.
-        changed = np.diff(self.target, axis=0).any(axis=1)
-        return np.compress(np.append(True, changed), self.target, axis=0)
+        # The first target counts as a change, from NaN.
+        return self.target[np.diff(self.target, axis=0, prepend=np.nan).any(axis=1)]
 
 
 def read_tracks(path: StrPath) -> list[Track]:
@@ -158,12 +156,13 @@ def read_tracks(path: StrPath) -> list[Track]:
     tracks = []
     for number, samples in enumerate(arrays.get("samples", ())):
         flown = slice(samples)
-        track = Track(
-            arrays["time"][flown],
-            arrays["position"][number, flown],
-            arrays["target"][number, flown],
-            arrays["wrench"][number, flown],
-            LOST.get(str(arrays["episode_outcome"][number]), ""),
+        tracks.append(
+            Track(
+                arrays["time"][flown],
+                arrays["position"][number, flown],
+                arrays["target"][number, flown],
+                arrays["wrench"][number, flown],
+                LOST.get(str(arrays["episode_outcome"][number]), ""),
+            )
         )
-        tracks.append(track)
     return tracks

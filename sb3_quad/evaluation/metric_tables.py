@@ -75,8 +75,7 @@ def estimate_cell(
     """Return an estimate with its interval, both times ``factor``; the words ``none`` for None."""
     if estimate is None:
         return Cell(words=none)
-    ends = factor * estimate.low, factor * estimate.high
-    return Cell(factor * estimate.value, ends, decimals)
+    return Cell(factor * estimate.value, (factor * estimate.low, factor * estimate.high), decimals)
 
 
 def metric_cells(metrics: Metrics) -> Cells:
@@ -146,8 +145,7 @@ def metric_rows(
     :param measured: of each controller; None: it failed.
     """
     # A controller that failed has one cell, which says so.
-    failed = {SUCCESS: Cell(words="failed")}
-    ours = [cells or failed for cells in measured]
+    ours = [cells or {SUCCESS: Cell(words="failed")} for cells in measured]
     others = [*map(reference_cells, references)]
     none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells)
     rows = []
@@ -224,8 +222,11 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
 
 def scenario_rows(results: Results, labels: Iterable[str], scenario: Scenario) -> list[Row]:
     """Return the :func:`metric_rows` of a scenario: some controllers, then all references."""
-    measured = [measured_cells(results, label, scenario) for label in labels]
-    return metric_rows(scenario, measured, scenario.reference.values())
+    return metric_rows(
+        scenario,
+        [measured_cells(results, label, scenario) for label in labels],
+        scenario.reference.values(),
+    )
 
 
 def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:

@@ -160,8 +160,9 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
     # Scenarios differ in tolerances and waypoints, and so in their columns.
     table = pd.concat([_table(folder, entry) for entry in entries])
     # Nine digits tell any two float32 apart.
-    text = table.to_csv(index=False, float_format="%.9g", lineterminator="\n")
-    write_text(folder / EPISODES, text)
+    write_text(
+        folder / EPISODES, table.to_csv(index=False, float_format="%.9g", lineterminator="\n")
+    )
 
 
 def _table(folder: Path, entry: Entry) -> pd.DataFrame:

@@ -39,9 +39,9 @@ def share(hits: npt.ArrayLike) -> Estimate:
     scale = 1 + Z * Z / n
     centre = p + Z * Z / (2 * n)
     half = Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
-    low = (centre - half) / scale
-    high = (centre + half) / scale
-    return Estimate(value=p, low=min(p, low), high=max(p, high), n=n)
+    return Estimate(
+        value=p, low=min(p, (centre - half) / scale), high=max(p, (centre + half) / scale), n=n
+    )
 
 
 def mean(values: FloatArray, statistic: Statistic = np.mean) -> Estimate | None:
@@ -66,8 +66,7 @@ def bootstrap(values: FloatArray, statistic: Statistic = np.mean) -> Estimate:
     # block. The generator draws the same numbers however they are divided.
     rows = max(1, BLOCK // n)
     for first in range(0, RESAMPLES, rows):
-        last = min(first + rows, RESAMPLES)
-        chosen = random.integers(0, n, (last - first, n))
-        resampled[first:last] = statistic(values[chosen], axis=-1)
-    low, high = np.percentile(resampled, [2.5, 97.5])
-    return Estimate(value=value, low=min(value, float(low)), high=max(value, float(high)), n=n)
+        part = resampled[first : first + rows]
+        part[:] = statistic(random.choice(values, (len(part), n)), axis=-1)
+    low, high = np.percentile(resampled, [2.5, 97.5]).tolist()
+    return Estimate(value=value, low=min(value, low), high=max(value, high), n=n)

@@ -175,8 +175,7 @@ def text_table(
     :param rows: each begins with its name.
     """
     corner, *names = heads
-    columns = [Column(name, align=align) for name in names]
     filled = []
     for name, *texts in rows:
         filled.append(Row(name, "", [Cell(words=text) for text in texts]))
-    return Table(columns, filled, corner, title)
+    return Table([Column(name, align=align) for name in names], filled, corner, title)

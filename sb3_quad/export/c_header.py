@@ -31,7 +31,7 @@ def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
-    text = render(
+    return render(
         "sb3_quad.export",
         "policy.h.j2",
         name=name,
@@ -41,8 +41,7 @@ def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
         network=network,
         features=OBSERVATION_SIZE,
         F=F,
-    )
-    return text.encode("ascii")
+    ).encode("ascii")
 
 
 def _comment(metadata: StrDict) -> list[str]:

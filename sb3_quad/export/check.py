@@ -72,7 +72,7 @@ class Reference:
         if statistics is not None:
             if self.observation.is_extended:
                 raise ConfigError("VecNormalize with more than the present features has no export")
-            self.clip = statistics.clip_obs
+            self.clip = float(statistics.clip_obs)
             self.mean = self.mean + self.std * statistics.obs_rms.mean
             self.std = self.std * np.sqrt(statistics.obs_rms.var + statistics.epsilon)
         self.turn = find_turn(vehicle, layout)

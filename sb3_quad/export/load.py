@@ -55,8 +55,7 @@ def load_onnx(content: bytes, state_size: int) -> tuple[Call, str]:
     session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
     def run(*inputs: Float32Array) -> Any:
-        names = ["observation", "state"][: len(inputs)]
-        return session.run(None, dict(zip(names, inputs, strict=True)))
+        return session.run(None, dict(zip(("observation", "state"), inputs, strict=False)))
 
     return _call(run, state_size), f"onnxruntime {runtime.__version__}"
 

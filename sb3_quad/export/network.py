@@ -57,7 +57,7 @@ class Network(th.nn.Module):
         vehicle = reference.vehicle
         observation = reference.observation
         self.observation = observation
-        self.clip = float(reference.clip)
+        self.clip = reference.clip
         self.output = reference.output
         self.result, self.unit = OUTPUTS[self.output]
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
@@ -190,7 +190,7 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     frame = np.eye(observation.frame_size)
     frame[:OBSERVATION_SIZE, :OBSERVATION_SIZE] = turn_features(turn) * std / std[:, None]
     if observation.last_action:
-        frame[OBSERVATION_SIZE:, OBSERVATION_SIZE:] = np.eye(4)[list(turn.order)]
+        frame[OBSERVATION_SIZE:, OBSERVATION_SIZE:] = np.eye(4)[[*turn.order]]
     # Every observed frame is turned alike; the weights absorb it, so that files stay as fast.
     frames = np.kron(np.eye(len(observation.ages)), frame)
     linear[0].weight.copy_(linear[0].weight @ th.from_numpy(frames))
@@ -225,8 +225,11 @@ def check_policy(policy: Any, where: str) -> None:
     """:raises ConfigError: a policy that is not ``MlpPolicy`` of an on-policy algorithm, or has
     extractors of its own.
     """
-    extractor = getattr(policy, "pi_features_extractor", None)
-    kinds = [type(policy), type(extractor), type(getattr(policy, "mlp_extractor", None))]
+    kinds = [
+        type(policy),
+        type(getattr(policy, "pi_features_extractor", None)),
+        type(getattr(policy, "mlp_extractor", None)),
+    ]
     if kinds != [ActorCriticPolicy, FlattenExtractor, MlpExtractor]:
         names = " with ".join(kind.__name__ for kind in kinds if kind is not type(None))
         raise ConfigError(

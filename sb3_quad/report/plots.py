@@ -76,8 +76,12 @@ def legend(figure: Figure) -> None:
         drawn, names = axes.get_legend_handles_labels()
         handles.update(zip(names, drawn, strict=True))
     longest = max(map(len, handles), default=0) + MARK
-    columns = max(1, int(LETTERS * figure.get_figwidth() / longest))
-    figure.legend([*handles.values()], [*handles], loc="outside upper left", ncols=columns)
+    figure.legend(
+        [*handles.values()],
+        [*handles],
+        loc="outside upper left",
+        ncols=max(1, int(LETTERS * figure.get_figwidth() / longest)),
+    )
 
 
 def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:

@@ -77,10 +77,11 @@ def sections(results: Results, folder: StrPath) -> list[Section]:
         parts.append(_flights_section(results, heading, scenarios, Path(folder)))
     rows = []
     for record in results.controllers:
-        content = record.content or ""
-        rows.append((record.label, record.spec, record.algorithm or "", content[:12]))
-    heads = ("name", "controller", "algorithm", "SHA-256")
-    parts.append(_words_section("Controllers", heads, rows))
+        content = (record.content or "")[:12]
+        rows.append((record.label, record.spec, record.algorithm or "", content))
+    parts.append(
+        _words_section("Controllers", ("name", "controller", "algorithm", "SHA-256"), rows)
+    )
     if results.failures:
         lines = []
         for failure in results.failures:
@@ -90,8 +91,7 @@ def sections(results: Results, folder: StrPath) -> list[Section]:
 
 
 def _words_section(heading: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Section:
-    table = text_table("", heads, rows, align="left")
-    return Section(heading.lower(), heading, tables=[table])
+    return Section(heading.lower(), heading, tables=[text_table("", heads, rows, align="left")])
 
 
 def _flights_section(
@@ -111,8 +111,9 @@ def _flights_section(
         if len(first.cell) == 1:
             (key,) = first.cell
             cells = [(f"{scenario.cell[key]:g}", [scenario]) for scenario in scenarios]
-            corner = f"{axis_label(key, first)}: success (%)"
-            tables.append(_share_table(SUCCESS, results, cells, corner))
+            tables.append(
+                _share_table(SUCCESS, results, cells, f"{axis_label(key, first)}: success (%)")
+            )
         plots = group_plots(results, scenarios)
     facts = (
         f"{flown}, {first.duration:g} s; observation noise {in_words(first.noise)};"

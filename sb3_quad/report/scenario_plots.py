@@ -49,11 +49,12 @@ def arrivals_plot(
     axes.set_xticks(places, [*map("{:g}".format, scenario.tolerances)])
     axes.grid(axis="x", visible=False)
     legend(figure)
-    caption = (
+    return Plot(
+        f"{scenario.name}_times",
         "Mean time until the vehicle is first within a tolerance of its target, over the flights"
-        " that get there."
+        " that get there.",
+        figure,
     )
-    return Plot(f"{scenario.name}_times", caption, figure)
 
 
 @styled
@@ -74,11 +75,12 @@ def paths_plot(
                 _draw_path(axes, track, label, colours[label], [i, j])
     legend(figure)
     flights_shown = "flight" if count == 1 else f"{count} flights"
-    caption = (
+    return Plot(
+        f"{scenario.name}_paths",
         f"The first {flights_shown} of each controller, from above and from the side. A cross marks"
-        " where a flight is lost; red arrows show the direction of a disturbance force."
+        " where a flight is lost; red arrows show the direction of a disturbance force.",
+        figure,
     )
-    return Plot(f"{scenario.name}_paths", caption, figure)
 
 
 def _draw_path(axes: Axes, track: Track, label: str, colour: str, plane: list[int]) -> None:
@@ -117,12 +119,13 @@ def errors_plot(
     axes.set_ylim(bottom=0.0)
     legend(figure)
     # As many flights of each controller are recorded.
-    caption = (
+    return Plot(
+        f"{scenario.name}_error",
         f"Median of {len(tracks)} flights, in a band from the least to the greatest"
         " distance; red: a disturbance. A lost flight counts as infinitely far away, so that a"
-        " median ends where half of the flights are lost."
+        " median ends where half of the flights are lost.",
+        figure,
     )
-    return Plot(f"{scenario.name}_error", caption, figure)
 
 
 @styled
@@ -134,24 +137,26 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
     keys = [*scenarios[0].cell]
     table = _cells(results, scenarios)
     controllers = table.groupby("label", sort=False)
+    is_single = len(keys) == 1
     plots = []
     for number, key in enumerate(keys):
         figure, axes = new_axes(axis_label(key, scenarios[0]), "success (%)")
         for label, flown in controllers:
             cells = flown.groupby(key)
-            if len(keys) == 1:
+            if is_single:
                 shares = cells[["value", "low", "high"]].first()
             else:
                 shares = cells["value"].agg(["mean", "min", "max"])
             band(axes, results.colours[label], label, 100.0 * shares, **POINTS)
         axes.set_ylim(-3.0, 103.0)
         legend(figure)
-        if len(keys) == 1:
-            plots.append(Plot(f"{group}_success", "Success, with 95 % intervals.", figure))
-        else:
-            caption = "Success, mean, least and greatest over the other quantities."
-            plots.append(Plot(f"{group}_{number}_success", caption, figure))
-    if len(keys) == 1:
+        name = f"{group}_{number}_success"
+        caption = "Success, mean, least and greatest over the other quantities."
+        if is_single:
+            name = f"{group}_success"
+            caption = "Success, with 95 % intervals."
+        plots.append(Plot(name, caption, figure))
+    if is_single:
         figure, axes = new_axes(axis_label(keys[0], scenarios[0]), "final error (m)")
         for label, flown in controllers:
             errors = flown.set_index(keys[0])["error"].dropna().sort_index().clip(lower=LEAST_ERROR)

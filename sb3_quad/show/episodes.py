@@ -52,8 +52,8 @@ class Recording:
     def targets(self) -> FloatArray:
         """The targets flown to, one after the other, (k, 3), world frame, m."""
         # The first target counts as a change, from NaN.
-        changed = np.diff(self.state.target, axis=0, prepend=np.nan).any(axis=1)
-        return self.state.target[changed]
+        target = self.state.target
+        return target[np.diff(target, axis=0, prepend=np.nan).any(axis=1)]
 
     @property
     def disturbances(self) -> list[int]:
@@ -78,8 +78,9 @@ class Recording:
 
     def pose(self, step: int, seconds: float = WRENCH_SECONDS) -> Pose:
         """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
-        wrench = self.wrench_around(step, seconds)
-        return Pose(self.state.array[:, step], wrench, self.rotor_angles[step])
+        return Pose(
+            self.state.array[:, step], self.wrench_around(step, seconds), self.rotor_angles[step]
+        )
 
 
 def landmarks(recordings: Iterable[Recording]) -> FloatArray:
@@ -127,8 +128,7 @@ def scenario_setting(text: str, own: Any = None, vehicle: str | None = None) -> 
     suite, colon, name = text.rpartition(":")
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
-    changed = load_suite(suite).with_changes(vehicle=vehicle)
-    scenario = changed.scenario(name).flown_by(own)
+    scenario = load_suite(suite).with_changes(vehicle=vehicle).scenario(name).flown_by(own)
     return Setting(
         scenario.nominal_vehicle(), scenario.flown_as, lambda seed: sample_plan(scenario, [seed])
     )
@@ -164,16 +164,21 @@ def fly_all(
             own = settings.with_changes(**setting.own.get(name, {}))
             for episode_seed in range(seed, seed + n_envs):
                 label = name if n_envs == 1 else f"seed {episode_seed}, {name}"
-                colour = COLOURS[len(episode) % len(COLOURS)]
-                plan = setting.plan(episode_seed)
                 log = _Log()
                 try:
                     flights = fly_settings(
-                        controller, own, [episode_seed], "pybullet", (), [log], plan, deterministic
+                        controller,
+                        own,
+                        [episode_seed],
+                        "pybullet",
+                        (),
+                        [log],
+                        setting.plan(episode_seed),
+                        deterministic,
                     )
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
-                episode.append(log.recording(label, colour, flights))
+                episode.append(log.recording(label, COLOURS[len(episode) % len(COLOURS)], flights))
         yield episode
         if n_timesteps is None:
             return

@@ -79,8 +79,8 @@ def write_film(path: Path, frames: Iterable[Image]) -> None:
 def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
     """The times of flight, s, that the frames of a film of several flights show."""
     last = max(float(recording.times[-1]) for recording in recordings)
-    n_frames = round((last / speed + HOLD) * FPS) + 1
-    return np.minimum(np.arange(n_frames) * speed / FPS, last)
+    frames = np.arange(round((last / speed + HOLD) * FPS) + 1)
+    return np.minimum(frames * speed / FPS, last)
 
 
 def film_frames(
@@ -157,7 +157,7 @@ def _caption(recording: Recording, step: int) -> str:
     height = recording.state.position[step, 2]
     caption = f"{seconds}   {distance:.2f} m from target   {height:.1f} m high"
     # Only disturbed flights have a force to tell.
-    force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
+    force = np.linalg.norm(recording.wrench_around(step)[:6])
     if force:
         caption += f"   force {force:.1f} N"
     return caption
@@ -188,8 +188,9 @@ def show_in_window(
 
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
-    forward = broadside(landmarks(recordings))
-    cameras = following_cameras(recordings, times, scene.scale, forward, lens)
+    cameras = following_cameras(
+        recordings, times, scene.scale, broadside(landmarks(recordings)), lens
+    )
     begun = time.perf_counter()
     for number, (seconds, camera) in enumerate(zip(times, cameras, strict=True)):
         # The frames follow the clock, so that flights are shown in real time: each waits for its

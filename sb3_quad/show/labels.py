@@ -38,8 +38,7 @@ def with_header(
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, 0, bar, band - 1), fill=recording.colour)
     column = bar + 0.7 * size
-    bold = font(size, "DejaVuSans-Bold")
-    draw.text((column, 0.35 * size), recording.name, font=bold, fill=INK)
+    draw.text((column, 0.35 * size), recording.name, font=font(size, "DejaVuSans-Bold"), fill=INK)
     for number, line in enumerate(lines, 1):
         row = (0.35 + number * STEP) * size
         draw.text((column, row), line, font=font(round(SMALLER * size)), fill=INK)
@@ -55,8 +54,7 @@ def side_by_side(pictures: Sequence[Pillow.Image], columns: int) -> Image:
     # Each picture stands in the top left corner of its field; the gap is on its other sides.
     width = pictures[0].width + GAP
     height = pictures[0].height + GAP
-    size = (columns * width // 2 * 2, rows * height // 2 * 2)
-    sheet = Pillow.new("RGB", size, "white")
+    sheet = Pillow.new("RGB", (columns * width // 2 * 2, rows * height // 2 * 2), "white")
     for number, picture in enumerate(pictures):
         row, column = divmod(number, columns)
         sheet.paste(picture, (column * width, row * height))

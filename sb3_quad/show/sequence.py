@@ -99,11 +99,12 @@ def pose_steps(recording: Recording, view: View) -> list[int]:
 
 def _panel(recording: Recording, view: View) -> Pillow.Image:
     steps = pose_steps(recording, view)
-    trail = Trail(recording.state.position, recording.colour)
     targets = recording.targets
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
-        picture = Pillow.fromarray(scene.picture(view.camera, [trail]))
+        picture = Pillow.fromarray(
+            scene.picture(view.camera, [Trail(recording.state.position, recording.colour)])
+        )
     # The texts grow with the picture, but stay legible in a small one.
     size = max(12, round(view.camera.lens.height / 34))
     draw_times(ImageDraw.Draw(picture, "RGBA"), recording, steps, view, round(0.92 * size))

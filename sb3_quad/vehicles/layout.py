@@ -49,13 +49,13 @@ def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
     :raises ConfigError: no turn does that.
     """
     # Places in the plane as complex numbers: a turn is a factor.
-    places = np.array(own.rotor_positions) @ (1.0, 1.0j)
-    goals = np.array(other.rotor_positions) @ (1.0, 1.0j)
+    places = np.dot(own.rotor_positions, (1.0, 1.0j))
+    goals = np.dot(other.rotor_positions, (1.0, 1.0j))
     fits: dict[Turn, float] = {}
     for order in itertools.permutations(range(4)):
         if tuple(own.rotor_directions[k] for k in order) != other.rotor_directions:
             continue
-        between = np.exp(1j * np.angle(goals * places[list(order)].conj()))
+        between = np.exp(1j * np.angle(goals * places[[*order]].conj()))
         angle = float(np.angle(between.sum()))
         misfit = np.abs(np.angle(between * np.exp(-1j * angle))).max()
         eighth = round(angle / _EIGHTH) * _EIGHTH

@@ -227,7 +227,7 @@ class Vehicle(Frozen):
         turn = find_turn(self, other)
         if turn == Turn():
             return self
-        positions = np.array(self.rotor_positions)[list(turn.order)] @ turn.axes[:2, :2].T
+        positions = np.array(self.rotor_positions)[[*turn.order]] @ turn.axes[:2, :2].T
         changes: StrDict = {name: getattr(self, name) for name in _FOUND}
         changes["rotor_positions"] = positions.tolist()
         changes["rotor_directions"] = other.rotor_directions
@@ -304,7 +304,7 @@ class Vehicle(Frozen):
 
         Above 1 the mass would lie beyond the rotors.
         """
-        return np.asarray(np.sqrt(np.array(self.inertia) / self.mass) / self.arm_length)
+        return np.sqrt(np.divide(self.inertia, self.mass)) / self.arm_length
 
     @property
     def largest_moment(self) -> float:

@@ -82,8 +82,9 @@ class Attitude(OneOf):
         if not isinstance(data, str):
             return data
         if data not in words:
-            names = unknown("attitude", data, words)
-            raise ValueError(f"{names}, or {{quaternion: …}}, or {{tilt: …}}")
+            raise ValueError(
+                f"{unknown('attitude', data, words)}, or {{quaternion: …}}, or {{tilt: …}}"
+            )
         return words[data]
 
     @field_validator("quaternion")
@@ -196,13 +197,11 @@ class VehicleChanges(Frozen):
         """
         if self == VehicleChanges():
             return vehicle
-        inertia = np.multiply(vehicle.inertia, self.inertia)
-        thrust_limits = np.divide(vehicle.thrust_limits, self.mass)
         return vehicle.model_copy(
             update={
                 "mass": vehicle.mass * self.mass,
-                "inertia": tuple(inertia.tolist()),
-                "thrust_limits": tuple(thrust_limits.tolist()),
+                "inertia": np.multiply(vehicle.inertia, self.inertia).tolist(),
+                "thrust_limits": np.divide(vehicle.thrust_limits, self.mass).tolist(),
                 "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
                 "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,
                 "delay": vehicle.delay if self.delay is None else self.delay,

@@ -55,8 +55,9 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
         start["velocity"] = np.einsum("nij,nj->ni", rotation, start["velocity"])
     if target.points:
         start["target"] = np.tile(target.points[0], (len(seeds), 1))
-    vehicle = scenario.nominal_vehicle()
-    wrenches = sample_wrenches(scenario.wrenches, vehicle, scenario.steps, generators)
+    wrenches = sample_wrenches(
+        scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators
+    )
     waypoints = np.array(target.waypoints or ()).reshape(-1, 3)
     return Plan(start, wrenches, waypoints, target.radius)
 

@@ -25,6 +25,8 @@ TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
 DEFAULT_VEHICLE = "itm"
 Printed = float | tuple[float, float] | None  # None: not known
+# Vehicles of the package are loaded once for the many scenarios of a suite.
+_by_name = cache(load_vehicle)
 
 
 class Reference(Frozen):
@@ -161,8 +163,11 @@ class Scenario(Frozen):
         if own is None or self.vehicle is not None:
             return self
         vehicle = first_vehicle(own)
-        where = f"scenario {self.name}, flown by {vehicle.name}"
-        return validate(Scenario, {**self.model_dump(), "vehicle": vehicle}, where)
+        return validate(
+            Scenario,
+            {**self.model_dump(), "vehicle": vehicle},
+            f"scenario {self.name}, flown by {vehicle.name}",
+        )
 
     def flown_vehicle(self) -> Vehicle:
         """The vehicle that flies, changes included.
@@ -174,8 +179,9 @@ class Scenario(Frozen):
         try:
             return self.vehicle_changes.apply(nominal)
         except ValidationError as error:
-            reason = explain(error, Vehicle)
-            raise ValueError(f"vehicle_changes: no such vehicle can fly ({reason})") from None
+            raise ValueError(
+                f"vehicle_changes: no such vehicle can fly ({explain(error, Vehicle)})"
+            ) from None
 
     def episode_seeds(self) -> list[int]:
         """The seeds of the episodes, for ``reset(seed=…)`` of one environment."""
@@ -307,8 +313,13 @@ class Suite(Frozen):
             own = {scenario.name, scenario.group or scenario.name}
             known |= own
             if not names or own & {*names}:
-                where = f"scenario {scenario.name}{flown_by}"
-                changed.append(validate(Scenario, scenario.model_dump() | changes, where))
+                changed.append(
+                    validate(
+                        Scenario,
+                        scenario.model_dump() | changes,
+                        f"scenario {scenario.name}{flown_by}",
+                    )
+                )
         for name in names:
             if name not in known:
                 raise ConfigError(unknown("scenario", name, known))
@@ -321,9 +332,3 @@ class Suite(Frozen):
             if times > 1:
                 raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
         return self
-
-
-@cache
-def _by_name(vehicle: str) -> Vehicle:
-    """Load a vehicle of the package, once for the many scenarios of a suite."""
-    return load_vehicle(vehicle)

@@ -179,8 +179,9 @@ def pack(network: Network) -> StrDict:
 
 def script(modules: Iterable[str] = (*MODEL, *VIEW)) -> str:
     """Return the named modules as one script, in this order."""
-    sources = files(__package__)
-    text = "\n".join(sources.joinpath(f"{name}.js").read_text("utf-8") for name in modules)
+    text = "\n".join(
+        files(__package__).joinpath(f"{name}.js").read_text("utf-8") for name in modules
+    )
     return join_modules(text).replace('JSON.parse("TABLES")', json.dumps(TABLES))
 
 
