@@ -19,7 +19,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict, StrPath
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.batch_env import quadcopter_spaces
-from sb3_quad.evaluation.fleets import FLEETS
+from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings, known_layout
@@ -91,9 +91,8 @@ class Flights:
         for name, first in vars(parts[0]).items():
             values = [getattr(part, name) for part in parts]
             if isinstance(first, Mapping):
-                columns[name] = {
-                    key: np.concatenate([value[key] for value in values]) for key in first
-                }
+                arrays = zip(*[value.values() for value in values], strict=True)
+                columns[name] = dict(zip(first, map(np.concatenate, arrays), strict=True))
             else:
                 columns[name] = np.concatenate(values)
         return Flights(**columns)
@@ -182,19 +181,12 @@ def fly(
     settings = FlightSettings().with_changes(
         task=task, vehicle=vehicle, noise=noise, max_episode_steps=max_steps, **environment
     )
+    seeds = row_seeds(seed, n_flights)
     return fly_settings(
-        controller,
-        settings,
-        row_seeds(seed, n_flights),
-        backend,
-        tolerances,
-        hooks,
-        reward=reward,
-        record=record,
+        controller, settings, seeds, backend, tolerances, hooks, reward=reward, record=record
     )
 
 
-# It is long because a split would hand over a dozen arrays that each step changes.
 def fly_settings(
     controller: Any,
     settings: FlightSettings,
@@ -214,112 +206,124 @@ def fly_settings(
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
-    if isinstance(reward, type):
-        # A reward that remembers, such as the last actions, begins afresh with these episodes.
-        reward = reward()
-    plan = plan or Plan()
     with closing(FLEETS[backend](seeds, settings)) as fleet:
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
             controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic
         )
-        vehicle = fleet.vehicle_list[0]
-        observation = fleet.begin(plan.start)
-        # The state is a live view: copy what later steps need.
-        state = fleet.true_state()
-        start = state.copy()
-        position = start.position
-        course = Waypoints(plan, fleet.n)
-        distance = state.distance
-        arrivals = Arrivals(tolerances, course.to_last(distance))
-        motion = Motion(start, vehicle.control_step)
-        if len(plan.waypoints):
-            # A course has no single straight line to deviate from.
-            motion.cross_track_error[:] = np.nan
-        flying = np.ones(fleet.n, bool)  # a flight survives until it is lost
-        collision = np.zeros(fleet.n, bool)
-        length = np.zeros(fleet.n, np.int64)
-        path_length = np.zeros(fleet.n)
-        total = np.zeros(fleet.n)
-        own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
-        observed = []  # for ``record``, as is ``acted``
-        acted = []
+        if isinstance(reward, type):
+            # A reward that remembers, such as the last actions, begins afresh with these episodes.
+            reward = reward()
+        steps = settings.longest_episode
+        return _fly_fleet(fleet, pilot, plan or Plan(), steps, tolerances, hooks, reward, record)
+
+
+# It is long because a split would hand over a dozen arrays that each step changes.
+def _fly_fleet(
+    fleet: Fleet,
+    controller: Controller,
+    plan: Plan,
+    max_steps: int,
+    tolerances: Sequence[float],
+    hooks: Sequence[Hook],
+    reward: Reward | None,
+    record: StrPath | None,
+) -> Flights:
+    vehicle = fleet.vehicle_list[0]
+    observation = fleet.begin(plan.start)
+    # The state is a live view: copy what later steps need.
+    state = fleet.true_state()
+    start = state.copy()
+    position = start.position
+    course = Waypoints(plan, fleet.n)
+    distance = state.distance
+    arrivals = Arrivals(tolerances, course.to_last(distance))
+    motion = Motion(start, vehicle.control_step)
+    if len(plan.waypoints):
+        # A course has no single straight line to deviate from.
+        motion.cross_track_error[:] = np.nan
+    flying = np.ones(fleet.n, bool)  # a flight survives until it is lost
+    collision = np.zeros(fleet.n, bool)
+    length = np.zeros(fleet.n, np.int64)
+    path_length = np.zeros(fleet.n)
+    total = np.zeros(fleet.n)
+    own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
+    observed = []  # for ``record``, as is ``acted``
+    acted = []
+    for hook in hooks:
+        hook.on_start(state, vehicle)
+
+    for step in range(1, max_steps + 1):
+        time = step * vehicle.control_step
+        # Disturbances of the plan begin and end between two control steps.
+        if step - 1 in plan.wrenches:
+            fleet.wrench[:] = plan.wrenches[step - 1].T
+        try:
+            actions = controller.actions(observation, flying)
+        except ControllerError as error:
+            before = time - vehicle.control_step
+            raise ControllerError(f"{error}, after {before:.2f} s") from error
         for hook in hooks:
-            hook.on_start(state, vehicle)
-
-        for step in range(1, settings.longest_episode + 1):
-            time = step * vehicle.control_step
-            # Disturbances of the plan begin and end between two control steps.
-            if step - 1 in plan.wrenches:
-                fleet.wrench[:] = plan.wrenches[step - 1].T
-            try:
-                actions = pilot.actions(observation, flying)
-            except ControllerError as error:
-                raise ControllerError(
-                    f"{error}, after {time - vehicle.control_step:.2f} s"
-                ) from error
-            for hook in hooks:
-                hook.before_step(state, observation, fleet.total_wrench().T, flying)
-            if record is not None:
-                observed.append(observation[flying])
-                # The environment clips them, too.
-                acted.append(actions[flying].clip(-1.0, 1.0))
-            observation, rewards, _ = fleet.step(actions)
-            state = fleet.true_state()
-
-            # This step counts also for the flights that it has ended; their distance stays.
-            length += flying
-            collision |= flying & fleet.outcome["collision"]
-            np.copyto(distance, fleet.outcome["distance"], where=flying)
-            total += np.where(flying, rewards, 0.0)
-            if reward is not None:
-                own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
-            way = np.linalg.norm(state.position - position, axis=1)
-            path_length += np.where(flying, way, 0.0)
-            position = state.position.copy()
-            arrivals.see(time, course.to_last(distance))
-
-            # From here on, only the flights that continue count.
-            flying &= fleet.outcome["truncated"]
-            motion.see(step, state, flying)
-            for hook in hooks:
-                hook.after_step(step, state, actions, flying)
-            if not flying.any():
-                break
-            if len(plan.waypoints):
-                # Whoever has reached a waypoint sees the next one from the next step on.
-                onward = course.see(time, distance, flying)
-                if onward.size:
-                    fleet.state[TARGET, onward] = course.targets(onward).T
-                    observation = fleet.observe()
-
+            hook.before_step(state, observation, fleet.total_wrench().T, flying)
         if record is not None:
-            write_arrays(
-                record, observations=np.concatenate(observed), actions=np.concatenate(acted)
-            )
-        # A flight that was lost, or that did not get to its last target, has no success and no time
-        # after which it stays there.
-        settling_time = np.where(flying, arrivals.settling_time, np.nan)
-        return Flights(
-            success=fleet.outcome["success"] & flying & course.on_last,
-            survival=flying,
-            collision=collision,
-            reward=total,
-            own_reward=own_total,
-            length=length,
-            flown=length.astype(np.float64) * vehicle.control_step,
-            time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
-            settling_time=dict(zip(tolerances, settling_time, strict=True)),
-            overshoot=arrivals.overshoot,
-            path_length=path_length,
-            final_error=distance,
-            final_offset=np.where(flying[:, None], state.position - state.target, np.nan),
-            recovery_time=motion.recovery_time,
-            cross_track_error=motion.cross_track_error,
-            waypoint_times=course.times,
-            start=start.array[:13].T,
-            target=start.target,
-        )
+            observed.append(observation[flying])
+            # The environment clips them, too.
+            acted.append(actions[flying].clip(-1.0, 1.0))
+        observation, rewards, _ = fleet.step(actions)
+        state = fleet.true_state()
+
+        # This step counts also for the flights that it has ended; their distance stays.
+        length += flying
+        collision |= flying & fleet.outcome["collision"]
+        np.copyto(distance, fleet.outcome["distance"], where=flying)
+        total += np.where(flying, rewards, 0.0)
+        if reward is not None:
+            own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
+        way = np.linalg.norm(state.position - position, axis=1)
+        path_length += np.where(flying, way, 0.0)
+        position = state.position.copy()
+        arrivals.see(time, course.to_last(distance))
+
+        # From here on, only the flights that continue count.
+        flying &= fleet.outcome["truncated"]
+        motion.see(step, state, flying)
+        for hook in hooks:
+            hook.after_step(step, state, actions, flying)
+        if not flying.any():
+            break
+        if len(plan.waypoints):
+            # Whoever has reached a waypoint sees the next one from the next step on.
+            onward = course.see(time, distance, flying)
+            if onward.size:
+                fleet.state[TARGET, onward] = course.targets(onward).T
+                observation = fleet.observe()
+
+    if record is not None:
+        write_arrays(record, observations=np.concatenate(observed), actions=np.concatenate(acted))
+    # A flight that was lost, or that did not get to its last target, has no success and no time
+    # after which it stays there.
+    settling_time = np.where(flying, arrivals.settling_time, np.nan)
+    offset = state.position - state.target
+    return Flights(
+        success=fleet.outcome["success"] & flying & course.on_last,
+        survival=flying,
+        collision=collision,
+        reward=total,
+        own_reward=own_total,
+        length=length,
+        flown=length.astype(np.float64) * vehicle.control_step,
+        time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
+        settling_time=dict(zip(tolerances, settling_time, strict=True)),
+        overshoot=arrivals.overshoot,
+        path_length=path_length,
+        final_error=distance,
+        final_offset=np.where(flying[:, None], offset, np.nan),
+        recovery_time=motion.recovery_time,
+        cross_track_error=motion.cross_track_error,
+        waypoint_times=course.times,
+        start=start.array[:13].T,
+        target=start.target,
+    )
 
 
 def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -> FloatArray:
@@ -364,8 +368,14 @@ class Arrivals:
         """
         inside = distance <= self._limits
         np.fmin(self.time_to, np.where(inside, time, np.nan), out=self.time_to)
-        self.settling_time = np.where(inside, np.fmin(self.settling_time, time), np.nan)
-        np.fmax(self.overshoot, distance, out=self.overshoot, where=~np.isnan(self._first))
+        self.settling_time = _since(self.settling_time, inside, time)
+        arrived = ~np.isnan(self._first)
+        np.fmax(self.overshoot, distance, out=self.overshoot, where=arrived)
+
+
+def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
+    """Return since when a condition has held, given that it ``holds`` now; else NaN."""
+    return np.where(holds, np.fmin(times, time), np.nan)
 
 
 class Waypoints:
@@ -382,9 +392,8 @@ class Waypoints:
 
     def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
-        reached = np.flatnonzero(
-            flying & (distance <= self._plan.radius) & (self._next < self._count)
-        )
+        near = flying & (distance <= self._plan.radius)
+        reached = np.flatnonzero(near & (self._next < self._count))
         self.times[reached, self._next[reached]] = time
         self._next[reached] += 1
         return reached[self._next[reached] < self._count]
@@ -436,7 +445,7 @@ class Motion:
         x, y = state.quaternion.T[1:3]
         upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
         stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
-        self._stable_since = np.where(stable, np.fmin(self._stable_since, time), np.nan)
+        self._stable_since = _since(self._stable_since, stable, time)
         # Half a step of tolerance, since times are multiples of steps only up to rounding.
         held = flying & (time - self._stable_since > HOLD - 0.5 * self._control_step)
         np.fmin(self.recovery_time, self._stable_since, out=self.recovery_time, where=held)
@@ -444,4 +453,5 @@ class Motion:
         flown = state.position - self._start
         along = (flown * self._direction).sum(axis=1, keepdims=True) * self._direction
         across = np.linalg.norm(flown - along, axis=1)
-        np.maximum(self.cross_track_error, across, out=self.cross_track_error, where=flying)
+        error = self.cross_track_error
+        np.maximum(error, across, out=error, where=flying)
