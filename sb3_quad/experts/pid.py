@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
-from sb3_quad.experts.vectors import difference, plus_dot, rotated, rotations_at, vector_at
+from sb3_quad.experts.vectors import difference, rotated, rotations_at, vector_at
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.state import QuadcopterState, X
 from sb3_quad.vehicles.vehicle import VehicleSource
@@ -51,9 +51,12 @@ class PIDExpert(Expert):
         # Table A.1, for any inertia (Eq. 3.15).
         v = self.vehicle
         inertia = np.asarray(v.inertia)
+        position_gains = np.array([kp, kd, ki * v.control_step, v.mass, v.gravity])
+        proportional = inertia * natural_frequency**2
+        derivative = inertia * 2 * damping * natural_frequency
         self._constants = (
-            np.array([kp, kd, ki * v.control_step, v.mass, v.gravity]),
-            np.stack([inertia * natural_frequency**2, inertia * 2 * damping * natural_frequency]),
+            position_gains,
+            np.stack([proportional, derivative]),
             v.mixer_inverse,
             np.array(v.thrust_range),
         )
@@ -66,6 +69,12 @@ class PIDExpert(Expert):
 
 
 @compiled
+def _rotor_thrust(mixer_row, u1, u2, u3, u4):  # type: ignore[no-untyped-def]
+    """Return the thrust of a rotor, N, for a thrust u1 and moments u2, u3, u4 (Eq. 2.7)."""
+    return mixer_row[0] * u1 + mixer_row[1] * u2 + mixer_row[2] * u3 + mixer_row[3] * u4
+
+
+@compiled
 def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
     """Write the actions of n vehicles, (n, 4), from their state, (STATE_SIZE, n)."""
     kp, kd, ki_dt, mass, g = gains
@@ -73,7 +82,6 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
     low, high = limits
     middle = (high + low) / 2
     half = (high - low) / 2
-    thrusts = np.empty(4)
     for i in range(actions.shape[0]):
         position_error = difference(vector_at(state, X.target, i), vector_at(state, X.position, i))
         # The velocity in the body frame, and the Euler angles Z-Y-X.
@@ -95,17 +103,18 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
         pitch_des = ANGLE_FACTOR * (ax * cosine + ay * sine) / g
 
         # Attitude: the thrust and the moments (Eqs. 2.7 to 2.10). The desired yaw is 0.
-        thrust = mass * (g + az + ki_dt * position_error[2])
-        moments = (
-            proportional[0] * (roll_des - roll) - derivative[0] * p,
-            proportional[1] * (pitch_des - pitch) - derivative[1] * q,
-            -proportional[2] * yaw - derivative[2] * r,
-        )
+        u1 = mass * (g + az + ki_dt * position_error[2])
+        u2 = proportional[0] * (roll_des - roll) - derivative[0] * p
+        u3 = proportional[1] * (pitch_des - pitch) - derivative[1] * q
+        u4 = -proportional[2] * yaw - derivative[2] * r
 
         # Scale all four thrusts by one factor, so that the largest is allowed.
+        largest = -math.inf
         for k in range(4):
-            thrusts[k] = plus_dot(mixer_inverse[k, 0] * thrust, mixer_inverse[k, 1:], moments)
-        scale = high / max(high, thrusts.max())
+            largest = max(largest, _rotor_thrust(mixer_inverse[k], u1, u2, u3, u4))
+        scale = 1.0
+        if largest > high:
+            scale = high / largest
         for k in range(4):
-            rotor_thrust = max(low, scale * thrusts[k])
-            actions[i, k] = min(1.0, max(-1.0, (rotor_thrust - middle) / half))
+            thrust = max(low, scale * _rotor_thrust(mixer_inverse[k], u1, u2, u3, u4))
+            actions[i, k] = min(1.0, max(-1.0, (thrust - middle) / half))
