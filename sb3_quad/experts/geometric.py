@@ -5,6 +5,7 @@ It recovers from nearly every attitude, spin and fall, and flies to targets.
 
 import numpy as np
 
+from sb3_quad.base.types import FloatArray
 from sb3_quad.experts.geometric_gains import TrueConstants, constants_of, derived_gains
 from sb3_quad.experts.geometric_law import fly_geometric
 from sb3_quad.experts.protocol import Actions, Expert
@@ -70,15 +71,21 @@ class GeometricExpert(Expert):
             if state.vehicles is not None:
                 constants = self._true.of(state.vehicles)
             if state.wrench is not None:
-                wrench = state.wrench
-                if state.vehicles is not None and state.vehicles[P.drag_x : P.drag_z + 1].any():
-                    # Drag against the air at rest is that of the vehicle's own motion.
-                    own_drag = drag_forces(state.array, state.vehicles, np.zeros((3, 1)))
-                    wrench = wrench.copy()
-                    wrench[FORCE_WORLD] -= _DRAG_LEFT * own_drag
+                wrench = self._to_compensate(state, state.wrench)
         actions = np.empty((state.n, 4), dtype=np.float32)
         fly_geometric(state.array, constants, wrench, actions)
         return actions
+
+    @staticmethod
+    def _to_compensate(state: QuadcopterState, wrench: FloatArray) -> FloatArray:
+        """Return the external wrench less a part of the vehicles' own drag."""
+        if state.vehicles is None or not state.vehicles[P.drag_x : P.drag_z + 1].any():
+            return wrench
+        # Drag against the air at rest is that of the vehicle's own motion.
+        at_rest = np.zeros((3, 1))
+        wrench = wrench.copy()
+        wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, at_rest)
+        return wrench
 
 
 def privileged_geometric(vehicle: VehicleSource = "itm") -> GeometricExpert:

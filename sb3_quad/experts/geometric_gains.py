@@ -65,14 +65,15 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
     # How quickly the vehicle can turn: the weaker of roll and pitch counts.
     gravity = v[P.gravity]
     lag = command_lag(v, control_step)
-    arms = np.abs(v[P.roll_arm_0 : P.yaw_arm_0]).reshape(2, 4, -1)
-    moments = arms.sum(axis=1) * v[P.thrust_half_range]
+    roll_pitch_arms = v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)
+    moments = np.abs(roll_pitch_arms).sum(axis=1) * v[P.thrust_half_range]
     turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
     rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
 
     # In hover thrusts. Worn motors and a low battery may not even lift the vehicle.
     least = (v[P.thrust_middle] - v[P.thrust_half_range]) / v[P.hover_thrust]
-    most = np.maximum(1.01, (v[P.thrust_middle] + v[P.thrust_half_range]) / v[P.hover_thrust])
+    most = (v[P.thrust_middle] + v[P.thrust_half_range]) / v[P.hover_thrust]
+    most = np.maximum(most, 1.01)
     sideways = np.sqrt(most**2 - 1.0)
     upwards = gravity * (most - 1.0)
     downwards = 1.0 - least

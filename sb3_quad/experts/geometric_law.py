@@ -45,14 +45,11 @@ def fly_geometric(state, constants, wrench, actions):
         omega = vector_at(state, X.body_rates, i)
 
         # What the external wrench does: an acceleration in the world frame, a torque in the body's.
-        force = plus_rotated(
-            vector_at(wrench, W.force_world, j), rotation, vector_at(wrench, W.force_body, j)
-        )
-        torque = plus_rotated(
-            vector_at(wrench, W.torque_body, j),
-            rotation_inverse,
-            vector_at(wrench, W.torque_world, j),
-        )
+        body_force = vector_at(wrench, W.force_body, j)
+        force = plus_rotated(vector_at(wrench, W.force_world, j), rotation, body_force)
+        world_torque = vector_at(wrench, W.torque_world, j)
+        body_torque = vector_at(wrench, W.torque_body, j)
+        torque = plus_rotated(body_torque, rotation_inverse, world_torque)
 
         # The force that the rotors should give per mass, and its direction b as the body will see
         # it when the command acts.
@@ -69,7 +66,8 @@ def fly_geometric(state, constants, wrench, actions):
 
         # Moments for the turn, against the yaw rate, and against the external torque.
         mx, my = turn_moments(b, omega, gains, inertia)
-        moments = difference((mx, my, -gains[G.yaw_rate] * inertia[2] * omega[2]), torque)
+        mz = -gains[G.yaw_rate] * inertia[2] * omega[2]
+        moments = difference((mx, my, mz), torque)
         allocate(
             mass * size * b[2],
             moments,
@@ -156,7 +154,8 @@ def seen_later(b, omega, time):
     n = divided(omega, rate)
     n_cross_b = cross(n, b)
     cosine = math.cos(rate * time)
-    shares = cosine, -math.sin(rate * time), dot(n, b) * (1.0 - cosine)
+    sine = -math.sin(rate * time)
+    shares = cosine, sine, dot(n, b) * (1.0 - cosine)
     return (
         dot(shares, (b[0], n_cross_b[0], n[0])),
         dot(shares, (b[1], n_cross_b[1], n[1])),
@@ -220,7 +219,10 @@ def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, t
         tilting[rotor] = share
         least = min(least, share)
         most = max(most, share)
-    scale = half / max(half, most, -least)
+    largest = max(most, -least)
+    scale = 1.0
+    if largest > half:
+        scale = half / largest
     common = min(high, max(low, thrust / 4))
     common = min(high - scale * most, max(low - scale * least, common))
 

@@ -68,10 +68,9 @@ class Expert(ABC):
                 f"expected ({OBSERVATION_SIZE},) or (n, {OBSERVATION_SIZE})"
             )
         # One observation is a batch of one.
-        state_of_rows = observed_state(
-            np.atleast_2d(array), self.observation_mean, self.observation_std
-        )
-        return self.actions(state_of_rows).reshape(*array.shape[:-1], -1), state
+        rows = np.atleast_2d(array)
+        actions = self.actions(observed_state(rows, self.observation_mean, self.observation_std))
+        return actions.reshape(*array.shape[:-1], -1), state
 
 
 def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -> QuadcopterState:
