@@ -53,16 +53,14 @@ class BulletBody:
     """
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
-        self.has_window = window is not None and has_display()
-        if window is not None and self.has_window:
-            client = open_window(*window)
-        else:
-            client = int(p.connect(p.DIRECT))
-        if window is not None and not self.has_window:
+        if window is not None and not has_display():
             sys.stderr.write(
                 "sb3_quad: DISPLAY is not set, so no window opens; "
                 "render_mode='rgb_array' makes pictures\n"
             )
+            window = None
+        self.has_window = window is not None
+        client = int(p.connect(p.DIRECT)) if window is None else open_window(*window)
         self.client = client
         # The number of PyBullet's clients is limited, so this one is also closed if the object is
         # garbage-collected without close(), and when the interpreter exits.

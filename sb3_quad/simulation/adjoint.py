@@ -14,9 +14,8 @@ import math
 from sb3_quad.simulation.compiled import LANES, compiled
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 from sb3_quad.simulation.physics import (
-    accelerate,
-    limit_velocities,
-    move,
+    fly,
+    four,
     quaternion_product,
     rotation,
     sinc_and_cosine,
@@ -33,12 +32,7 @@ MOVING = X.target  # the rows of the state that a flight changes
 @compiled(inline="always")
 def _add_rotation(quaternion, gradient, lane, x, y, z):
     """Add the gradient by a quaternion, given that by its rotation matrix, row by row."""
-    qw, qx, qy, qz = (
-        quaternion[0, lane],
-        quaternion[1, lane],
-        quaternion[2, lane],
-        quaternion[3, lane],
-    )
+    qw, qx, qy, qz = four(quaternion, lane)
     (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = x, y, z
     k = X.quaternion
     gradient[k, lane] += 2.0 * (qz * (y0 - x1) + qy * (x2 - z0) + qx * (z1 - y2))
@@ -70,8 +64,8 @@ def undo_move(before, after, gradient, dt):
     half_step = 0.5 * dt
     k = X.quaternion
     for lane in range(LANES):
-        px, py, pz = vector(gradient[X.position :], lane)
-        _add(gradient, X.velocity, lane, dt * px, dt * py, dt * pz)
+        for axis in range(3):
+            gradient[X.velocity + axis, lane] += dt * gradient[X.position + axis, lane]
 
         # The new quaternion is n = q a, with a = (cos |h|, h sin |h| / |h|) and h = dt ω / 2.
         wx, wy, wz = vector(after[X.body_rates :], lane)
@@ -79,21 +73,11 @@ def undo_move(before, after, gradient, dt):
         h2 = hx * hx + hy * hy + hz * hz
         sinc, cosine = sinc_and_cosine(h2)
         ax, ay, az = sinc * hx, sinc * hy, sinc * hz
-        qw, qx, qy, qz = (
-            before[k, lane],
-            before[k + 1, lane],
-            before[k + 2, lane],
-            before[k + 3, lane],
-        )
+        qw, qx, qy, qz = four(before[k:], lane)
         nw, nx, ny, nz = quaternion_product(qw, qx, qy, qz, cosine, ax, ay, az)
 
         # n is scaled by s = 1.5 - |n|² / 2, so the gradient g becomes s g - n (n g).
-        gw, gx, gy, gz = (
-            gradient[k, lane],
-            gradient[k + 1, lane],
-            gradient[k + 2, lane],
-            gradient[k + 3, lane],
-        )
+        gw, gx, gy, gz = four(gradient[k:], lane)
         scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
         along = nw * gw + nx * gx + ny * gy + nz * gz
         gw = scale * gw - along * nw
@@ -110,11 +94,8 @@ def undo_move(before, after, gradient, dt):
         gradient[k + 3, lane] = gz
 
         # (cos |h| - sin |h| / |h|) / |h|², the slope of the sinc over |h|, by Horner's scheme.
-        slope = 1.0 - h2 / 88.0
-        slope = 1.0 - h2 / 54.0 * slope
-        slope = 1.0 - h2 / 28.0 * slope
-        slope = 1.0 - h2 / 10.0 * slope
-        slope = -slope / 3.0
+        slope = 1.0 - h2 / 28.0 * (1.0 - h2 / 54.0 * (1.0 - h2 / 88.0))
+        slope = (h2 / 10.0 * slope - 1.0) / 3.0
         along = slope * (hx * tx + hy * ty + hz * tz) - sinc * tw
         _add(
             gradient,
@@ -212,9 +193,7 @@ def undo_flight(b, passed, gradient, by_wanted, dt, substeps):
     """
     for substep in range(substeps):
         passed[substep] = b.state[:MOVING]
-        if accelerate(b):
-            limit_velocities(b)
-        move(b, dt)
+        fly(b, dt, 1)
     passed[substeps] = b.state[:MOVING]
     by_wanted[:, :] = 0.0
     for substep in range(substeps - 1, -1, -1):
@@ -250,10 +229,9 @@ def undo_features(b, by_feature, gradient):
     f = by_feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
-        px, py, pz = vector(f[F.position :], lane)
-        _add(gradient, X.position, lane, px, py, pz)
-        wx, wy, wz = vector(f[F.body_rates :], lane)
-        _add(gradient, X.body_rates, lane, wx, wy, wz)
+        for k in range(3):
+            gradient[X.position + k, lane] += f[F.position + k, lane]
+            gradient[X.body_rates + k, lane] += f[F.body_rates + k, lane]
         # The observed velocity is Rᵀ v.
         gx, gy, gz = vector(f[F.velocity :], lane)
         x, y, z = to_world(r, gx, gy, gz)
