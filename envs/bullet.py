@@ -81,12 +81,11 @@ class BulletBody:
 
     def become(self, parameters: FloatArray) -> None:
         """Take on the mass and inertia in a vehicle's ``parameters()``."""
-        inertia = parameters[[P.ixx, P.iyy, P.izz]].tolist()
         p.changeDynamics(
             self.body,
             -1,
             mass=float(parameters[P.mass]),
-            localInertiaDiagonal=inertia,
+            localInertiaDiagonal=parameters[[P.ixx, P.iyy, P.izz]].tolist(),
             linearDamping=0.0,
             angularDamping=0.0,
             physicsClientId=self.client,

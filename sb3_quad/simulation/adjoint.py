@@ -118,26 +118,13 @@ def undo_accelerate(b, before, after, gradient, by_wanted):
     for lane in range(LANES):
         r = rotation(before[X.quaternion :], lane)
 
-        # The force in the body frame, as it was: drag of the airspeed u, and the thrusts.
-        vx, vy, vz = vector(before[X.velocity :], lane)
-        wind_x, wind_y, wind_z = vector(b.wind, lane)
-        ux, uy, uz = vx - wind_x, vy - wind_y, vz - wind_z
-        bx, by, bz = to_body(r, ux, uy, uz)
-        for k in range(4):
-            new = after[X.rotor_speeds + k, lane]
-            old = before[X.rotor_speeds + k, lane]
-            b.thrust[k, lane] = b.lift[lane] * new * (new + b.exact[lane] * (old - new))
-        dx, dy, dz = vector(b.drag, lane)
-        fx = b.force_body[0, lane] - dx * bx
-        fy = b.force_body[1, lane] - dy * by
-        fz = b.force_body[2, lane] - dz * bz + total_thrust(b, lane)
-
         # By the torque in the body frame, and through the gyroscopic terms by the body rates.
-        gain = b.rates_gain
+        gain_x, gain_y, gain_z = vector(b.rates_gain, lane)
         tx, ty, tz = vector(gradient[X.body_rates :], lane)
-        tx, ty, tz = gain[0, lane] * tx, gain[1, lane] * ty, gain[2, lane] * tz
+        tx, ty, tz = gain_x * tx, gain_y * ty, gain_z * tz
         wx, wy, wz = vector(before[X.body_rates :], lane)
-        gx, gy, gz = b.gyro[0, lane] * tx, b.gyro[1, lane] * ty, b.gyro[2, lane] * tz
+        gx, gy, gz = vector(b.gyro, lane)
+        gx, gy, gz = gx * tx, gy * ty, gz * tz
         _add(
             gradient,
             X.body_rates,
@@ -159,14 +146,26 @@ def undo_accelerate(b, before, after, gradient, by_wanted):
             by_thrust = (
                 cz + b.arm[0, k, lane] * tx + b.arm[1, k, lane] * ty + b.arm[2, k, lane] * tz
             )
-            by_thrust *= b.lift[lane]
-            exact = b.exact[lane]
+            lift, exact = b.lift[lane], b.exact[lane]
+            by_thrust *= lift
+            b.thrust[k, lane] = lift * new * (new + exact * (old - new))
             by_new = gradient[X.rotor_speeds + k, lane]
             by_new += by_thrust * (2.0 * new * (1.0 - exact) + exact * old)
             speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
             factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
             by_wanted[k, lane] += factor * by_new
             gradient[X.rotor_speeds + k, lane] = (1.0 - factor) * by_new + by_thrust * exact * new
+
+        # The force in the body frame, as it was: drag of the airspeed u, and the thrusts.
+        vx, vy, vz = vector(before[X.velocity :], lane)
+        wind_x, wind_y, wind_z = vector(b.wind, lane)
+        ux, uy, uz = vx - wind_x, vy - wind_y, vz - wind_z
+        bx, by, bz = to_body(r, ux, uy, uz)
+        dx, dy, dz = vector(b.drag, lane)
+        fx, fy, fz = vector(b.force_body, lane)
+        fx -= dx * bx
+        fy -= dy * by
+        fz += total_thrust(b, lane) - dz * bz
 
         # By the velocity, through the drag, and by the attitude: forces, drag and torques turn.
         cx, cy, cz = -dx * cx, -dy * cy, -dz * cz

@@ -265,7 +265,13 @@ def step(
                 # The gusts of the wind have words of their own.
                 gust_words(b.word[GUST_WORDS:], b.stream)
                 advance_gusts(b, wind_gust, first, count)
-            _advance_frames(b, first, count, actions, integral_numbers, integral, frames)
+            if frames.shape[1] > 0:
+                # A policy sees more than the present features.
+                for lane in range(count):
+                    i = first + lane
+                    store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
+                    if integral.shape[0] > 0:
+                        integrate_position(b, i, lane, integral_numbers, integral)
             _write_observations(b, count, integral, ages, frames, observations)
             ended = _end_episodes(
                 b, first, count, autoreset, observations, rewards, dones, returns, limits,
@@ -467,18 +473,6 @@ def _load_commands(b, first, count, actions, queue, own_delays):
                 wanted[k, lane] = new if own[lane] == 0.0 else old
         for lane in range(count):
             queue[delay - 1, k, first + lane] = command[k, lane]
-
-
-@inlined
-def _advance_frames(b, first, count, actions, integral_numbers, integral, frames):
-    """Keep the actions of a block and advance its position integrals, where a policy sees them."""
-    if frames.shape[1] == 0:
-        return
-    for lane in range(count):
-        i = first + lane
-        store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
-        if integral.shape[0] > 0:
-            integrate_position(b, i, lane, integral_numbers, integral)
 
 
 @compiled

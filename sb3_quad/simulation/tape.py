@@ -68,17 +68,8 @@ class FlightTape:
         """
         batch = self.batch
         observations = batch.reset(np.flatnonzero(self.lost) if carry_on else None)
-        self._refuse_fast_motors()
-        self._at = 0
-        self._streams = batch.streams.copy()
-        self._queue = batch.queue.copy()
-        self.lengths[:] = self.n_steps
-        self.lost[:] = False
-        return observations
-
-    def _refuse_fast_motors(self) -> None:
-        """Check that no rotor overshoots its commanded speed because the physics steps are long."""
-        vehicles = self.batch.vehicles
+        # A rotor must not overshoot its commanded speed because the physics steps are long.
+        vehicles = batch.vehicles
         gains = np.maximum(vehicles[P.motor_gain_up], vehicles[P.motor_gain_down])
         fastest = float((gains * (vehicles[P.exact_motors] == 0.0)).max())
         if fastest * self.physics_step > 1.0:
@@ -86,6 +77,12 @@ class FlightTape:
                 f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
                 " give None, which is what the simulation has"
             )
+        self._at = 0
+        self._streams = batch.streams.copy()
+        self._queue = batch.queue.copy()
+        self.lengths[:] = self.n_steps
+        self.lost[:] = False
+        return observations
 
     def step(self, actions: Float32Array) -> Float32Array:
         """Fly a control step; return the observations after it.
@@ -238,10 +235,10 @@ def undo(
             load_rows(wind, first, count, b.wind)
             for lane in range(LANES):
                 i = b.row[lane]
-                late = np.int64(b.delay[lane])
+                acted = step - np.int64(b.delay[lane])
                 for k in range(4):
-                    if step >= late:
-                        b.wanted_speeds[k, lane] = rotor_speed(b, lane, actions[step - late, i, k])
+                    if acted >= 0:
+                        b.wanted_speeds[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
                     else:
                         b.wanted_speeds[k, lane] = queue[step, k, i]
                 if step >= lengths[i]:
