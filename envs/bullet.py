@@ -60,8 +60,7 @@ class BulletBody:
             )
             window = None
         self.has_window = window is not None
-        client = int(p.connect(p.DIRECT)) if window is None else open_window(*window)
-        self.client = client
+        client = self.client = open_window(*window) if window else int(p.connect(p.DIRECT))
         # The number of PyBullet's clients is limited, so this one is also closed if the object is
         # garbage-collected without close(), and when the interpreter exits.
         self._close = weakref.finalize(self, disconnect, client)

@@ -19,6 +19,7 @@ from sb3_quad.simulation.physics import (
     quaternion_product,
     rotation,
     sinc_and_cosine,
+    store,
     to_body,
     to_world,
     total_thrust,
@@ -89,9 +90,7 @@ def undo_move(before, after, gradient, dt):
         tw, tx, ty, tz = quaternion_product(qw, -qx, -qy, -qz, gw, gx, gy, gz)
         gw, gx, gy, gz = quaternion_product(gw, gx, gy, gz, cosine, -ax, -ay, -az)
         gradient[k, lane] = gw
-        gradient[k + 1, lane] = gx
-        gradient[k + 2, lane] = gy
-        gradient[k + 3, lane] = gz
+        store(gradient[k + 1 :], lane, gx, gy, gz)
 
         # (cos |h| - sin |h| / |h|) / |h|², the slope of the sinc over |h|, by Horner's scheme.
         slope = 1.0 - h2 / 28.0 * (1.0 - h2 / 54.0 * (1.0 - h2 / 88.0))

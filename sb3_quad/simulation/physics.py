@@ -245,9 +245,7 @@ def move(b, dt):
         nw, nx, ny, nz = quaternion_product(qw, qx, qy, qz, cosine, sinc * hx, sinc * hy, sinc * hz)
         scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
         q[0, lane] = nw * scale
-        q[1, lane] = nx * scale
-        q[2, lane] = ny * scale
-        q[3, lane] = nz * scale
+        store(q[1:], lane, nx * scale, ny * scale, nz * scale)
 
 
 @inlined

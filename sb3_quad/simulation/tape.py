@@ -109,8 +109,7 @@ class FlightTape:
 
         The one that a crash ends in does not: it lies beyond what the model describes.
         """
-        after = np.arange(1, self.n_steps + 1)[:, None]
-        return (after < self.lengths) | ~self.lost
+        return (np.arange(1, self.n_steps + 1)[:, None] < self.lengths) | ~self.lost
 
     @property
     def acts(self) -> BoolArray:
