@@ -53,17 +53,14 @@ class BulletBody:
     """
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
-        self.has_window = window is not None and has_display()
-        if window is not None and self.has_window:
-            client = open_window(*window)
-        else:
-            client = int(p.connect(p.DIRECT))
-        if window is not None and not self.has_window:
+        if window is not None and not has_display():
             sys.stderr.write(
                 "sb3_quad: DISPLAY is not set, so no window opens; "
                 "render_mode='rgb_array' makes pictures\n"
             )
-        self.client = client
+            window = None
+        self.has_window = window is not None
+        client = self.client = open_window(*window) if window else int(p.connect(p.DIRECT))
         # The number of PyBullet's clients is limited, so this one is also closed if the object is
         # garbage-collected without close(), and when the interpreter exits.
         self._close = weakref.finalize(self, disconnect, client)
@@ -83,12 +80,11 @@ class BulletBody:
 
     def become(self, parameters: FloatArray) -> None:
         """Take on the mass and inertia in a vehicle's ``parameters()``."""
-        inertia = parameters[[P.ixx, P.iyy, P.izz]].tolist()
         p.changeDynamics(
             self.body,
             -1,
             mass=float(parameters[P.mass]),
-            localInertiaDiagonal=inertia,
+            localInertiaDiagonal=parameters[[P.ixx, P.iyy, P.izz]].tolist(),
             linearDamping=0.0,
             angularDamping=0.0,
             physicsClientId=self.client,

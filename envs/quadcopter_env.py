@@ -236,7 +236,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     def _open(self) -> None:
         """Begin a simulation, with a window or pictures if the render mode asks for them."""
         self._body = BulletBody(self.vehicle, self._size if self.render_mode == "human" else None)
-        self._body.become(self.batch.vehicles[:, 0])
         self._renderer = None
         if self._body.has_window or self.render_mode == "rgb_array":
             self._renderer = Renderer(self.vehicle, *self._size, self._body)

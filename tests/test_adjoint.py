@@ -255,7 +255,7 @@ def test_the_number_of_threads_changes_no_bit():
     found = []
     for threads in (1, 2, 2, 2):
         tape = FlightTape(new_batch(n, 5, threads, **keywords), steps, 2)
-        assert tape._helpers == threads - 1
+        assert tape.batch.helpers == threads - 1
         begin(tape)
         for action in random_actions(steps, n, 0):
             tape.step(action)

@@ -140,6 +140,6 @@ def hoop(thickness: float, yaw: float) -> list[Part]:
     for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
         level = math.cos(angle)
         place = (-level * math.sin(yaw), level * math.cos(yaw), math.sin(angle))
-        part = Part(p.GEOM_CYLINDER, place, radius=thickness, length=length)
-        parts.append(part._replace(angles=(angle, 0.0, yaw)))
+        angles = (angle, 0.0, yaw)
+        parts.append(Part(p.GEOM_CYLINDER, place, radius=thickness, length=length, angles=angles))
     return parts

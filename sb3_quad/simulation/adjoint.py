@@ -14,12 +14,12 @@ import math
 from sb3_quad.simulation.compiled import LANES, compiled
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 from sb3_quad.simulation.physics import (
-    accelerate,
-    limit_velocities,
-    move,
+    fly,
+    four,
     quaternion_product,
     rotation,
     sinc_and_cosine,
+    store,
     to_body,
     to_world,
     total_thrust,
@@ -33,12 +33,7 @@ MOVING = X.target  # the rows of the state that a flight changes
 @compiled(inline="always")
 def _add_rotation(quaternion, gradient, lane, x, y, z):
     """Add the gradient by a quaternion, given that by its rotation matrix, row by row."""
-    qw, qx, qy, qz = (
-        quaternion[0, lane],
-        quaternion[1, lane],
-        quaternion[2, lane],
-        quaternion[3, lane],
-    )
+    qw, qx, qy, qz = four(quaternion, lane)
     (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = x, y, z
     k = X.quaternion
     gradient[k, lane] += 2.0 * (qz * (y0 - x1) + qy * (x2 - z0) + qx * (z1 - y2))
@@ -70,8 +65,8 @@ def undo_move(before, after, gradient, dt):
     half_step = 0.5 * dt
     k = X.quaternion
     for lane in range(LANES):
-        px, py, pz = vector(gradient[X.position :], lane)
-        _add(gradient, X.velocity, lane, dt * px, dt * py, dt * pz)
+        for axis in range(3):
+            gradient[X.velocity + axis, lane] += dt * gradient[X.position + axis, lane]
 
         # The new quaternion is n = q a, with a = (cos |h|, h sin |h| / |h|) and h = dt ω / 2.
         wx, wy, wz = vector(after[X.body_rates :], lane)
@@ -79,21 +74,11 @@ def undo_move(before, after, gradient, dt):
         h2 = hx * hx + hy * hy + hz * hz
         sinc, cosine = sinc_and_cosine(h2)
         ax, ay, az = sinc * hx, sinc * hy, sinc * hz
-        qw, qx, qy, qz = (
-            before[k, lane],
-            before[k + 1, lane],
-            before[k + 2, lane],
-            before[k + 3, lane],
-        )
+        qw, qx, qy, qz = four(before[k:], lane)
         nw, nx, ny, nz = quaternion_product(qw, qx, qy, qz, cosine, ax, ay, az)
 
         # n is scaled by s = 1.5 - |n|² / 2, so the gradient g becomes s g - n (n g).
-        gw, gx, gy, gz = (
-            gradient[k, lane],
-            gradient[k + 1, lane],
-            gradient[k + 2, lane],
-            gradient[k + 3, lane],
-        )
+        gw, gx, gy, gz = four(gradient[k:], lane)
         scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
         along = nw * gw + nx * gx + ny * gy + nz * gz
         gw = scale * gw - along * nw
@@ -105,16 +90,11 @@ def undo_move(before, after, gradient, dt):
         tw, tx, ty, tz = quaternion_product(qw, -qx, -qy, -qz, gw, gx, gy, gz)
         gw, gx, gy, gz = quaternion_product(gw, gx, gy, gz, cosine, -ax, -ay, -az)
         gradient[k, lane] = gw
-        gradient[k + 1, lane] = gx
-        gradient[k + 2, lane] = gy
-        gradient[k + 3, lane] = gz
+        store(gradient[k + 1 :], lane, gx, gy, gz)
 
         # (cos |h| - sin |h| / |h|) / |h|², the slope of the sinc over |h|, by Horner's scheme.
-        slope = 1.0 - h2 / 88.0
-        slope = 1.0 - h2 / 54.0 * slope
-        slope = 1.0 - h2 / 28.0 * slope
-        slope = 1.0 - h2 / 10.0 * slope
-        slope = -slope / 3.0
+        slope = 1.0 - h2 / 28.0 * (1.0 - h2 / 54.0 * (1.0 - h2 / 88.0))
+        slope = (h2 / 10.0 * slope - 1.0) / 3.0
         along = slope * (hx * tx + hy * ty + hz * tz) - sinc * tw
         _add(
             gradient,
@@ -137,26 +117,13 @@ def undo_accelerate(b, before, after, gradient, by_wanted):
     for lane in range(LANES):
         r = rotation(before[X.quaternion :], lane)
 
-        # The force in the body frame, as it was: drag of the airspeed u, and the thrusts.
-        vx, vy, vz = vector(before[X.velocity :], lane)
-        wind_x, wind_y, wind_z = vector(b.wind, lane)
-        ux, uy, uz = vx - wind_x, vy - wind_y, vz - wind_z
-        bx, by, bz = to_body(r, ux, uy, uz)
-        for k in range(4):
-            new = after[X.rotor_speeds + k, lane]
-            old = before[X.rotor_speeds + k, lane]
-            b.thrust[k, lane] = b.lift[lane] * new * (new + b.exact[lane] * (old - new))
-        dx, dy, dz = vector(b.drag, lane)
-        fx = b.force_body[0, lane] - dx * bx
-        fy = b.force_body[1, lane] - dy * by
-        fz = b.force_body[2, lane] - dz * bz + total_thrust(b, lane)
-
         # By the torque in the body frame, and through the gyroscopic terms by the body rates.
-        gain = b.rates_gain
+        gain_x, gain_y, gain_z = vector(b.rates_gain, lane)
         tx, ty, tz = vector(gradient[X.body_rates :], lane)
-        tx, ty, tz = gain[0, lane] * tx, gain[1, lane] * ty, gain[2, lane] * tz
+        tx, ty, tz = gain_x * tx, gain_y * ty, gain_z * tz
         wx, wy, wz = vector(before[X.body_rates :], lane)
-        gx, gy, gz = b.gyro[0, lane] * tx, b.gyro[1, lane] * ty, b.gyro[2, lane] * tz
+        gx, gy, gz = vector(b.gyro, lane)
+        gx, gy, gz = gx * tx, gy * ty, gz * tz
         _add(
             gradient,
             X.body_rates,
@@ -178,14 +145,26 @@ def undo_accelerate(b, before, after, gradient, by_wanted):
             by_thrust = (
                 cz + b.arm[0, k, lane] * tx + b.arm[1, k, lane] * ty + b.arm[2, k, lane] * tz
             )
-            by_thrust *= b.lift[lane]
-            exact = b.exact[lane]
+            lift, exact = b.lift[lane], b.exact[lane]
+            by_thrust *= lift
+            b.thrust[k, lane] = lift * new * (new + exact * (old - new))
             by_new = gradient[X.rotor_speeds + k, lane]
             by_new += by_thrust * (2.0 * new * (1.0 - exact) + exact * old)
             speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
             factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
             by_wanted[k, lane] += factor * by_new
             gradient[X.rotor_speeds + k, lane] = (1.0 - factor) * by_new + by_thrust * exact * new
+
+        # The force in the body frame, as it was: drag of the airspeed u, and the thrusts.
+        vx, vy, vz = vector(before[X.velocity :], lane)
+        wind_x, wind_y, wind_z = vector(b.wind, lane)
+        ux, uy, uz = vx - wind_x, vy - wind_y, vz - wind_z
+        bx, by, bz = to_body(r, ux, uy, uz)
+        dx, dy, dz = vector(b.drag, lane)
+        fx, fy, fz = vector(b.force_body, lane)
+        fx -= dx * bx
+        fy -= dy * by
+        fz += total_thrust(b, lane) - dz * bz
 
         # By the velocity, through the drag, and by the attitude: forces, drag and torques turn.
         cx, cy, cz = -dx * cx, -dy * cy, -dz * cz
@@ -212,9 +191,7 @@ def undo_flight(b, passed, gradient, by_wanted, dt, substeps):
     """
     for substep in range(substeps):
         passed[substep] = b.state[:MOVING]
-        if accelerate(b):
-            limit_velocities(b)
-        move(b, dt)
+        fly(b, dt, 1)
     passed[substeps] = b.state[:MOVING]
     by_wanted[:, :] = 0.0
     for substep in range(substeps - 1, -1, -1):
@@ -250,10 +227,9 @@ def undo_features(b, by_feature, gradient):
     f = by_feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
-        px, py, pz = vector(f[F.position :], lane)
-        _add(gradient, X.position, lane, px, py, pz)
-        wx, wy, wz = vector(f[F.body_rates :], lane)
-        _add(gradient, X.body_rates, lane, wx, wy, wz)
+        for k in range(3):
+            gradient[X.position + k, lane] += f[F.position + k, lane]
+            gradient[X.body_rates + k, lane] += f[F.body_rates + k, lane]
         # The observed velocity is Rᵀ v.
         gx, gy, gz = vector(f[F.velocity :], lane)
         x, y, z = to_world(r, gx, gy, gz)

@@ -45,6 +45,7 @@ Rows: TypeAlias = "int | slice | Iterable[int] | AnyArray | None"
 StepResult: TypeAlias = tuple[Float32Array, Float32Array, BoolArray]
 MAX_ROWS = 2**20
 MAX_THREADS = 2**16
+_NO_ROWS = np.zeros(0, np.int64)
 # A snapshot keeps these: future flight depends on nothing else.
 _KEPT = (
     "state",
@@ -93,6 +94,8 @@ class QuadcopterBatch:
             self.threads = available_cpus()
         else:
             self.threads = whole_number("n_threads", n_threads, 1, MAX_THREADS)
+        # A thread pays off from two chunks on.
+        self.helpers = min(self.threads, n // (2 * CHUNK)) - 1
         self.autoreset = autoreset
 
         vehicles = self._set_vehicles(settings)
@@ -184,9 +187,7 @@ class QuadcopterBatch:
 
         :return: the observations of all rows, float32 (n, size).
         """
-        begins = np.zeros(self.n, np.bool_)
-        begins[self.rows(rows)] = True
-        return self._run(LOOK, np.zeros((self.n, 4)), begins)[0]
+        return self._run(LOOK, np.zeros((self.n, 4)), self.rows(rows))[0]
 
     def stagger(self) -> None:
         """Stagger the present episodes: row i of n is truncated after (n - i) / n of
@@ -198,7 +199,7 @@ class QuadcopterBatch:
         """Return the present observations, float32 (n, ``observation.size``). They are the same
         numbers, noise included, until the next step.
         """
-        return self._run(LOOK, np.zeros((self.n, 4)), np.zeros(self.n, np.bool_))[0]
+        return self.reset(())
 
     def step(self, actions: AnyArray) -> StepResult:
         """Fly a control step of every row.
@@ -211,7 +212,7 @@ class QuadcopterBatch:
         :return: observations float32 (n, size), rewards float32 (n,), done bool (n,): fresh arrays.
         :raises ValueError: actions of another shape, or not finite.
         """
-        return self._run(FLY, actions, np.zeros(self.n, np.bool_))
+        return self._run(FLY, actions)
 
     def step_on(self, actions: AnyArray, substeps: int) -> StepResult:
         """Like :meth:`step`, but no row begins another episode, and there is no time limit.
@@ -219,9 +220,8 @@ class QuadcopterBatch:
         :param substeps: physics steps in this control step, which lasts as long as any.
         """
         physics_step = self.physics_step * self.substeps / substeps
-        dones = np.zeros(self.n, np.bool_)
         return self._run(
-            FLY, actions, dones, physics_step=physics_step, substeps=substeps, autoreset=False
+            FLY, actions, physics_step=physics_step, substeps=substeps, autoreset=False
         )
 
     def score(self, actions: AnyArray) -> StepResult:
@@ -230,11 +230,14 @@ class QuadcopterBatch:
 
         :param actions: those that the policy sees in its next observation.
         """
-        return self._run(SCORE, actions, np.zeros(self.n, np.bool_))
+        return self._run(SCORE, actions)
 
-    def _run(self, mode: int, actions: AnyArray, dones: BoolArray, **changes: Any) -> StepResult:
+    def _run(
+        self, mode: int, actions: AnyArray, begins: IntArray = _NO_ROWS, **changes: Any
+    ) -> StepResult:
         """Call the compiled step with fresh arrays for its results.
 
+        :param begins: numbers of the rows whose next episode LOOK begins.
         :param changes: arguments of the compiled step in this call, instead of the batch's own.
         """
         array = np.ascontiguousarray(actions, dtype=np.float32)
@@ -244,11 +247,11 @@ class QuadcopterBatch:
             )
         observations = np.empty_like(self.last_observations)
         rewards = np.empty(self.n, np.float32)
+        dones = np.zeros(self.n, np.bool_)
+        dones[begins] = True
         results = observations, rewards, dones
-        # A thread pays off from two chunks on.
-        helpers = min(self.threads, self.n // (2 * CHUNK)) - 1
-        arguments = self._arguments if not changes else self._arguments | changes
-        if not share_out(step, helpers, mode, array, *results, *arguments.values()):
+        arguments = self._arguments | changes
+        if not share_out(step, self.helpers, mode, array, *results, *arguments.values()):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(
                 f"actions: row {row} is {array[row].tolist()}; every number must be finite"

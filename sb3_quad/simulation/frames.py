@@ -109,37 +109,37 @@ def clear_frames(i, frames, integral):
 
 
 @compiled
-def integrate_position(i, feature, lane, mean, inverse_std, numbers, integral):
-    """Advance the position integral of row i by a control step, in place, from its scaled features
-    (OBSERVATION_SIZE, lanes).
+def integrate_position(b, i, lane, numbers, integral):
+    """Advance the position integral of row i by a control step, in place.
 
+    :param b: a block whose scaled features are computed; row i is in ``lane``.
     :param numbers: float64 (4,), :meth:`PositionIntegral.numbers`.
     """
     gain_dt = numbers[0]
     limit = numbers[3]
     e2 = v2 = 0.0
     for axis in range(3):
-        e = _unscaled(F.position + axis, feature, lane, mean, inverse_std)
-        v = _unscaled(F.velocity + axis, feature, lane, mean, inverse_std)
+        e = _unscaled(b, F.position + axis, lane)
+        v = _unscaled(b, F.velocity + axis, lane)
         e2 += e * e
         v2 += v * v
     if e2 < numbers[1] and v2 < numbers[2]:
         for axis in range(3):
-            e = _unscaled(F.position + axis, feature, lane, mean, inverse_std)
+            e = _unscaled(b, F.position + axis, lane)
             integral[axis, i] = min(max(integral[axis, i] + gain_dt * e, -limit), limit)
 
 
 @inlined
-def _unscaled(k, feature, lane, mean, inverse_std):
-    return feature[k, lane] / inverse_std[k, lane] + mean[k, lane]
+def _unscaled(b, k, lane):
+    return b.feature[k, lane] / b.inverse_std[k, lane] + b.mean[k, lane]
 
 
 @compiled
-def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, out):
+def observe_frames(b, i, step, lane, integral, ages, frames, out):
     """Keep row i's present frame and write its observation, in place.
 
+    :param b: a block whose scaled features are computed; row i is in ``lane``.
     :param step: control steps since the episode began.
-    :param feature: scaled features, float32 (OBSERVATION_SIZE, lanes); row i is in ``lane``.
     :param integral: float64 (3, n), or (0, n) without.
     :param ages: int64, ages of the observed frames, control steps.
     :param frames: float32 (n, depth, frame_size), the frames of the latest control steps, step s in
@@ -149,10 +149,10 @@ def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, 
     _, depth, size = frames.shape
     slot = step % depth
     for k in range(OBSERVATION_SIZE):
-        frames[i, slot, k] = feature[k, lane]
+        frames[i, slot, k] = b.feature[k, lane]
     for axis in range(integral.shape[0]):
         k = F.position + axis
-        frames[i, slot, k] += float32(integral[axis, i]) * inverse_std[k, lane]
+        frames[i, slot, k] += float32(integral[axis, i]) * b.inverse_std[k, lane]
     at = 0
     for age in ages:
         # Frames from before the episode are zeros.

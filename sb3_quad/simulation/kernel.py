@@ -259,8 +259,19 @@ def step(
                 streams[STEP, first + lane] += np.uint32(1)
             load_rows(streams, first, count, b.stream)
             observe(b)
-            _advance_disturbances(b, first, count, gust, wind_gust)
-            _advance_frames(b, first, count, actions, integral_numbers, integral, frames)
+            if gust.shape[1] > 0:
+                advance_gusts(b, gust, first, count)
+            if wind_gust.shape[1] > 0:
+                # The gusts of the wind have words of their own.
+                gust_words(b.word[GUST_WORDS:], b.stream)
+                advance_gusts(b, wind_gust, first, count)
+            if frames.shape[1] > 0:
+                # A policy sees more than the present features.
+                for lane in range(count):
+                    i = first + lane
+                    store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
+                    if integral.shape[0] > 0:
+                        integrate_position(b, i, lane, integral_numbers, integral)
             _write_observations(b, count, integral, ages, frames, observations)
             ended = _end_episodes(
                 b, first, count, autoreset, observations, rewards, dones, returns, limits,
@@ -464,30 +475,6 @@ def _load_commands(b, first, count, actions, queue, own_delays):
             queue[delay - 1, k, first + lane] = command[k, lane]
 
 
-@inlined
-def _advance_disturbances(b, first, count, gust, wind_gust):
-    """Advance the gusts of a block by a control step; those of the wind have words of their own."""
-    if gust.shape[1] > 0:
-        advance_gusts(b, gust, first, count)
-    if wind_gust.shape[1] > 0:
-        gust_words(b.word[GUST_WORDS:], b.stream)
-        advance_gusts(b, wind_gust, first, count)
-
-
-@inlined
-def _advance_frames(b, first, count, actions, integral_numbers, integral, frames):
-    """Keep the actions of a block and advance its position integrals, where a policy sees them."""
-    if frames.shape[1] == 0:
-        return
-    for lane in range(count):
-        i = first + lane
-        store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
-        if integral.shape[0] > 0:
-            integrate_position(
-                i, b.feature, lane, b.mean, b.inverse_std, integral_numbers, integral
-            )
-
-
 @compiled
 def _write_observations(b, count, integral, ages, frames, out):
     """Write the observations of a block to its rows of ``out``, float32 (n, size)."""
@@ -500,7 +487,7 @@ def _write_observations(b, count, integral, ages, frames, out):
     for lane in range(count):
         i = b.row[lane]
         since = np.int64(b.stream[STEP, lane])
-        observe_frames(i, since, b.feature, lane, b.inverse_std, integral, ages, frames, out)
+        observe_frames(b, i, since, lane, integral, ages, frames, out)
 
 
 @inlined

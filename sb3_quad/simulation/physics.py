@@ -75,13 +75,17 @@ def to_body(r, x, y, z):
 
 @fast
 def command_rotors(b):
-    """Replace the actions in ``b.command`` by rotor speeds, rad/s (Eqs. 3.18 and 2.4)."""
+    """Replace the actions in ``b.command`` by the rotor speeds that they command."""
     for lane in range(LANES):
         for k in range(4):
-            action = min(max(b.command[k, lane], -1.0), 1.0)
-            b.command[k, lane] = math.sqrt(
-                b.thrust_middle[lane] + b.thrust_half_range[lane] * action
-            )
+            b.command[k, lane] = rotor_speed(b, lane, b.command[k, lane])
+
+
+@inlined
+def rotor_speed(b, lane, action):
+    """Return the rotor speed that an action commands, rad/s (Eqs. 3.18 and 2.4)."""
+    bounded = min(max(action, -1.0), 1.0)
+    return math.sqrt(b.thrust_middle[lane] + b.thrust_half_range[lane] * bounded)
 
 
 @inlined
@@ -241,9 +245,7 @@ def move(b, dt):
         nw, nx, ny, nz = quaternion_product(qw, qx, qy, qz, cosine, sinc * hx, sinc * hy, sinc * hz)
         scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
         q[0, lane] = nw * scale
-        q[1, lane] = nx * scale
-        q[2, lane] = ny * scale
-        q[3, lane] = nz * scale
+        store(q[1:], lane, nx * scale, ny * scale, nz * scale)
 
 
 @inlined

@@ -201,9 +201,9 @@ def _randomize_vehicle(i, streams, table, vehicles):
     arm = between(table, R.arm, u[7], 1.0)
     x = between(table, R.center_of_mass, u[8], 0.0)
     y = between(table, R.center_of_mass, u[9], 0.0)
-    for rotor in range(4):
-        v[P.roll_arm_0 + rotor] = arm * v[P.roll_arm_0 + rotor] - y
-        v[P.pitch_arm_0 + rotor] = arm * v[P.pitch_arm_0 + rotor] + x
+    v[P.roll_arm_0 : P.yaw_arm_0] *= arm
+    v[P.roll_arm_0 : P.pitch_arm_0] -= y
+    v[P.pitch_arm_0 : P.yaw_arm_0] += x
     if table[R.delay + 2] != FIXED:
         delay = math.floor(between(table, R.delay, u[10], 0.0))
         v[P.delay] = min(delay, table[R.delay + 1] - 1.0)

@@ -18,6 +18,7 @@ from sb3_quad.simulation.kernel import (
     new_block,
 )
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features, with_noise
+from sb3_quad.simulation.physics import rotor_speed
 from sb3_quad.simulation.random import STEP, random_words, standard_normals
 from sb3_quad.simulation.state import STATE_SIZE, P
 from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
@@ -57,12 +58,8 @@ class FlightTape:
         self.lost = np.ones(n, np.bool_)
         self._at = 0
         self._integrals = np.zeros((n_steps, *batch.integral.shape))
-        # Without gusts, wrench and wind are the same at all steps.
-        n_wrenches = 1 if batch.randomize.gusts is None else n_steps
-        n_winds = 1 if batch.randomize.wind_gusts is None else n_steps
-        self._wrenches = np.zeros((n_wrenches, *batch.wrench.shape))
-        self._winds = np.zeros((n_winds, *batch.wind.shape))
-        self._helpers = min(batch.threads, n // (2 * CHUNK)) - 1
+        self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
+        self._winds = np.zeros((n_steps, *batch.wind.shape))
 
     def reset(self, carry_on: bool = False) -> Float32Array:
         """Begin a recording; return the observations, float32 (n, size).
@@ -71,17 +68,8 @@ class FlightTape:
         """
         batch = self.batch
         observations = batch.reset(np.flatnonzero(self.lost) if carry_on else None)
-        self._refuse_fast_motors()
-        self._at = 0
-        self._streams = batch.streams.copy()
-        self._queue = batch.queue.copy()
-        self.lengths[:] = self.n_steps
-        self.lost[:] = False
-        return observations
-
-    def _refuse_fast_motors(self) -> None:
-        """Check that no rotor overshoots its commanded speed because the physics steps are long."""
-        vehicles = self.batch.vehicles
+        # A rotor must not overshoot its commanded speed because the physics steps are long.
+        vehicles = batch.vehicles
         gains = np.maximum(vehicles[P.motor_gain_up], vehicles[P.motor_gain_down])
         fastest = float((gains * (vehicles[P.exact_motors] == 0.0)).max())
         if fastest * self.physics_step > 1.0:
@@ -89,6 +77,12 @@ class FlightTape:
                 f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
                 " give None, which is what the simulation has"
             )
+        self._at = 0
+        self._streams = batch.streams.copy()
+        self._queue = batch.queue.copy()
+        self.lengths[:] = self.n_steps
+        self.lost[:] = False
+        return observations
 
     def step(self, actions: Float32Array) -> Float32Array:
         """Fly a control step; return the observations after it.
@@ -99,10 +93,8 @@ class FlightTape:
         self.states[t] = batch.state
         self.actions[t] = actions
         self._integrals[t] = batch.integral
-        if t < len(self._wrenches):
-            self._wrenches[t] = batch.total_wrench()
-        if t < len(self._winds):
-            self._winds[t] = batch.total_wind()
+        self._wrenches[t] = batch.total_wrench()
+        self._winds[t] = batch.total_wind()
         observations, self.rewards[t], _ = batch.step_on(actions, self.substeps)
         self._at = t + 1
         self.states[self._at] = batch.state
@@ -117,8 +109,7 @@ class FlightTape:
 
         The one that a crash ends in does not: it lies beyond what the model describes.
         """
-        after = np.arange(1, self.n_steps + 1)[:, None]
-        return (after < self.lengths) | ~self.lost
+        return (np.arange(1, self.n_steps + 1)[:, None] < self.lengths) | ~self.lost
 
     @property
     def acts(self) -> BoolArray:
@@ -137,10 +128,8 @@ class FlightTape:
         self._by_states = by_states
         self._by_actions = by_actions
         self._gradient = np.zeros((MOVING, batch.n))
-        ages = batch.observation.ages
-        self._ages = np.array(ages)
-        self._by_frames = np.zeros((max(ages) + 1, batch.n, batch.observation.frame_size))
-        self._by_integral = np.zeros(batch.integral.shape)
+        self._by_frames = np.zeros((batch.ages[-1] + 1, batch.n, batch.observation.frame_size))
+        self._by_integral = np.zeros_like(batch.integral)
         return value
 
     def backward(self, step: int, by_observation: Float32Array) -> FloatArray:
@@ -150,24 +139,24 @@ class FlightTape:
             comes from the later actions.
         """
         batch = self.batch
+        self._gradient += self._by_states[step, :MOVING]
         share_out(
             undo,
-            self._helpers,
+            batch.helpers,
             step,
             self.lengths,
             self.states,
             self.actions,
             self._queue,
             self._streams,
-            self._wrenches[step % len(self._wrenches)],
-            self._winds[step % len(self._winds)],
+            self._wrenches[step],
+            self._winds[step],
             batch.vehicles,
             batch.scaling,
-            self._ages,
+            batch.ages,
             self._integrals,
             batch.integral_numbers,
             by_observation,
-            self._by_states,
             self._by_frames,
             self._by_integral,
             self._gradient,
@@ -189,8 +178,8 @@ class FlightTape:
 @compiled
 def undo(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
-    ages, integrals, integral_numbers, by_observation, by_states, by_frames, by_integral, gradient,
-    by_actions, physics_step, substeps,
+    ages, integrals, integral_numbers, by_observation, by_frames, by_integral, gradient, by_actions,
+    physics_step, substeps,
 ):  # fmt: skip
     """Undo a control step and the observation after it; see :class:`FlightTape`.
 
@@ -225,9 +214,6 @@ def undo(
                 b.row[lane] = first + min(lane, count - 1)
             load_vehicles(b, vehicles, first, count, physics_step)
             load_rows(gradient, first, count, own)
-            for k in range(MOVING):
-                for lane in range(count):
-                    own[k, lane] += by_states[step, k, first + lane]
             if step + 1 < len(actions):
                 load_scaling(b, scaling)
                 load_rows(states[step + 1], first, count, b.state)
@@ -248,10 +234,10 @@ def undo(
             load_rows(wind, first, count, b.wind)
             for lane in range(LANES):
                 i = b.row[lane]
-                late = np.int64(b.delay[lane])
+                acted = step - np.int64(b.delay[lane])
                 for k in range(4):
-                    if step >= late:
-                        b.wanted_speeds[k, lane] = _speed(b, lane, actions[step - late, i, k])
+                    if acted >= 0:
+                        b.wanted_speeds[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
                     else:
                         b.wanted_speeds[k, lane] = queue[step, k, i]
                 if step >= lengths[i]:
@@ -270,13 +256,6 @@ def undo(
     if leads:
         finish(control, chunks)
     return True
-
-
-@compiled
-def _speed(b, lane, action):
-    """Return the rotor speed that an action commands (Eqs. 3.18 and 2.4)."""
-    bounded = min(max(np.float64(action), -1.0), 1.0)
-    return np.sqrt(b.thrust_middle[lane] + b.thrust_half_range[lane] * bounded)
 
 
 @compiled
@@ -315,9 +294,8 @@ def _undo_integral(b, lane, i, integral, numbers, frame, by_integral):
     """Undo :func:`.frames.integrate_position` of a row; ``frame`` is the gradient by its frame."""
     error2 = speed2 = 0.0
     for axis in range(3):
-        e, v = F.position + axis, F.velocity + axis
-        error = with_noise(b, e, lane)
-        speed = with_noise(b, v, lane)
+        error = with_noise(b, F.position + axis, lane)
+        speed = with_noise(b, F.velocity + axis, lane)
         error2 += error * error
         speed2 += speed * speed
     near = error2 < numbers[1] and speed2 < numbers[2]
