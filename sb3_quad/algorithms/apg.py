@@ -22,7 +22,6 @@ from typing_extensions import Self
 from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
 from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost
 from sb3_quad.algorithms.networks.gradients import Pullback, mean_actions, network_of
-from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.tape import FlightCost
@@ -103,6 +102,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
+    _tape: Tape
 
     def __init__(
         self,
@@ -151,12 +151,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.carry_on = carry_on
         self.cost = cost
         self.substeps = substeps
-        self._tape: Tape | None = None
 
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
 
     def learn(
         self,
@@ -174,12 +171,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self._tape = self._new_tape()
         with self._threads():
             return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
             )
 
     def _new_tape(self) -> Tape:
@@ -213,7 +210,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         network = network_of(self.policy)
         tape = self._tape
-        assert tape is not None
         callback.on_rollout_start()
         observations = tape.reset(self.carry_on)
         self._observations = []
@@ -244,14 +240,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         tape = self._tape
-        assert self.env is not None
-        assert tape is not None
         cost = tape.begin(partial(cost_and_gradients, self.cost))
 
         # What the critic or an earlier update has left; autograd adds to it.
         self.policy.optimizer.zero_grad()
         # The observation after the last step leads to no action.
-        network = Pullback(self.policy, self.env.num_envs)
+        network = Pullback(self.policy, self.n_envs)
         by_observations = np.zeros_like(self._observations[0])
         for step in reversed(range(self.n_steps)):
             by_actions = tape.backward(step, by_observations)
@@ -268,9 +262,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.optimizer.step()
         self._n_updates += 1
 
-        self.logger.record("train/cost", cost)
-        self.logger.record("train/gradient_norm", float(norm))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._log_update({"cost": [cost], "gradient_norm": [float(norm)]})
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "cost", "_tape", "_observations"]

@@ -66,9 +66,9 @@ class ExpertRolloutBuffer(RolloutBuffer):
             # Flattened, the rows of an environment follow one another.
             rows = np.arange(n_rows).reshape(self.n_envs, self.buffer_size).T.reshape(-1)
         if not self.generator_ready:
-            for name in ("observations", "actions", "values", "log_probs", "advantages", "returns"):
+            stock = ("observations", "actions", "values", "log_probs", "advantages", "returns")
+            for name in (*stock, "expert_actions"):
                 setattr(self, name, self.swap_and_flatten(getattr(self, name)))
-            self.expert_actions = self.swap_and_flatten(self.expert_actions)
             self.generator_ready = True
         for start in range(0, n_rows, batch_size):
             yield rows[start : start + batch_size]
@@ -105,7 +105,7 @@ class AggregatedDataset:
     """
 
     #: The least and the greatest actions, (action_dim,); those of a file must lie between
-    action_range: tuple[Any, Any] = (-np.inf, np.inf)
+    action_range: Any = (-np.inf, np.inf)
 
     def __init__(
         self,
@@ -202,7 +202,7 @@ class AggregatedDataset:
                     f" {self.capacity}"
                 )
             # NaN is not itself.
-            if (actions != actions.clip(*self.action_range).astype(np.float32)).any():
+            if (actions != actions.clip(*self.action_range)).any():
                 raise ValueError(f"actions from {actions.min():g} to {actions.max():g}")
             if not np.isfinite(observations).all():
                 raise ValueError("observations that are not finite")

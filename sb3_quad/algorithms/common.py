@@ -1,7 +1,7 @@
 """The parts that all algorithms with an expert share."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import wraps
 from pathlib import Path
@@ -22,7 +22,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
-from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
+from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.base.errors import ConfigError, TrainingError, raised_as, unknown
 from sb3_quad.base.files import one_line
 from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.controller import Controller, limits_of
@@ -170,6 +171,19 @@ class ExpertMixin:
                 f"policy {self.policy_class.__name__}: {type(self).__name__} has none of this kind;"
                 " give an agent of another algorithm as expert=... to a new model"
             )
+
+    def _check_names(self, **valid: Sequence[str]) -> None:
+        """Check arguments whose valid values are given by their names."""
+        for argument, names in valid.items():
+            value = getattr(self, argument)
+            if value not in names:
+                raise ConfigError(unknown(argument, value, names))
+
+    def _begin(self, initial: BaseAlgorithm | None) -> None:
+        """Set the model up, with the policy of the agent that it starts from."""
+        self._setup_model()
+        if initial is not None:
+            transfer_policy(initial, self)  # type: ignore[arg-type]
 
     def _setup_model(self) -> None:
         self._check_arguments()

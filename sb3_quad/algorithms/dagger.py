@@ -45,9 +45,8 @@ from sb3_quad.algorithms.networks.losses import (
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # Observations that the critic evaluates at once after a rollout
@@ -192,7 +191,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.beta = beta
         self.beta_decay = beta_decay
         self.beta_final = beta_final
-        self.bc_loss: CloningLoss = bc_loss
+        self.bc_loss = bc_loss
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
@@ -205,9 +204,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if expert is not None:
             self.set_expert(expert)
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
             if demonstrations is not None:
                 self.dataset.load(demonstrations)
 
@@ -222,8 +219,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             raise ConfigError(
                 f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1"
             )
-        if self.bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
+        self._check_names(bc_loss=CLONING_LOSSES)
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(
@@ -239,7 +235,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self._rescale(False)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        space: Any = self.action_space
         dtype = self.rollout_buffer.observations.dtype
         if np.issubdtype(dtype, np.floating):
             dtype = np.dtype(np.float32)
@@ -249,7 +244,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self.rollout_buffer.action_dim,
             dtype,
         )
-        self.dataset.action_range = space.low.ravel(), space.high.ravel()
+        self.dataset.action_range = limits_of(self.action_space)
 
     def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on.
@@ -302,12 +297,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self._n_rollouts = 0
         with self._threads():
             return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
             )
 
     def _generator(self, purpose: int) -> np.random.Generator:
@@ -315,9 +310,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         There is no state to save: after a resume they are the same again.
         """
-        seed = self.seed
-        if seed is None:
-            seed = self._entropy
+        seed = self._entropy if self.seed is None else self.seed
         return np.random.default_rng([seed, purpose, self._n_updates])
 
     def collect_rollouts(
@@ -336,7 +329,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
-        action_space: Any = self.action_space
+        action_space = self.action_space
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
         not_yet = th.zeros(env.num_envs)

@@ -41,8 +41,7 @@ from sb3_quad.algorithms.networks.losses import (
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, unknown
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # By default a rollout is so many mini-batches, but none has less than so many rows.
@@ -179,8 +178,8 @@ class PPOBC(ExpertMixin, PPO):
         self.batch_size = batch_size
         self.expert = expert
         self.bc_coef = bc_coef
-        self.bc_loss: CloningLoss = bc_loss
-        self.bc_filter: CloningFilter = bc_filter
+        self.bc_loss = bc_loss
+        self.bc_filter = bc_filter
         self.l2_coef = l2_coef
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
@@ -188,16 +187,11 @@ class PPOBC(ExpertMixin, PPO):
         self._n_rollouts_trained = 0
 
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
 
     def _setup_model(self) -> None:
         filters = [name for name in BC_FILTERS if name != "q"]
-        if self.bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
-        if self.bc_filter not in filters:
-            raise ConfigError(unknown("bc_filter", self.bc_filter, filters))
+        self._check_names(bc_loss=CLONING_LOSSES, bc_filter=filters)
         self._refuse_dict_observations()
         # SB3's own, as a zip of PPO names it, is one without labels.
         if self.rollout_buffer_class in (None, RolloutBuffer):
@@ -206,7 +200,7 @@ class PPOBC(ExpertMixin, PPO):
             raise ConfigError(
                 f"rollout_buffer_class {self.rollout_buffer_class}: must be an ExpertRolloutBuffer"
             )
-        if cast(int | None, self.batch_size) is None:
+        if self.batch_size is None:
             n_rows = self.n_steps * self.n_envs
             n_minibatches = min(N_MINIBATCHES, max(n_rows // LEAST_ROWS, 1))
             self.batch_size = math.ceil(n_rows / n_minibatches)
@@ -249,8 +243,8 @@ class PPOBC(ExpertMixin, PPO):
 
     def _rescale(self, into: bool) -> None:
         # Without a cloning term it is PPO, which counts actions as they are.
-        buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
-        if isinstance(self.action_space, spaces.Box) and (self.will_clone() or buffer.bc_coef):
+        may_clone = self.will_clone() or self.rollout_buffer.bc_coef
+        if isinstance(self.action_space, spaces.Box) and may_clone:
             super()._rescale(into)
 
     def _check_cloning(self) -> None:
@@ -282,12 +276,12 @@ class PPOBC(ExpertMixin, PPO):
             self._check_cloning()
         with self._threads():
             return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
             )
 
     def collect_rollouts(
@@ -339,7 +333,7 @@ class PPOBC(ExpertMixin, PPO):
             clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
 
         # + While the critic warms up, no term moves the actor's weights.
-        buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
+        buffer: ExpertRolloutBuffer = self.rollout_buffer
         bc_coef = buffer.bc_coef
         warming_up = self._n_rollouts_trained < self.critic_warmup
         ent_coef = self.ent_coef

@@ -31,8 +31,7 @@ from sb3_quad.algorithms.networks.losses import (
     agree,
     cloning_errors,
 )
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, unknown
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.types import Float32Array
 from sb3_quad.controllers.expert_like import ExpertLike
 
@@ -154,8 +153,8 @@ class SACBC(ExpertMixin, SAC):
         )
         self.expert = expert
         self.bc_coef = bc_coef
-        self.bc_loss: CloningLoss = bc_loss
-        self.bc_filter: CloningFilter = bc_filter
+        self.bc_loss = bc_loss
+        self.bc_filter = bc_filter
         self.critic_warmup = critic_warmup
         self.critic_layer_norm = critic_layer_norm
         self._clones = False
@@ -163,17 +162,12 @@ class SACBC(ExpertMixin, SAC):
         self._scaled_labels: Float32Array | None = None
 
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
 
     def _setup_model(self) -> None:
         # The negative log-likelihood is no error of an action that tanh squashes.
         kinds = [name for name in CLONING_LOSSES if name != "nll"]
-        if self.bc_loss not in kinds:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, kinds))
-        if self.bc_filter not in BC_FILTERS:
-            raise ConfigError(unknown("bc_filter", self.bc_filter, BC_FILTERS))
+        self._check_names(bc_loss=kinds, bc_filter=BC_FILTERS)
         if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
             raise ConfigError(
                 f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
@@ -226,12 +220,12 @@ class SACBC(ExpertMixin, SAC):
             )
         with self._threads():
             return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
             )
 
     def _sample_action(
@@ -241,8 +235,8 @@ class SACBC(ExpertMixin, SAC):
         if self._clones:
             assert self.env is not None
             labels = self._labels(self.env)
-            space: Any = self.action_space
-            scaled: Any = self.policy.scale_action(labels.reshape(n_envs, *space.shape))
+            shape = self.action_space.shape
+            scaled: Any = self.policy.scale_action(labels.reshape(n_envs, *shape))
             self._scaled_labels = scaled.reshape(n_envs, -1)
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
