@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +22,7 @@ from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
 from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost
 from sb3_quad.algorithms.networks.gradients import Pullback, mean_actions, network_of
 from sb3_quad.base.errors import ConfigError, TrainingError
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.simulation.tape import FlightCost
 
 
@@ -113,12 +112,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         max_grad_norm: float = 1.0,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         carry_on: bool = False,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         substeps: int | None = 2,
@@ -168,19 +167,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ConfigError: an environment that cannot be differentiated.
         """
-        self._tape = self._new_tape()
-        with self._threads():
-            return super().learn(
-                total_timesteps,
-                callback,
-                log_interval,
-                tb_log_name,
-                reset_num_timesteps,
-                progress_bar,
-            )
-
-    def _new_tape(self) -> Tape:
-        """Return a tape of the environment, below its wrappers."""
         assert self.env is not None
         env: Any = self.env
         # The statistics of episodes come from the tape.
@@ -196,8 +182,16 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 f"{type(env).__name__}: APG differentiates flights, and this environment has no"
                 " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
             )
-        tape: Tape = env.record(self.n_steps, self.substeps)
-        return tape
+        self._tape = env.record(self.n_steps, self.substeps)
+        with self._threads():
+            return super().learn(
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
+            )
 
     def collect_rollouts(
         self,
@@ -213,7 +207,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         callback.on_rollout_start()
         observations = tape.reset(self.carry_on)
         self._observations = []
-        infos: list[dict[str, Any]] = [{} for _ in range(env.num_envs)]
+        infos: list[StrDict] = [{} for _ in range(env.num_envs)]
         for step in range(n_rollout_steps):
             self._observations.append(observations)
             observations = tape.step(mean_actions(network, observations))

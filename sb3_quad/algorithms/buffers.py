@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_quad.algorithms.networks.gradients import Batch
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_arrays, write_arrays
-from sb3_quad.base.types import Arrays, Float32Array, IntArray
+from sb3_quad.base.types import AnyArray, Arrays, Float32Array, IntArray, StrDict, StrPath
 
 
 class ExpertRolloutSamples(NamedTuple):
@@ -127,7 +127,7 @@ class AggregatedDataset:
         """Forget every pair."""
         self.added = 0
 
-    def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
+    def add(self, observations: AnyArray, actions: Float32Array) -> None:
         """Add observations (n, ...) and actions (n, action_dim), oldest first.
 
         Of more than ``capacity`` pairs, the last are kept.
@@ -144,7 +144,7 @@ class AggregatedDataset:
         return Batch(places, self.observations, self.actions)
 
     @property
-    def pairs(self) -> Arrays:
+    def pairs(self) -> StrDict:
         """Copies of observations (n, ...) and expert actions (n, action_dim) by name, oldest first.
 
         :meth:`add` takes them.
@@ -158,13 +158,12 @@ class AggregatedDataset:
         n = len(self)
         return {"observations": self.observations[:n], "actions": self.actions[:n]}
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: StrPath) -> None:
         """Write the pairs to an ``.npz`` file, which is replaced as a whole or not at all.
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
-        pairs: dict[str, Any] = self.pairs
-        write_arrays(path, **pairs)
+        write_arrays(path, **self.pairs)
 
     def load(self, source: Any) -> None:
         """Hold the pairs of recorded flights instead of the present ones.

@@ -25,7 +25,7 @@ from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as, unknown
 from sb3_quad.base.files import one_line
-from sb3_quad.base.types import Float32Array
+from sb3_quad.base.types import Float32Array, StrDict, StrPath
 from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.pretrained import agent_path
@@ -155,7 +155,7 @@ class ExpertMixin:
             if not isinstance(value, (int, float)) or not value >= least:
                 raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
         # DAgger's None is nothing that PPO could load.
-        if vars(self).get("max_grad_norm", 0.0) is None:
+        if getattr(self, "max_grad_norm", 0.0) is None:
             self.max_grad_norm = math.inf
         # Rows are sampled all at once.
         capacity = getattr(self, "dataset_capacity", 0) or getattr(self, "buffer_size", 0)
@@ -328,7 +328,7 @@ def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
     return settings if env.observation_space.shape == (settings.observation.size,) else None
 
 
-def model_of(initial_policy: BaseAlgorithm | str | Path | None) -> BaseAlgorithm | None:
+def model_of(initial_policy: BaseAlgorithm | StrPath | None) -> BaseAlgorithm | None:
     """Return the model that ``initial_policy`` is or names.
 
     :param initial_policy: a model, the path of a zip, a run folder, or the name of a shipped agent.
@@ -340,11 +340,11 @@ def model_of(initial_policy: BaseAlgorithm | str | Path | None) -> BaseAlgorithm
 
 
 def policy_arguments(
-    given: dict[str, Any] | None,
+    given: StrDict | None,
     initial: BaseAlgorithm | None,
     family: type[BaseAlgorithm],
     log_std_init: float | None = None,
-) -> dict[str, Any]:
+) -> StrDict:
     """Return the ``policy_kwargs`` of a new model.
 
     :param given: what the user gives; it holds. ``log_std_init=None`` there: no default.
@@ -352,7 +352,7 @@ def policy_arguments(
         ``net_arch`` and ``activation_fn`` are taken.
     :param log_std_init: the default.
     """
-    arguments: dict[str, Any] = {}
+    arguments: StrDict = {}
     if isinstance(initial, family):
         for name in ("net_arch", "activation_fn"):
             if name in initial.policy_kwargs:

@@ -2,7 +2,6 @@
 
 import math
 import secrets
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -46,6 +45,7 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 
@@ -142,13 +142,13 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         max_grad_norm: float | None = 0.5,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
         expert: ExpertLike | None = None,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         gradient_steps: int | None = 60,
         beta: float = 0.5,
         beta_decay: float = 0.001,
@@ -158,7 +158,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         l2_coef: float = 0.0,
         dataset_capacity: int = 500_000,
         shuffle: bool = True,
-        demonstrations: str | Path | None = None,
+        demonstrations: StrPath | None = None,
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -344,7 +344,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             labels = buffer.expert_actions[step]
 
             # + The expert's action flies with probability β, else a sample of the agent's.
-            observations: Any = self._last_obs
+            observations = self._last_obs
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta
@@ -366,8 +366,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 if last is not None and infos[row].get("TimeLimit.truncated"):
                     rewards[row] += self.gamma * state_values(network, last[None])[0]
 
-            starts: Any = self._last_episode_starts
-            buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
+            buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)
             self._last_obs = new_obs
             self._last_episode_starts = dones
 
@@ -456,8 +455,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                     raise self._diverged({"bc_loss": math.nan}) from error
                 # + The cloning term L_BC (Eq. 3.12)
                 mean = self.policy.action_dist.mode()
-                log_std = self.policy.log_std
-                errors = cloning_errors(self.bc_loss, mean, log_std, experts)
+                errors = cloning_errors(self.bc_loss, mean, self.policy.log_std, experts)
                 losses = {"bc_loss": errors.mean()}
                 loss = losses["bc_loss"]
 
@@ -483,8 +481,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
                 self.policy.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
+                losses["loss"] = loss
                 terms = {name: term.item() for name, term in losses.items()}
-                terms["loss"] = loss.item()
 
             # + In a step without it, the critic does not move.
             if critic_batch is None:

@@ -2,7 +2,6 @@
 
 import math
 from functools import partial
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -42,6 +41,7 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # By default a rollout is so many mini-batches, but none has less than so many rows.
@@ -125,17 +125,17 @@ class PPOBC(ExpertMixin, PPO):
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         rollout_buffer_class: type[RolloutBuffer] | None = None,
-        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        rollout_buffer_kwargs: StrDict | None = None,
         target_kl: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
         expert: ExpertLike | None = None,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         bc_coef: float | Schedule = 0.1,
         bc_loss: CloningLoss = "mse",
         bc_filter: CloningFilter = "agreement",
@@ -295,8 +295,7 @@ class PPOBC(ExpertMixin, PPO):
         # The update comes at the end of this rollout and takes the weight of that time.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
-        progress = 1.0 - float(end) / float(self._total_timesteps)
-        buffer.bc_coef = float(self.bc_coef(progress))
+        buffer.bc_coef = self.bc_coef(1.0 - end / self._total_timesteps)
         if buffer.bc_coef == 0.0:
             # A recurrent expert that does not see this rollout begins again.
             self._labeller = None
@@ -346,9 +345,7 @@ class PPOBC(ExpertMixin, PPO):
         # PyTorch does it, as in PPO, bit for bit.
         own_value_loss = clip_range_vf is not None and self.max_clipped_value
         adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
-        network: Any = self.policy
-        if adds:
-            network = network_of(self.policy)
+        network: Any = network_of(self.policy) if adds else self.policy
         compiled_loss = Loss(
             policy_coef=1.0,
             clip_range=clip_range,
@@ -454,8 +451,8 @@ class PPOBC(ExpertMixin, PPO):
 
                     self.policy.optimizer.zero_grad()
                     loss.backward()  # type: ignore[no-untyped-call]
+                    losses["loss"] = loss
                     terms = {name: term.item() for name, term in losses.items()}
-                    terms["loss"] = loss.item()
 
                 # Logging
                 for name, term in terms.items():

@@ -1,11 +1,9 @@
 """Soft actor-critic that also clones an expert: a value-based stage two."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -32,7 +30,7 @@ from sb3_quad.algorithms.networks.losses import (
     cloning_errors,
 )
 from sb3_quad.base.errors import ConfigError, ExpertError
-from sb3_quad.base.types import Float32Array
+from sb3_quad.base.types import AnyArray, Float32Array, StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
 _STOCK_BUFFERS = (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer)
@@ -95,7 +93,7 @@ class SACBC(ExpertMixin, SAC):
         gradient_steps: int = 1,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
+        replay_buffer_kwargs: StrDict | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
         ent_coef: str | float = "auto",
@@ -106,13 +104,13 @@ class SACBC(ExpertMixin, SAC):
         use_sde_at_warmup: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
         expert: ExpertLike | None = None,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         bc_coef: float | Schedule = 0.0,
         bc_loss: CloningLoss = "mse",
         bc_filter: CloningFilter = "none",
@@ -230,7 +228,7 @@ class SACBC(ExpertMixin, SAC):
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    ) -> tuple[AnyArray, AnyArray]:
         # Before the step: an expert that sees the true state labels the present one.
         if self._clones:
             assert self.env is not None
@@ -243,11 +241,11 @@ class SACBC(ExpertMixin, SAC):
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
-        buffer_action: npt.NDArray[Any],
+        buffer_action: AnyArray,
         new_obs: Any,
-        reward: npt.NDArray[Any],
-        dones: npt.NDArray[Any],
-        infos: list[dict[str, Any]],
+        reward: AnyArray,
+        dones: AnyArray,
+        infos: list[StrDict],
     ) -> None:
         if self._scaled_labels is not None:
             flown = buffer_action.reshape(self._scaled_labels.shape)
@@ -338,8 +336,7 @@ class SACBC(ExpertMixin, SAC):
                     log("bc_share", bc_share)
                 self.actor.optimizer.zero_grad()
                 # + The critic needs no gradient of this loss.
-                parameters = [*self.actor.parameters()]
-                actor_loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
+                actor_loss.backward(inputs=[*self.actor.parameters()])  # type: ignore[no-untyped-call]
                 self.actor.optimizer.step()
 
             # Update target networks

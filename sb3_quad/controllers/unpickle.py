@@ -115,11 +115,6 @@ def _dtype(code: Any, *_: Any) -> Any:
     return np.dtype(code)
 
 
-def _check_dtype(dtype: Any, state: Any) -> None:
-    """Accept the state of a plain dtype in this machine's byte order, which it has already."""
-    _check(state[1:5] == (dtype.str[0], None, None, None), "a dtype")
-
-
 def _check_tensor(stored: Any, offset: Any, shape: Any, *_: Any) -> None:
     """Refuse a tensor of more numbers than a file stores for it, which repeats them."""
     _check({*map(type, (stored, offset, *shape))} == {int}, "a tensor")
@@ -306,7 +301,8 @@ class _Reader(pickle._Unpickler):
         kind = type(instance)
         self.walk(state)
         if isinstance(instance, np.dtype):
-            _check_dtype(instance, state)
+            # A plain dtype in this machine's byte order is so already.
+            _check(state[1:5] == (instance.str[0], None, None, None), "a dtype")
         elif kind is np.ndarray:
             # The content is copied.
             self.steps.left -= len(state[-1]) // 128
@@ -324,24 +320,10 @@ class _Reader(pickle._Unpickler):
             if kind is Box:
                 _check(instance.low.shape == instance.high.shape == instance._shape, "a Box")
 
-    def skip_frame(self) -> None:
-        # It says how much to read at once.
-        self.read(8)
-
     def read_array(self) -> None:
         # Python's makes room for whatever size is named.
         size = int.from_bytes(self.read(8), "little")
         self.stack.append(bytearray(self.read(size)))
-
-    def drop(self) -> None:
-        # Python's would also take a mark, which no pickler writes.
-        self.stack.pop()
-
-    def append_item(self) -> None:
-        self.extend([self.stack.pop()])
-
-    def append_items(self) -> None:
-        self.extend(self.pop_mark())
 
     def extend(self, new: list[Any]) -> None:
         items = self.stack[-1]
@@ -353,9 +335,6 @@ class _Reader(pickle._Unpickler):
         key = self.stack.pop()
         self.update([key, value])
 
-    def set_items(self) -> None:
-        self.update(self.pop_mark())
-
     def update(self, new: list[Any]) -> None:
         items = self.stack[-1]
         keys = new[::2]
@@ -364,16 +343,18 @@ class _Reader(pickle._Unpickler):
         items.update(zip(keys, new[1::2], strict=True))
 
     dispatch: ClassVar[dict[int, Any]] = {
-        pickle.FRAME[0]: skip_frame,
+        # A frame says how much to read at once.
+        pickle.FRAME[0]: lambda self: self.read(8),
         pickle.BYTEARRAY8[0]: read_array,
-        pickle.POP[0]: drop,
+        # Python's would also take a mark, which no pickler writes.
+        pickle.POP[0]: lambda self: self.stack.pop(),
         pickle.REDUCE[0]: call,
         pickle.NEWOBJ[0]: make,
         pickle.BUILD[0]: change,
-        pickle.APPEND[0]: append_item,
-        pickle.APPENDS[0]: append_items,
+        pickle.APPEND[0]: lambda self: self.extend([self.stack.pop()]),
+        pickle.APPENDS[0]: lambda self: self.extend(self.pop_mark()),
         pickle.SETITEM[0]: set_item,
-        pickle.SETITEMS[0]: set_items,
+        pickle.SETITEMS[0]: lambda self: self.update(self.pop_mark()),
     }
 
 
