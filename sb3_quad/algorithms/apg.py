@@ -101,6 +101,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
+    _unsaved = ("cost", "_tape", "_observations")
     _tape: Tape
 
     def __init__(
@@ -124,11 +125,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
-        own_kwargs = policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             n_steps=n_steps,
             gamma=1.0,
             gae_lambda=1.0,
@@ -140,7 +140,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             # Gradients of whole flights change quickly: a short memory of their size.
-            policy_kwargs={"optimizer_kwargs": {"betas": (0.9, 0.99)}} | own_kwargs,
+            policy_kwargs={"optimizer_kwargs": {"betas": (0.9, 0.99)}}
+            | policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0),
             verbose=verbose,
             seed=seed,
             device=device,
@@ -183,15 +184,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
             )
         self._tape = env.record(self.n_steps, self.substeps)
-        with self._threads():
-            return super().learn(
-                total_timesteps,
-                callback,
-                log_interval,
-                tb_log_name,
-                reset_num_timesteps,
-                progress_bar,
-            )
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def collect_rollouts(
         self,
@@ -257,6 +252,3 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self._n_updates += 1
 
         self._log_update({"cost": [cost], "gradient_norm": [float(norm)]})
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "cost", "_tape", "_observations"]

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from functools import wraps
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,9 +17,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from typing_extensions import Self
 
 from sb3_quad.algorithms import offset_correction
-from sb3_quad.algorithms.networks.gradients import network_of
+from sb3_quad.algorithms.networks.gradients import Terms, network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as, unknown
@@ -61,6 +61,8 @@ LIMITS = {
     "beta_decay": _WEIGHT,
 }
 """Valid range of each argument of the algorithms; the greatest holds for settings files alone."""
+History = dict[str, list[float]]
+"""The terms of an update's losses in each of its mini-batches, by logged name."""
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 # A half range beyond this is no limit at all.
@@ -107,6 +109,8 @@ class ExpertMixin:
     batch_size: Any
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
+    # What else of an algorithm no zip holds.
+    _unsaved: tuple[str, ...] = ()
 
     def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on, as a model must that was loaded without one."""
@@ -235,12 +239,12 @@ class ExpertMixin:
         # BaseAlgorithm has them by this name, which no zip holds.
         setattr(self, STATISTICS, self._vec_normalize_env)
 
-    def _threads(self) -> AbstractContextManager[None]:
-        """Return the context to learn in: compiled code leaves PyTorch one thread."""
+    def learn(self, *arguments: Any, **keywords: Any) -> Self:
+        """Learn as SB3 does. Compiled code leaves PyTorch one thread."""
         policy = self.policy
-        return one_torch_thread(
-            isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
-        )
+        compiled = isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
+        with one_torch_thread(compiled):
+            return super().learn(*arguments, **keywords)  # type: ignore[misc, no-any-return]
 
     def _labels(self, env: VecEnv) -> Float32Array:
         """Return the expert's actions for the present states, (n_envs, action_dim).
@@ -266,7 +270,7 @@ class ExpertMixin:
                 " expert; wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
 
-    def _log_update(self, history: dict[str, list[float]]) -> None:
+    def _log_update(self, history: History) -> None:
         """Log the means of an update's terms, whose values are given by name."""
         for name, values in history.items():
             self.logger.record(f"train/{name}", float(np.mean(values)))
@@ -281,7 +285,7 @@ class ExpertMixin:
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
 
-    def _diverged(self, terms: dict[str, float]) -> TrainingError:
+    def _diverged(self, terms: Terms) -> TrainingError:
         """Return the error for a loss or gradient that is not finite."""
         values = ", ".join(f"{name} {term:.3g}" for name, term in terms.items())
         return TrainingError(
@@ -292,7 +296,7 @@ class ExpertMixin:
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
-        return [*super()._excluded_save_params(), *own]  # type: ignore[misc]
+        return [*super()._excluded_save_params(), *own, *self._unsaved]  # type: ignore[misc]
 
 
 def half_ranges(space: spaces.Box, into: bool) -> tuple[Float32Array, Float32Array]:

@@ -23,6 +23,7 @@ from typing_extensions import Self
 from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, sample_rows
 from sb3_quad.algorithms.common import (
     ExpertMixin,
+    History,
     actor_and_critic_parameters,
     half_ranges,
     in_half_ranges,
@@ -125,6 +126,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
+    _unsaved = ("dataset",)
 
     def __init__(
         self,
@@ -163,9 +165,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     ):
         initial = model_of(initial_policy)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
@@ -295,15 +297,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
-        with self._threads():
-            return super().learn(
-                total_timesteps,
-                callback,
-                log_interval,
-                tb_log_name,
-                reset_num_timesteps,
-                progress_bar,
-            )
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def _generator(self, purpose: int) -> np.random.Generator:
         """Return random numbers for this rollout (0) or update (1).
@@ -437,7 +433,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
         targets = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
         # The terms of each step, by name
-        history: dict[str, list[float]] = {}
+        history: History = {}
 
         for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
             actor_batch = self.dataset.batch(rows)._replace(targets=labels)
@@ -502,6 +498,3 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         self._log_update(history)
         self._log_rollout(buffer, clip_range_vf)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "dataset"]

@@ -22,6 +22,7 @@ from typing_extensions import Self
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import (
     ExpertMixin,
+    History,
     actor_and_critic_parameters,
     in_half_ranges,
     is_ever_nonzero,
@@ -147,9 +148,9 @@ class PPOBC(ExpertMixin, PPO):
     ):
         initial = model_of(initial_policy)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             n_steps=n_steps,
             # The default is known when the environments are. PPO warns where this is no divisor.
             batch_size=batch_size or max(n_steps, 2),
@@ -274,15 +275,9 @@ class PPOBC(ExpertMixin, PPO):
         """
         if self.will_clone():
             self._check_cloning()
-        with self._threads():
-            return super().learn(
-                total_timesteps,
-                callback,
-                log_interval,
-                tb_log_name,
-                reset_num_timesteps,
-                progress_bar,
-            )
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def collect_rollouts(
         self,
@@ -361,7 +356,7 @@ class PPOBC(ExpertMixin, PPO):
         )
 
         # The terms of each mini-batch, by name
-        history: dict[str, list[float]] = {}
+        history: History = {}
         continue_training = True
 
         # train for n_epochs epochs

@@ -11,7 +11,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update
@@ -20,7 +19,13 @@ from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, model_of, policy_arguments
+from sb3_quad.algorithms.common import (
+    ExpertMixin,
+    History,
+    is_ever_nonzero,
+    model_of,
+    policy_arguments,
+)
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
     CLONING_LOSSES,
@@ -79,6 +84,8 @@ class SACBC(ExpertMixin, SAC):
     :raises TrainingError: a loss that is not finite.
     """
 
+    _unsaved = ("_scaled_labels",)
+
     def __init__(
         self,
         policy: str | type[SACPolicy],
@@ -120,9 +127,9 @@ class SACBC(ExpertMixin, SAC):
     ):
         initial = model_of(initial_policy)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
             batch_size=batch_size,
@@ -184,8 +191,7 @@ class SACBC(ExpertMixin, SAC):
             # separated, whichever rows SB3 samples.
             buffer: Any = self.replay_buffer
             buffer.action_dim *= 2
-            shape = (*buffer.actions.shape[:2], buffer.action_dim)
-            buffer.actions = np.zeros(shape, dtype=np.float32)
+            buffer.actions = np.zeros((*buffer.actions.shape[:2], buffer.action_dim), np.float32)
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
             _normalise_layers(self.critic_target)
@@ -216,15 +222,9 @@ class SACBC(ExpertMixin, SAC):
             raise ExpertError(
                 "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
             )
-        with self._threads():
-            return super().learn(
-                total_timesteps,
-                callback,
-                log_interval,
-                tb_log_name,
-                reset_num_timesteps,
-                progress_bar,
-            )
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -272,7 +272,7 @@ class SACBC(ExpertMixin, SAC):
         # + Weight of the cloning term in this update
         bc_coef = self.bc_coef(self._current_progress_remaining)
         # The terms of each gradient step, by name
-        history: dict[str, list[float]] = {}
+        history: History = {}
 
         def log(name: str, value: th.Tensor) -> None:
             history.setdefault(name, []).append(value.item())
@@ -371,17 +371,13 @@ class SACBC(ExpertMixin, SAC):
                 kept = agree(mean, labels)
         return (errors * kept).mean(), kept.float().mean()
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_scaled_labels"]
 
-
-def _normalise_layers(critic: ContinuousCritic) -> None:
+def _normalise_layers(critic: Any) -> None:
     """Normalise the inputs of each activation over its layer.
 
     Nothing is learnt there, so the names in a zip stay those of SAC.
     """
-    networks: list[Any] = critic.q_networks
-    for network in networks:
+    for network in critic.q_networks:
         for i, layer in enumerate([*network][:-1]):
             if isinstance(layer, nn.Linear):
                 normal = nn.LayerNorm(layer.out_features, elementwise_affine=False)

@@ -107,14 +107,15 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
     # The states flown, and the teacher's actions there as the actor gives them
     space: Any = env.observation_space
-    action_dim = get_action_dim(env.action_space)
-    dataset = AggregatedDataset(steps * n, space.shape, action_dim, space.dtype)
+    dataset = AggregatedDataset(
+        steps * n, space.shape, get_action_dim(env.action_space), space.dtype
+    )
     errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)
     for step in range(steps):
         labels = expert.labels(observation, begins)
-        scaled: Any = policy.scale_action(labels.reshape(n, *actor.action_space.shape))
+        scaled = policy.scale_action(labels.reshape(n, *actor.action_space.shape))
         dataset.add(observation, scaled.reshape(n, -1))
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)

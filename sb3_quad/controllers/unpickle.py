@@ -89,7 +89,7 @@ def held(item: Any) -> Collection[Any]:
     return item if isinstance(item, (list, tuple, deque)) else ()
 
 
-# Functions that stand for those that SB3's pickles call, and for the methods that set a state.
+# Functions that stand for those that SB3's pickles call.
 
 
 def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> Any:
@@ -99,14 +99,6 @@ def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) ->
     if axes is None:
         return array.reshape(shape, order=order)
     return array.reshape(shape).transpose(axes)
-
-
-def _fill_array(array: Any, state: Any) -> None:
-    """Do what ``ndarray.__setstate__`` does, which itself trusts the state."""
-    _, shape, dtype, by_columns, content = state
-    values = _array(content, dtype, shape, "F" if by_columns is True else "C")
-    _, _, checked_state = values.__reduce__()
-    array.__setstate__(checked_state)
 
 
 def _dtype(code: Any, *_: Any) -> Any:
@@ -304,9 +296,13 @@ class _Reader(pickle._Unpickler):
             # A plain dtype in this machine's byte order is so already.
             _check(state[1:5] == (instance.str[0], None, None, None), "a dtype")
         elif kind is np.ndarray:
+            _, shape, dtype, by_columns, content = state
             # The content is copied.
-            self.steps.left -= len(state[-1]) // 128
-            _fill_array(instance, state)
+            self.steps.left -= len(content) // 128
+            # NumPy itself trusts the state of an array, but for one that an array has given.
+            values = _array(content, dtype, shape, "F" if by_columns is True else "C")
+            _, _, checked_state = values.__reduce__()
+            instance.__setstate__(checked_state)
         # None stands for random numbers; PyTorch notes versions at its OrderedDict.
         elif instance is not None and kind is not OrderedDict:
             _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")

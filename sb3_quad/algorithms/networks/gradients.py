@@ -88,13 +88,14 @@ class Perceptrons(NamedTuple):
             loss = loss._replace(advantage_shift=float(advantages.mean()), advantage_scale=scale)
         observations = _flat(batch.observations)
         sums = self.actor.gradient(observations, batch.rows, batch.targets, loss, self.log_std)
+        means = sums / n
         terms: Terms = {}
         if loss.bc_coef != 0.0:
-            terms["bc_loss"] = sums[losses.CLONING] / n
+            terms["bc_loss"] = means[losses.CLONING]
         if loss.policy_coef != 0.0:
-            terms["policy_gradient_loss"] = sums[losses.POLICY] / n
-            terms["approx_kl"] = sums[losses.KL] / n
-            terms["clip_fraction"] = sums[losses.CLIPPED] / n
+            terms["policy_gradient_loss"] = means[losses.POLICY]
+            terms["approx_kl"] = means[losses.KL]
+            terms["clip_fraction"] = means[losses.CLIPPED]
         return terms
 
 
