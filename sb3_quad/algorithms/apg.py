@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,9 +21,8 @@ from typing_extensions import Self
 from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
 from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost
 from sb3_quad.algorithms.networks.gradients import Pullback, mean_actions, network_of
-from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, TrainingError
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.simulation.tape import FlightCost
 
 
@@ -103,6 +101,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
+    _unsaved = ("cost", "_tape", "_observations")
+    _tape: Tape
 
     def __init__(
         self,
@@ -113,23 +113,22 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         max_grad_norm: float = 1.0,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         carry_on: bool = False,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         substeps: int | None = 2,
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
-        own_kwargs = policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             n_steps=n_steps,
             gamma=1.0,
             gae_lambda=1.0,
@@ -141,7 +140,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             # Gradients of whole flights change quickly: a short memory of their size.
-            policy_kwargs={"optimizer_kwargs": {"betas": (0.9, 0.99)}} | own_kwargs,
+            policy_kwargs={"optimizer_kwargs": {"betas": (0.9, 0.99)}}
+            | policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0),
             verbose=verbose,
             seed=seed,
             device=device,
@@ -151,12 +151,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.carry_on = carry_on
         self.cost = cost
         self.substeps = substeps
-        self._tape: Tape | None = None
 
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
 
     def learn(
         self,
@@ -171,19 +168,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ConfigError: an environment that cannot be differentiated.
         """
-        self._tape = self._new_tape()
-        with self._threads():
-            return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
-            )
-
-    def _new_tape(self) -> Tape:
-        """Return a tape of the environment, below its wrappers."""
         assert self.env is not None
         env: Any = self.env
         # The statistics of episodes come from the tape.
@@ -199,8 +183,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 f"{type(env).__name__}: APG differentiates flights, and this environment has no"
                 " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
             )
-        tape: Tape = env.record(self.n_steps, self.substeps)
-        return tape
+        self._tape = env.record(self.n_steps, self.substeps)
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def collect_rollouts(
         self,
@@ -213,11 +199,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         network = network_of(self.policy)
         tape = self._tape
-        assert tape is not None
         callback.on_rollout_start()
         observations = tape.reset(self.carry_on)
         self._observations = []
-        infos: list[dict[str, Any]] = [{} for _ in range(env.num_envs)]
+        infos: list[StrDict] = [{} for _ in range(env.num_envs)]
         for step in range(n_rollout_steps):
             self._observations.append(observations)
             observations = tape.step(mean_actions(network, observations))
@@ -244,14 +229,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         tape = self._tape
-        assert self.env is not None
-        assert tape is not None
         cost = tape.begin(partial(cost_and_gradients, self.cost))
 
         # What the critic or an earlier update has left; autograd adds to it.
         self.policy.optimizer.zero_grad()
         # The observation after the last step leads to no action.
-        network = Pullback(self.policy, self.env.num_envs)
+        network = Pullback(self.policy, self.n_envs)
         by_observations = np.zeros_like(self._observations[0])
         for step in reversed(range(self.n_steps)):
             by_actions = tape.backward(step, by_observations)
@@ -268,9 +251,4 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.optimizer.step()
         self._n_updates += 1
 
-        self.logger.record("train/cost", cost)
-        self.logger.record("train/gradient_norm", float(norm))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "cost", "_tape", "_observations"]
+        self._log_update({"cost": [cost], "gradient_norm": [float(norm)]})

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_quad.algorithms.networks.gradients import Batch
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_arrays, write_arrays
-from sb3_quad.base.types import Arrays, Float32Array, IntArray
+from sb3_quad.base.types import AnyArray, Arrays, Float32Array, IntArray, StrDict, StrPath
 
 
 class ExpertRolloutSamples(NamedTuple):
@@ -66,9 +66,9 @@ class ExpertRolloutBuffer(RolloutBuffer):
             # Flattened, the rows of an environment follow one another.
             rows = np.arange(n_rows).reshape(self.n_envs, self.buffer_size).T.reshape(-1)
         if not self.generator_ready:
-            for name in ("observations", "actions", "values", "log_probs", "advantages", "returns"):
+            stock = ("observations", "actions", "values", "log_probs", "advantages", "returns")
+            for name in (*stock, "expert_actions"):
                 setattr(self, name, self.swap_and_flatten(getattr(self, name)))
-            self.expert_actions = self.swap_and_flatten(self.expert_actions)
             self.generator_ready = True
         for start in range(0, n_rows, batch_size):
             yield rows[start : start + batch_size]
@@ -105,7 +105,7 @@ class AggregatedDataset:
     """
 
     #: The least and the greatest actions, (action_dim,); those of a file must lie between
-    action_range: tuple[Any, Any] = (-np.inf, np.inf)
+    action_range: Any = (-np.inf, np.inf)
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class AggregatedDataset:
         """Forget every pair."""
         self.added = 0
 
-    def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
+    def add(self, observations: AnyArray, actions: Float32Array) -> None:
         """Add observations (n, ...) and actions (n, action_dim), oldest first.
 
         Of more than ``capacity`` pairs, the last are kept.
@@ -144,7 +144,7 @@ class AggregatedDataset:
         return Batch(places, self.observations, self.actions)
 
     @property
-    def pairs(self) -> Arrays:
+    def pairs(self) -> StrDict:
         """Copies of observations (n, ...) and expert actions (n, action_dim) by name, oldest first.
 
         :meth:`add` takes them.
@@ -158,13 +158,12 @@ class AggregatedDataset:
         n = len(self)
         return {"observations": self.observations[:n], "actions": self.actions[:n]}
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: StrPath) -> None:
         """Write the pairs to an ``.npz`` file, which is replaced as a whole or not at all.
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
-        pairs: dict[str, Any] = self.pairs
-        write_arrays(path, **pairs)
+        write_arrays(path, **self.pairs)
 
     def load(self, source: Any) -> None:
         """Hold the pairs of recorded flights instead of the present ones.
@@ -202,7 +201,7 @@ class AggregatedDataset:
                     f" {self.capacity}"
                 )
             # NaN is not itself.
-            if (actions != actions.clip(*self.action_range).astype(np.float32)).any():
+            if (actions != actions.clip(*self.action_range)).any():
                 raise ValueError(f"actions from {actions.min():g} to {actions.max():g}")
             if not np.isfinite(observations).all():
                 raise ValueError("observations that are not finite")

@@ -1,8 +1,7 @@
 """The parts that all algorithms with an expert share."""
 
 import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,13 +17,15 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from typing_extensions import Self
 
 from sb3_quad.algorithms import offset_correction
-from sb3_quad.algorithms.networks.gradients import network_of
+from sb3_quad.algorithms.networks.gradients import Terms, network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
-from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
+from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.base.errors import ConfigError, TrainingError, raised_as, unknown
 from sb3_quad.base.files import one_line
-from sb3_quad.base.types import Float32Array
+from sb3_quad.base.types import Float32Array, StrDict, StrPath
 from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.pretrained import agent_path
@@ -60,6 +61,8 @@ LIMITS = {
     "beta_decay": _WEIGHT,
 }
 """Valid range of each argument of the algorithms; the greatest holds for settings files alone."""
+History = dict[str, list[float]]
+"""The terms of an update's losses in each of its mini-batches, by logged name."""
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 # A half range beyond this is no limit at all.
@@ -106,6 +109,8 @@ class ExpertMixin:
     batch_size: Any
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
+    # What else of an algorithm no zip holds.
+    _unsaved: tuple[str, ...] = ()
 
     def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on, as a model must that was loaded without one."""
@@ -154,7 +159,7 @@ class ExpertMixin:
             if not isinstance(value, (int, float)) or not value >= least:
                 raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
         # DAgger's None is nothing that PPO could load.
-        if vars(self).get("max_grad_norm", 0.0) is None:
+        if getattr(self, "max_grad_norm", 0.0) is None:
             self.max_grad_norm = math.inf
         # Rows are sampled all at once.
         capacity = getattr(self, "dataset_capacity", 0) or getattr(self, "buffer_size", 0)
@@ -170,6 +175,19 @@ class ExpertMixin:
                 f"policy {self.policy_class.__name__}: {type(self).__name__} has none of this kind;"
                 " give an agent of another algorithm as expert=... to a new model"
             )
+
+    def _check_names(self, **valid: Sequence[str]) -> None:
+        """Check arguments whose valid values are given by their names."""
+        for argument, names in valid.items():
+            value = getattr(self, argument)
+            if value not in names:
+                raise ConfigError(unknown(argument, value, names))
+
+    def _begin(self, initial: BaseAlgorithm | None) -> None:
+        """Set the model up, with the policy of the agent that it starts from."""
+        self._setup_model()
+        if initial is not None:
+            transfer_policy(initial, self)  # type: ignore[arg-type]
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -221,12 +239,12 @@ class ExpertMixin:
         # BaseAlgorithm has them by this name, which no zip holds.
         setattr(self, STATISTICS, self._vec_normalize_env)
 
-    def _threads(self) -> AbstractContextManager[None]:
-        """Return the context to learn in: compiled code leaves PyTorch one thread."""
+    def learn(self, *arguments: Any, **keywords: Any) -> Self:
+        """Learn as SB3 does. Compiled code leaves PyTorch one thread."""
         policy = self.policy
-        return one_torch_thread(
-            isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
-        )
+        compiled = isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
+        with one_torch_thread(compiled):
+            return super().learn(*arguments, **keywords)  # type: ignore[misc, no-any-return]
 
     def _labels(self, env: VecEnv) -> Float32Array:
         """Return the expert's actions for the present states, (n_envs, action_dim).
@@ -252,7 +270,7 @@ class ExpertMixin:
                 " expert; wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
 
-    def _log_update(self, history: dict[str, list[float]]) -> None:
+    def _log_update(self, history: History) -> None:
         """Log the means of an update's terms, whose values are given by name."""
         for name, values in history.items():
             self.logger.record(f"train/{name}", float(np.mean(values)))
@@ -267,7 +285,7 @@ class ExpertMixin:
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
 
-    def _diverged(self, terms: dict[str, float]) -> TrainingError:
+    def _diverged(self, terms: Terms) -> TrainingError:
         """Return the error for a loss or gradient that is not finite."""
         values = ", ".join(f"{name} {term:.3g}" for name, term in terms.items())
         return TrainingError(
@@ -278,7 +296,7 @@ class ExpertMixin:
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
-        return [*super()._excluded_save_params(), *own]  # type: ignore[misc]
+        return [*super()._excluded_save_params(), *own, *self._unsaved]  # type: ignore[misc]
 
 
 def half_ranges(space: spaces.Box, into: bool) -> tuple[Float32Array, Float32Array]:
@@ -314,7 +332,7 @@ def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
     return settings if env.observation_space.shape == (settings.observation.size,) else None
 
 
-def model_of(initial_policy: BaseAlgorithm | str | Path | None) -> BaseAlgorithm | None:
+def model_of(initial_policy: BaseAlgorithm | StrPath | None) -> BaseAlgorithm | None:
     """Return the model that ``initial_policy`` is or names.
 
     :param initial_policy: a model, the path of a zip, a run folder, or the name of a shipped agent.
@@ -326,11 +344,11 @@ def model_of(initial_policy: BaseAlgorithm | str | Path | None) -> BaseAlgorithm
 
 
 def policy_arguments(
-    given: dict[str, Any] | None,
+    given: StrDict | None,
     initial: BaseAlgorithm | None,
     family: type[BaseAlgorithm],
     log_std_init: float | None = None,
-) -> dict[str, Any]:
+) -> StrDict:
     """Return the ``policy_kwargs`` of a new model.
 
     :param given: what the user gives; it holds. ``log_std_init=None`` there: no default.
@@ -338,7 +356,7 @@ def policy_arguments(
         ``net_arch`` and ``activation_fn`` are taken.
     :param log_std_init: the default.
     """
-    arguments: dict[str, Any] = {}
+    arguments: StrDict = {}
     if isinstance(initial, family):
         for name in ("net_arch", "activation_fn"):
             if name in initial.policy_kwargs:

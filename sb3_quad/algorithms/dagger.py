@@ -2,7 +2,6 @@
 
 import math
 import secrets
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -24,6 +23,7 @@ from typing_extensions import Self
 from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, sample_rows
 from sb3_quad.algorithms.common import (
     ExpertMixin,
+    History,
     actor_and_critic_parameters,
     half_ranges,
     in_half_ranges,
@@ -45,9 +45,9 @@ from sb3_quad.algorithms.networks.losses import (
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # Observations that the critic evaluates at once after a rollout
@@ -126,6 +126,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
+    _unsaved = ("dataset",)
 
     def __init__(
         self,
@@ -143,13 +144,13 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         max_grad_norm: float | None = 0.5,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
         expert: ExpertLike | None = None,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         gradient_steps: int | None = 60,
         beta: float = 0.5,
         beta_decay: float = 0.001,
@@ -159,14 +160,14 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         l2_coef: float = 0.0,
         dataset_capacity: int = 500_000,
         shuffle: bool = True,
-        demonstrations: str | Path | None = None,
+        demonstrations: StrPath | None = None,
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
@@ -192,7 +193,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.beta = beta
         self.beta_decay = beta_decay
         self.beta_final = beta_final
-        self.bc_loss: CloningLoss = bc_loss
+        self.bc_loss = bc_loss
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
@@ -205,9 +206,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if expert is not None:
             self.set_expert(expert)
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
             if demonstrations is not None:
                 self.dataset.load(demonstrations)
 
@@ -222,8 +221,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             raise ConfigError(
                 f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1"
             )
-        if self.bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
+        self._check_names(bc_loss=CLONING_LOSSES)
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(
@@ -239,7 +237,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self._rescale(False)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        space: Any = self.action_space
         dtype = self.rollout_buffer.observations.dtype
         if np.issubdtype(dtype, np.floating):
             dtype = np.dtype(np.float32)
@@ -249,7 +246,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self.rollout_buffer.action_dim,
             dtype,
         )
-        self.dataset.action_range = space.low.ravel(), space.high.ravel()
+        self.dataset.action_range = limits_of(self.action_space)
 
     def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on.
@@ -300,24 +297,16 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
-        with self._threads():
-            return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
-            )
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def _generator(self, purpose: int) -> np.random.Generator:
         """Return random numbers for this rollout (0) or update (1).
 
         There is no state to save: after a resume they are the same again.
         """
-        seed = self.seed
-        if seed is None:
-            seed = self._entropy
+        seed = self._entropy if self.seed is None else self.seed
         return np.random.default_rng([seed, purpose, self._n_updates])
 
     def collect_rollouts(
@@ -336,7 +325,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
-        action_space: Any = self.action_space
+        action_space = self.action_space
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
         not_yet = th.zeros(env.num_envs)
@@ -351,7 +340,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             labels = buffer.expert_actions[step]
 
             # + The expert's action flies with probability β, else a sample of the agent's.
-            observations: Any = self._last_obs
+            observations = self._last_obs
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta
@@ -373,8 +362,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 if last is not None and infos[row].get("TimeLimit.truncated"):
                     rewards[row] += self.gamma * state_values(network, last[None])[0]
 
-            starts: Any = self._last_episode_starts
-            buffer.add(observations, actions, rewards, starts, not_yet, not_yet)
+            buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)
             self._last_obs = new_obs
             self._last_episode_starts = dones
 
@@ -445,7 +433,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
         targets = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
         # The terms of each step, by name
-        history: dict[str, list[float]] = {}
+        history: History = {}
 
         for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
             actor_batch = self.dataset.batch(rows)._replace(targets=labels)
@@ -463,8 +451,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                     raise self._diverged({"bc_loss": math.nan}) from error
                 # + The cloning term L_BC (Eq. 3.12)
                 mean = self.policy.action_dist.mode()
-                log_std = self.policy.log_std
-                errors = cloning_errors(self.bc_loss, mean, log_std, experts)
+                errors = cloning_errors(self.bc_loss, mean, self.policy.log_std, experts)
                 losses = {"bc_loss": errors.mean()}
                 loss = losses["bc_loss"]
 
@@ -490,8 +477,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
                 self.policy.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
+                losses["loss"] = loss
                 terms = {name: term.item() for name, term in losses.items()}
-                terms["loss"] = loss.item()
 
             # + In a step without it, the critic does not move.
             if critic_batch is None:
@@ -511,6 +498,3 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         self._log_update(history)
         self._log_rollout(buffer, clip_range_vf)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "dataset"]

@@ -57,7 +57,7 @@ def cost_and_gradients(
     gradients = th.autograd.grad(
         mean, (by_states, by_actions), allow_unused=True, materialize_grads=True
     )
-    return float(mean.detach()), gradients[0].numpy(), gradients[1].numpy()
+    return mean.item(), gradients[0].numpy(), gradients[1].numpy()
 
 
 def length(vectors: th.Tensor) -> th.Tensor:

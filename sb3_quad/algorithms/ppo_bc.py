@@ -2,7 +2,6 @@
 
 import math
 from functools import partial
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +22,7 @@ from typing_extensions import Self
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import (
     ExpertMixin,
+    History,
     actor_and_critic_parameters,
     in_half_ranges,
     is_ever_nonzero,
@@ -41,8 +41,8 @@ from sb3_quad.algorithms.networks.losses import (
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, unknown
+from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # By default a rollout is so many mini-batches, but none has less than so many rows.
@@ -126,17 +126,17 @@ class PPOBC(ExpertMixin, PPO):
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         rollout_buffer_class: type[RolloutBuffer] | None = None,
-        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        rollout_buffer_kwargs: StrDict | None = None,
         target_kl: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
         expert: ExpertLike | None = None,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         bc_coef: float | Schedule = 0.1,
         bc_loss: CloningLoss = "mse",
         bc_filter: CloningFilter = "agreement",
@@ -148,9 +148,9 @@ class PPOBC(ExpertMixin, PPO):
     ):
         initial = model_of(initial_policy)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             n_steps=n_steps,
             # The default is known when the environments are. PPO warns where this is no divisor.
             batch_size=batch_size or max(n_steps, 2),
@@ -179,8 +179,8 @@ class PPOBC(ExpertMixin, PPO):
         self.batch_size = batch_size
         self.expert = expert
         self.bc_coef = bc_coef
-        self.bc_loss: CloningLoss = bc_loss
-        self.bc_filter: CloningFilter = bc_filter
+        self.bc_loss = bc_loss
+        self.bc_filter = bc_filter
         self.l2_coef = l2_coef
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
@@ -188,16 +188,11 @@ class PPOBC(ExpertMixin, PPO):
         self._n_rollouts_trained = 0
 
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
 
     def _setup_model(self) -> None:
         filters = [name for name in BC_FILTERS if name != "q"]
-        if self.bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
-        if self.bc_filter not in filters:
-            raise ConfigError(unknown("bc_filter", self.bc_filter, filters))
+        self._check_names(bc_loss=CLONING_LOSSES, bc_filter=filters)
         self._refuse_dict_observations()
         # SB3's own, as a zip of PPO names it, is one without labels.
         if self.rollout_buffer_class in (None, RolloutBuffer):
@@ -206,7 +201,7 @@ class PPOBC(ExpertMixin, PPO):
             raise ConfigError(
                 f"rollout_buffer_class {self.rollout_buffer_class}: must be an ExpertRolloutBuffer"
             )
-        if cast(int | None, self.batch_size) is None:
+        if self.batch_size is None:
             n_rows = self.n_steps * self.n_envs
             n_minibatches = min(N_MINIBATCHES, max(n_rows // LEAST_ROWS, 1))
             self.batch_size = math.ceil(n_rows / n_minibatches)
@@ -249,8 +244,8 @@ class PPOBC(ExpertMixin, PPO):
 
     def _rescale(self, into: bool) -> None:
         # Without a cloning term it is PPO, which counts actions as they are.
-        buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
-        if isinstance(self.action_space, spaces.Box) and (self.will_clone() or buffer.bc_coef):
+        may_clone = self.will_clone() or self.rollout_buffer.bc_coef
+        if isinstance(self.action_space, spaces.Box) and may_clone:
             super()._rescale(into)
 
     def _check_cloning(self) -> None:
@@ -280,15 +275,9 @@ class PPOBC(ExpertMixin, PPO):
         """
         if self.will_clone():
             self._check_cloning()
-        with self._threads():
-            return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
-            )
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def collect_rollouts(
         self,
@@ -301,8 +290,7 @@ class PPOBC(ExpertMixin, PPO):
         # The update comes at the end of this rollout and takes the weight of that time.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
-        progress = 1.0 - float(end) / float(self._total_timesteps)
-        buffer.bc_coef = float(self.bc_coef(progress))
+        buffer.bc_coef = self.bc_coef(1.0 - end / self._total_timesteps)
         if buffer.bc_coef == 0.0:
             # A recurrent expert that does not see this rollout begins again.
             self._labeller = None
@@ -339,7 +327,7 @@ class PPOBC(ExpertMixin, PPO):
             clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
 
         # + While the critic warms up, no term moves the actor's weights.
-        buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
+        buffer: ExpertRolloutBuffer = self.rollout_buffer
         bc_coef = buffer.bc_coef
         warming_up = self._n_rollouts_trained < self.critic_warmup
         ent_coef = self.ent_coef
@@ -352,9 +340,7 @@ class PPOBC(ExpertMixin, PPO):
         # PyTorch does it, as in PPO, bit for bit.
         own_value_loss = clip_range_vf is not None and self.max_clipped_value
         adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
-        network: Any = self.policy
-        if adds:
-            network = network_of(self.policy)
+        network: Any = network_of(self.policy) if adds else self.policy
         compiled_loss = Loss(
             policy_coef=1.0,
             clip_range=clip_range,
@@ -370,7 +356,7 @@ class PPOBC(ExpertMixin, PPO):
         )
 
         # The terms of each mini-batch, by name
-        history: dict[str, list[float]] = {}
+        history: History = {}
         continue_training = True
 
         # train for n_epochs epochs
@@ -460,8 +446,8 @@ class PPOBC(ExpertMixin, PPO):
 
                     self.policy.optimizer.zero_grad()
                     loss.backward()  # type: ignore[no-untyped-call]
+                    losses["loss"] = loss
                     terms = {name: term.item() for name, term in losses.items()}
-                    terms["loss"] = loss.item()
 
                 # Logging
                 for name, term in terms.items():

@@ -1,11 +1,9 @@
 """Soft actor-critic that also clones an expert: a value-based stage two."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -13,7 +11,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update
@@ -22,7 +19,13 @@ from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, model_of, policy_arguments
+from sb3_quad.algorithms.common import (
+    ExpertMixin,
+    History,
+    is_ever_nonzero,
+    model_of,
+    policy_arguments,
+)
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
     CLONING_LOSSES,
@@ -31,9 +34,8 @@ from sb3_quad.algorithms.networks.losses import (
     agree,
     cloning_errors,
 )
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, unknown
-from sb3_quad.base.types import Float32Array
+from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.base.types import AnyArray, Float32Array, StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
 _STOCK_BUFFERS = (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer)
@@ -82,6 +84,8 @@ class SACBC(ExpertMixin, SAC):
     :raises TrainingError: a loss that is not finite.
     """
 
+    _unsaved = ("_scaled_labels",)
+
     def __init__(
         self,
         policy: str | type[SACPolicy],
@@ -96,7 +100,7 @@ class SACBC(ExpertMixin, SAC):
         gradient_steps: int = 1,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
+        replay_buffer_kwargs: StrDict | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
         ent_coef: str | float = "auto",
@@ -107,13 +111,13 @@ class SACBC(ExpertMixin, SAC):
         use_sde_at_warmup: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: StrDict | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
         *,
         expert: ExpertLike | None = None,
-        initial_policy: BaseAlgorithm | str | Path | None = None,
+        initial_policy: BaseAlgorithm | StrPath | None = None,
         bc_coef: float | Schedule = 0.0,
         bc_loss: CloningLoss = "mse",
         bc_filter: CloningFilter = "none",
@@ -123,9 +127,9 @@ class SACBC(ExpertMixin, SAC):
     ):
         initial = model_of(initial_policy)
         super().__init__(
-            policy=policy,
-            env=env,
-            learning_rate=learning_rate,
+            policy,
+            env,
+            learning_rate,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
             batch_size=batch_size,
@@ -154,8 +158,8 @@ class SACBC(ExpertMixin, SAC):
         )
         self.expert = expert
         self.bc_coef = bc_coef
-        self.bc_loss: CloningLoss = bc_loss
-        self.bc_filter: CloningFilter = bc_filter
+        self.bc_loss = bc_loss
+        self.bc_filter = bc_filter
         self.critic_warmup = critic_warmup
         self.critic_layer_norm = critic_layer_norm
         self._clones = False
@@ -163,17 +167,12 @@ class SACBC(ExpertMixin, SAC):
         self._scaled_labels: Float32Array | None = None
 
         if _init_setup_model:
-            self._setup_model()
-            if initial is not None:
-                transfer_policy(initial, self)
+            self._begin(initial)
 
     def _setup_model(self) -> None:
         # The negative log-likelihood is no error of an action that tanh squashes.
         kinds = [name for name in CLONING_LOSSES if name != "nll"]
-        if self.bc_loss not in kinds:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, kinds))
-        if self.bc_filter not in BC_FILTERS:
-            raise ConfigError(unknown("bc_filter", self.bc_filter, BC_FILTERS))
+        self._check_names(bc_loss=kinds, bc_filter=BC_FILTERS)
         if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
             raise ConfigError(
                 f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
@@ -192,8 +191,7 @@ class SACBC(ExpertMixin, SAC):
             # separated, whichever rows SB3 samples.
             buffer: Any = self.replay_buffer
             buffer.action_dim *= 2
-            shape = (*buffer.actions.shape[:2], buffer.action_dim)
-            buffer.actions = np.zeros(shape, dtype=np.float32)
+            buffer.actions = np.zeros((*buffer.actions.shape[:2], buffer.action_dim), np.float32)
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
             _normalise_layers(self.critic_target)
@@ -224,36 +222,30 @@ class SACBC(ExpertMixin, SAC):
             raise ExpertError(
                 "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
             )
-        with self._threads():
-            return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
-            )
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    ) -> tuple[AnyArray, AnyArray]:
         # Before the step: an expert that sees the true state labels the present one.
         if self._clones:
             assert self.env is not None
             labels = self._labels(self.env)
-            space: Any = self.action_space
-            scaled: Any = self.policy.scale_action(labels.reshape(n_envs, *space.shape))
+            shape = self.action_space.shape
+            scaled: Any = self.policy.scale_action(labels.reshape(n_envs, *shape))
             self._scaled_labels = scaled.reshape(n_envs, -1)
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
-        buffer_action: npt.NDArray[Any],
+        buffer_action: AnyArray,
         new_obs: Any,
-        reward: npt.NDArray[Any],
-        dones: npt.NDArray[Any],
-        infos: list[dict[str, Any]],
+        reward: AnyArray,
+        dones: AnyArray,
+        infos: list[StrDict],
     ) -> None:
         if self._scaled_labels is not None:
             flown = buffer_action.reshape(self._scaled_labels.shape)
@@ -280,7 +272,7 @@ class SACBC(ExpertMixin, SAC):
         # + Weight of the cloning term in this update
         bc_coef = self.bc_coef(self._current_progress_remaining)
         # The terms of each gradient step, by name
-        history: dict[str, list[float]] = {}
+        history: History = {}
 
         def log(name: str, value: th.Tensor) -> None:
             history.setdefault(name, []).append(value.item())
@@ -344,8 +336,7 @@ class SACBC(ExpertMixin, SAC):
                     log("bc_share", bc_share)
                 self.actor.optimizer.zero_grad()
                 # + The critic needs no gradient of this loss.
-                parameters = [*self.actor.parameters()]
-                actor_loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
+                actor_loss.backward(inputs=[*self.actor.parameters()])  # type: ignore[no-untyped-call]
                 self.actor.optimizer.step()
 
             # Update target networks
@@ -380,17 +371,13 @@ class SACBC(ExpertMixin, SAC):
                 kept = agree(mean, labels)
         return (errors * kept).mean(), kept.float().mean()
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_scaled_labels"]
 
-
-def _normalise_layers(critic: ContinuousCritic) -> None:
+def _normalise_layers(critic: Any) -> None:
     """Normalise the inputs of each activation over its layer.
 
     Nothing is learnt there, so the names in a zip stay those of SAC.
     """
-    networks: list[Any] = critic.q_networks
-    for network in networks:
+    for network in critic.q_networks:
         for i, layer in enumerate([*network][:-1]):
             if isinstance(layer, nn.Linear):
                 normal = nn.LayerNorm(layer.out_features, elementwise_affine=False)

@@ -1,7 +1,6 @@
 """Starting from a trained agent: its policy and critic in a new algorithm with a new optimiser."""
 
-from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -13,12 +12,13 @@ from stable_baselines3.common.utils import update_learning_rate
 from sb3_quad.algorithms.buffers import AggregatedDataset
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
+from sb3_quad.base.types import StrPath
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.statistics import share_statistics, statistics_of
 from sb3_quad.controllers.zips import load_model
 
 
-def transfer_policy(source: BaseAlgorithm | str | Path, model: BaseAlgorithm) -> None:
+def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> None:
     """Give ``model`` the policy and critic of another agent with the same spaces and networks.
 
     An off-policy ``model`` also takes an agent with other networks, such as DAgger's. Its actor is
@@ -98,7 +98,7 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     env = model.get_env()
     assert env is not None
     policy: Any = model.policy
-    actor = cast(Any, model.actor)
+    actor = policy.actor
     n = env.num_envs
     expert = Controller.for_env(teacher, env)
     rng = np.random.default_rng(seed)
@@ -107,20 +107,21 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
     # The states flown, and the teacher's actions there as the actor gives them
     space: Any = env.observation_space
-    action_dim = get_action_dim(env.action_space)
-    dataset = AggregatedDataset(steps * n, space.shape, action_dim, space.dtype)
+    dataset = AggregatedDataset(
+        steps * n, space.shape, get_action_dim(env.action_space), space.dtype
+    )
     errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)
     for step in range(steps):
         labels = expert.labels(observation, begins)
-        scaled: Any = policy.scale_action(labels.reshape(n, *actor.action_space.shape))
+        scaled = policy.scale_action(labels.reshape(n, *actor.action_space.shape))
         dataset.add(observation, scaled.reshape(n, -1))
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
-        is_round_over = (step + 1) * CLONE_ROUNDS // steps > step * CLONE_ROUNDS // steps
-        if not is_round_over:
+        # The round is not over yet.
+        if (step + 1) * CLONE_ROUNDS // steps == step * CLONE_ROUNDS // steps:
             continue
         # Fit all that has been flown so far.
         for _ in range(CLONE_STEPS // CLONE_ROUNDS):

@@ -33,8 +33,7 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
         return _settings_of_zip(data[KEY], f"{zip_file}: {KEY}"), Path(zip_file)
 
     # Other zips, such as those of rl_zoo3, lie in a run folder.
-    folder = Path(zip_file).parent
-    configs = sorted(folder.glob("*/config.yml"))
+    configs = sorted(Path(zip_file).parent.glob("*/config.yml"))
     if not configs:
         return FlightSettings(), None
     if len(configs) > 1:

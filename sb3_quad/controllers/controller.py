@@ -75,8 +75,7 @@ class Controller:
             raise self._error(f"{self._who}: is a class; give an instance, such as {name}()")
         if not isinstance(action_space, spaces.Box):
             raise self._error(f"action space {action_space}: a {kind} gives Box actions only")
-        sees_observation = hasattr(source, "predict") or callable(source)
-        if self._true_state is None and not sees_observation:
+        if self._true_state is None and not (hasattr(source, "predict") or callable(source)):
             raise self._error(
                 f"{kind} {source!r}: must be a function of observations or have "
                 "predict(observation), or actions(state) if the environment has true_state()"
@@ -137,8 +136,14 @@ class Controller:
             return present
         vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
         source = resolve_expert(expert, vehicle)
-        env_spaces = (env.action_space, env.observation_space)
-        controller = Controller(source, *env_spaces, true_state_of(env), kind="expert", env=env)
+        controller = Controller(
+            source,
+            env.action_space,
+            env.observation_space,
+            true_state_of(env),
+            kind="expert",
+            env=env,
+        )
         if isinstance(source, BaseAlgorithm):
             controller._raw = unwrap_vec_normalize(env)
         controller.made_for = (expert, env)

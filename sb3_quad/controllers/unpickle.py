@@ -89,7 +89,7 @@ def held(item: Any) -> Collection[Any]:
     return item if isinstance(item, (list, tuple, deque)) else ()
 
 
-# Functions that stand for those that SB3's pickles call, and for the methods that set a state.
+# Functions that stand for those that SB3's pickles call.
 
 
 def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> Any:
@@ -101,23 +101,10 @@ def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) ->
     return array.reshape(shape).transpose(axes)
 
 
-def _fill_array(array: Any, state: Any) -> None:
-    """Do what ``ndarray.__setstate__`` does, which itself trusts the state."""
-    _, shape, dtype, by_columns, content = state
-    values = _array(content, dtype, shape, "F" if by_columns is True else "C")
-    _, _, checked_state = values.__reduce__()
-    array.__setstate__(checked_state)
-
-
 def _dtype(code: Any, *_: Any) -> Any:
     """Make a dtype of numbers; an array of objects made of bytes would read memory as it likes."""
     _check(type(code) is str and re.fullmatch(r"[biufc]\d{1,2}", code) is not None, "a dtype")
     return np.dtype(code)
-
-
-def _check_dtype(dtype: Any, state: Any) -> None:
-    """Accept the state of a plain dtype in this machine's byte order, which it has already."""
-    _check(state[1:5] == (dtype.str[0], None, None, None), "a dtype")
 
 
 def _check_tensor(stored: Any, offset: Any, shape: Any, *_: Any) -> None:
@@ -306,11 +293,16 @@ class _Reader(pickle._Unpickler):
         kind = type(instance)
         self.walk(state)
         if isinstance(instance, np.dtype):
-            _check_dtype(instance, state)
+            # A plain dtype in this machine's byte order is so already.
+            _check(state[1:5] == (instance.str[0], None, None, None), "a dtype")
         elif kind is np.ndarray:
+            _, shape, dtype, by_columns, content = state
             # The content is copied.
-            self.steps.left -= len(state[-1]) // 128
-            _fill_array(instance, state)
+            self.steps.left -= len(content) // 128
+            # NumPy itself trusts the state of an array, but for one that an array has given.
+            values = _array(content, dtype, shape, "F" if by_columns is True else "C")
+            _, _, checked_state = values.__reduce__()
+            instance.__setstate__(checked_state)
         # None stands for random numbers; PyTorch notes versions at its OrderedDict.
         elif instance is not None and kind is not OrderedDict:
             _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")
@@ -324,24 +316,10 @@ class _Reader(pickle._Unpickler):
             if kind is Box:
                 _check(instance.low.shape == instance.high.shape == instance._shape, "a Box")
 
-    def skip_frame(self) -> None:
-        # It says how much to read at once.
-        self.read(8)
-
     def read_array(self) -> None:
         # Python's makes room for whatever size is named.
         size = int.from_bytes(self.read(8), "little")
         self.stack.append(bytearray(self.read(size)))
-
-    def drop(self) -> None:
-        # Python's would also take a mark, which no pickler writes.
-        self.stack.pop()
-
-    def append_item(self) -> None:
-        self.extend([self.stack.pop()])
-
-    def append_items(self) -> None:
-        self.extend(self.pop_mark())
 
     def extend(self, new: list[Any]) -> None:
         items = self.stack[-1]
@@ -353,9 +331,6 @@ class _Reader(pickle._Unpickler):
         key = self.stack.pop()
         self.update([key, value])
 
-    def set_items(self) -> None:
-        self.update(self.pop_mark())
-
     def update(self, new: list[Any]) -> None:
         items = self.stack[-1]
         keys = new[::2]
@@ -364,16 +339,18 @@ class _Reader(pickle._Unpickler):
         items.update(zip(keys, new[1::2], strict=True))
 
     dispatch: ClassVar[dict[int, Any]] = {
-        pickle.FRAME[0]: skip_frame,
+        # A frame says how much to read at once.
+        pickle.FRAME[0]: lambda self: self.read(8),
         pickle.BYTEARRAY8[0]: read_array,
-        pickle.POP[0]: drop,
+        # Python's would also take a mark, which no pickler writes.
+        pickle.POP[0]: lambda self: self.stack.pop(),
         pickle.REDUCE[0]: call,
         pickle.NEWOBJ[0]: make,
         pickle.BUILD[0]: change,
-        pickle.APPEND[0]: append_item,
-        pickle.APPENDS[0]: append_items,
+        pickle.APPEND[0]: lambda self: self.extend([self.stack.pop()]),
+        pickle.APPENDS[0]: lambda self: self.extend(self.pop_mark()),
         pickle.SETITEM[0]: set_item,
-        pickle.SETITEMS[0]: set_items,
+        pickle.SETITEMS[0]: lambda self: self.update(self.pop_mark()),
     }
 
 

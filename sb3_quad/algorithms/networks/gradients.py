@@ -6,7 +6,6 @@ In shapes, ``b`` is the mini-batch and ``a`` the action dimension.
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -15,7 +14,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from sb3_quad.algorithms.networks import losses
 from sb3_quad.algorithms.networks.losses import Loss
 from sb3_quad.algorithms.networks.perceptron import Perceptron
-from sb3_quad.base.types import Float32Array, FloatArray, IntArray
+from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, IntArray
 
 Terms = dict[str, float]
 """The terms of a loss without their weights, and ``loss``, their weighted sum, by logged name."""
@@ -30,7 +29,7 @@ class Batch(NamedTuple):
     """
 
     rows: IntArray
-    observations: npt.NDArray[Any]
+    observations: AnyArray
     targets: Float32Array
 
     def tensors(self, device: th.device) -> tuple[th.Tensor, th.Tensor]:
@@ -89,13 +88,14 @@ class Perceptrons(NamedTuple):
             loss = loss._replace(advantage_shift=float(advantages.mean()), advantage_scale=scale)
         observations = _flat(batch.observations)
         sums = self.actor.gradient(observations, batch.rows, batch.targets, loss, self.log_std)
+        means = sums / n
         terms: Terms = {}
         if loss.bc_coef != 0.0:
-            terms["bc_loss"] = sums[losses.CLONING] / n
+            terms["bc_loss"] = means[losses.CLONING]
         if loss.policy_coef != 0.0:
-            terms["policy_gradient_loss"] = sums[losses.POLICY] / n
-            terms["approx_kl"] = sums[losses.KL] / n
-            terms["clip_fraction"] = sums[losses.CLIPPED] / n
+            terms["policy_gradient_loss"] = means[losses.POLICY]
+            terms["approx_kl"] = means[losses.KL]
+            terms["clip_fraction"] = means[losses.CLIPPED]
         return terms
 
 
@@ -126,7 +126,7 @@ def network_of(policy: ActorCriticPolicy) -> Network:
     return network
 
 
-def mean_actions(network: Network, observations: npt.NDArray[Any]) -> Float32Array:
+def mean_actions(network: Network, observations: AnyArray) -> Float32Array:
     """Return the means of a policy's Gaussian, (b, a), without gradients."""
     if isinstance(network, Perceptrons):
         return network.actor(_flat(observations))
@@ -135,7 +135,7 @@ def mean_actions(network: Network, observations: npt.NDArray[Any]) -> Float32Arr
     return np.asarray(means.cpu().numpy())
 
 
-def state_values(network: Network, observations: npt.NDArray[Any]) -> Float32Array:
+def state_values(network: Network, observations: AnyArray) -> Float32Array:
     """Return V of observations, (b,), without gradients."""
     if isinstance(network, Perceptrons):
         return network.critic(_flat(observations))[:, 0]
@@ -170,7 +170,7 @@ class Pullback:
         if isinstance(self._network, Perceptrons):
             self._sums = self._network.actor.new_sums(n)
 
-    def __call__(self, observations: npt.NDArray[Any], by_actions: FloatArray) -> Float32Array:
+    def __call__(self, observations: AnyArray, by_actions: FloatArray) -> Float32Array:
         """Return the gradient by observations (n, ...), given that by the mean actions (n, a)."""
         given = by_actions.astype(np.float32)
         if isinstance(self._network, Perceptrons):
@@ -191,5 +191,5 @@ def _add(parameter: th.nn.Parameter, gradient: th.Tensor) -> None:
     parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
 
 
-def _flat(observations: npt.NDArray[Any]) -> Float32Array:
+def _flat(observations: AnyArray) -> Float32Array:
     return np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)

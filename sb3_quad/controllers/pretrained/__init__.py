@@ -33,10 +33,9 @@ def pretrained(name: str) -> Path:
 
     :raises ConfigError: an unknown name.
     """
-    path = FOLDER / f"{name}.zip"
     if name not in pretrained_names():
         raise ConfigError(unknown("pretrained policy", name, pretrained_names()))
-    return path
+    return FOLDER / f"{name}.zip"
 
 
 def load_pretrained(name: str, **kwargs: Any) -> "PPO":
