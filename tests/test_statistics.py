@@ -261,4 +261,4 @@ def test_a_pipeline_whose_stages_do_not_fit_is_refused_before_the_first(tmp_path
     with pytest.raises(ConfigError, match="stage 'two': normalize: must be as in"):
         stage_jobs(Pipeline(stages=[one, two]), {})
     with pytest.raises(ConfigError, match="stage 'one': correct_offset: flies without wrappers"):
-        stage_jobs(Pipeline(stages=[{**one, "correct_offset": "position"}]), {})
+        stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0}]), {})
