@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.results_plotter import load_results
 
 import sb3_quad
+from sb3_quad.base.errors import TrainingError
 from sb3_quad.cli import closing, main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.controllers.agent_settings import agent_settings
@@ -587,3 +588,21 @@ def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
         again.model.policy.parameters(), whole.model.policy.parameters(), strict=True
     ):
         assert torch.equal(ours, theirs)
+
+
+def test_closed_streams_cost_nothing(tmp_path, monkeypatch):
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    arguments = "evaluate pid --suite quick --scenario tracking --episodes 2 --no-report -o"
+    assert main([*arguments.split(), str(tmp_path)]) == 0
+    assert (tmp_path / "results.json").is_file()
+
+
+def test_a_training_whose_output_nobody_reads_says_so(tmp_path):
+    def report(line):
+        raise BrokenPipeError
+
+    config = build_config("dagger", ENV, SMALL_DAGGER)
+    job = TrainingJob(config=config, log_folder=str(tmp_path), eval_freq=400, eval_episodes=2)
+    with pytest.raises(TrainingError, match="reader of the output, has ended; the model after"):
+        train(job, report)

@@ -10,6 +10,7 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import LOCK, locked
+from sb3_quad.simulation.compiled import _CacheFile
 
 ROOT = Path(__file__).resolve().parent.parent
 WITHOUT_POSIX = """
@@ -102,3 +103,16 @@ def test_a_lock_refuses_a_second_process_and_ends_with_the_first(tmp_path):
     with locked(tmp_path, "run folder"):
         assert [path.name for path in tmp_path.iterdir()] == [LOCK]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_compiled_code_that_a_crash_left_broken_counts_as_missing(tmp_path, suffix, share):
+    cache = _CacheFile(str(tmp_path), "kernel", "stamp of the sources")
+    for _ in range(2):
+        cache.save("key", ("compiled", "code"))
+        assert cache.load("key") == ("compiled", "code")
+        (path,) = tmp_path.glob(f"*.{suffix}")
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+        assert cache.load("key") is None

@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import os
 import pkgutil
 import sys
 import traceback
@@ -40,6 +41,7 @@ exit codes:
        on stderr says what (--traceback after the command shows where)
   129  the terminal was closed (SIGHUP), after saving
   130  interrupted by Ctrl-C, after saving
+  141  nobody reads the output any more, as in sb3-quad sweep ... | head -1
   143  interrupted by SIGTERM, after saving
 """
 COMMANDS = {
@@ -69,6 +71,10 @@ def make_parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    # A closed stream, as after `>&-`, is None. Its number must not go to a file that opens next.
+    for name in ("stdout", "stderr"):
+        if not getattr(sys, name):
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     # Lines appear at once, also in a pipe. Letters that the console lacks become question marks.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True, errors="replace")
@@ -87,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # The reader has ended, as in `sb3-quad train --help | head`.
         sys.stderr.close()
-        return 0
+        return 141
     except (Exception, SystemExit) as error:
         # A user's environment or callback, or a fault of this package, may raise anything.
         if "--traceback" in arguments:

@@ -6,12 +6,14 @@ import functools
 import hashlib
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numba
 from numba import types
 from numba.core import event
+from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic
 
 from sb3_quad.base.process import print_once
@@ -42,8 +44,23 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
             " set NUMBA_CACHE_DIR to a folder"
         )
     else:
-        dispatcher._cache._cache_file._source_stamp = _source_stamp()
+        cache_file = dispatcher._cache._cache_file
+        cache_file._source_stamp = _source_stamp()
+        cache_file.__class__ = _CacheFile
     return dispatcher
+
+
+class _CacheFile(IndexDataCacheFile):
+    """Takes files that a crash or a full disk left broken for missing ones."""
+
+    def _load_index(self) -> Any:
+        with suppress(Exception):
+            return super()._load_index()
+        return {}
+
+    def load(self, key: Any) -> Any:
+        with suppress(Exception):
+            return super().load(key)
 
 
 @functools.cache

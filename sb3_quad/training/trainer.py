@@ -370,10 +370,13 @@ class _Training:
         write_text(self.run.error, "".join(traceback.format_exception(error)))
         where += f"; the traceback is in {self.run.error}"
         if isinstance(error, (EOFError, ConnectionError)):
-            raise TrainingError(f"{WORKER_ENDED}{where}") from error
-        if isinstance(error, ValueError) and not all(
-            th.isfinite(parameter).all() for parameter in self.model.policy.parameters()
-        ):
+            # Without workers it may be the reader of the output, as in `sb3-quad train | head`.
+            reason = "a connection, or the reader of the output, has ended"
+            if self.job.config.vec_env == "subproc":
+                reason = WORKER_ENDED
+            raise TrainingError(reason + where) from error
+        parameters = self.model.policy.parameters()
+        if isinstance(error, ValueError) and not all(th.isfinite(p).all() for p in parameters):
             raise TrainingError(
                 f"the policy's parameters are no longer finite; lower learning_rate{where}"
             ) from error
