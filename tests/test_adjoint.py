@@ -69,7 +69,8 @@ class LinearCost:
         self.observations = np.zeros((steps + 1, n, size), np.float32)
         if observed:
             weights = generator.standard_normal((steps, n, size))
-            self.observations[:-1] = np.where(tape.acts[:, :, None], weights, 0.0)
+            acts = np.arange(tape.n_steps)[:, None] < tape.lengths
+            self.observations[:-1] = np.where(acts[:, :, None], weights, 0.0)
 
     def __call__(self, states, actions, counts):
         """As the tape takes it."""

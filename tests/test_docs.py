@@ -71,7 +71,8 @@ def shorten_trainings(monkeypatch, rollouts=1):
 
     def short(self, total_timesteps, *args, **kwargs):
         size = min(total_timesteps, rollouts * self.n_steps * self.n_envs)
-        learn(self, size, *args, **{**kwargs, "progress_bar": False})
+        kwargs.pop("progress_bar", None)
+        learn(self, size, *args[:4], **kwargs, progress_bar=False)
         weights = [tensor.tolist() for tensor in self.policy.state_dict().values()]
         trained.append((total_timesteps, weights))
         return self

@@ -62,7 +62,7 @@ def import_factory(text: str, kind: str = "expert") -> Any:
     """
     location = EXPERTS.get(text, text)
     if ":" not in location:
-        if Path(text).is_dir():
+        if text and Path(text).is_dir():
             raise ConfigError(f"{kind} {text}: no run with an agent in this folder")
         valid = [*EXPERTS, *pretrained_names()]
         raise ConfigError(

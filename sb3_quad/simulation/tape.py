@@ -70,8 +70,8 @@ class FlightTape:
         observations = batch.reset(np.flatnonzero(self.lost) if carry_on else None)
         # A rotor must not overshoot its commanded speed because the physics steps are long.
         vehicles = batch.vehicles
-        gains = np.maximum(vehicles[P.motor_gain_up], vehicles[P.motor_gain_down])
-        fastest = float((gains * (vehicles[P.exact_motors] == 0.0)).max())
+        gains = vehicles[[P.motor_gain_up, P.motor_gain_down]]
+        fastest = (gains * (1.0 - vehicles[P.exact_motors])).max()
         if fastest * self.physics_step > 1.0:
             raise ConfigError(
                 f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
@@ -89,7 +89,8 @@ class FlightTape:
 
         :param actions: float32 (n, 4); in flight they are clipped to [-1, 1], here they are not.
         """
-        batch, t = self.batch, self._at
+        batch = self.batch
+        t = self._at
         self.states[t] = batch.state
         self.actions[t] = actions
         self._integrals[t] = batch.integral
@@ -111,15 +112,10 @@ class FlightTape:
         """
         return (np.arange(1, self.n_steps + 1)[:, None] < self.lengths) | ~self.lost
 
-    @property
-    def acts(self) -> BoolArray:
-        """Whether each row has flown each control step, (n_steps, n)."""
-        return np.arange(self.n_steps)[:, None] < self.lengths
-
     def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return the sum of each row's rewards, its length, and whether it was lost, (n,) each."""
-        rewards = np.where(self.acts, self.rewards, 0.0).sum(axis=0)
-        return rewards, self.lengths, self.lost
+        flown = np.arange(self.n_steps)[:, None] < self.lengths
+        return (self.rewards * flown).sum(axis=0), self.lengths, self.lost
 
     def begin(self, cost: FlightCost) -> float:
         """Begin the way back; return the mean cost of a control step."""

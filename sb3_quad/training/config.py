@@ -378,7 +378,8 @@ def build_config(
     check_environment(env_id)
     settings = with_vehicle_paths(settings)
     # The default is written out, so that config.yml names the expert. Flights of a file need none.
-    if takes_expert(algorithm) and not (settings.get("expert") or settings.get("demonstrations")):
+    needs_expert = takes_expert(algorithm) and not settings.get("demonstrations")
+    if needs_expert and settings.get("expert") is None:
         settings["expert"] = DEFAULT_EXPERT
 
     def source(key: str) -> str:
