@@ -1,5 +1,7 @@
 """Actions in other units than [-1, 1]: losses, labels and new actors in half ranges."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_quad import PPOBC, DAgger
 from sb3_quad.algorithms import dagger, ppo_bc
@@ -35,7 +38,8 @@ class Height(gym.Env):
         return self.state.astype(np.float32), {}
 
     def step(self, action):
-        low, high = self.action_space.low[0], self.action_space.high[0]
+        space: Any = self.action_space
+        low, high = space.low[0], space.high[0]
         push = 2.0 * (float(action[0]) - low) / (high - low) - 1.0
         self.state[1] += 0.3 * push
         self.state[0] += 0.1 * self.state[1]
@@ -155,7 +159,7 @@ class OddLayer(th.nn.Module):
         return latent[:, :2]
 
 
-class OddPolicy(PPO.policy_aliases["MlpPolicy"]):
+class OddPolicy(ActorCriticPolicy):
     """Gives two of its hidden units as actions."""
 
     def _build(self, lr_schedule):

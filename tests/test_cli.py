@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import publish
@@ -583,7 +584,8 @@ def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
     interrupted = train(job(tmp_path, **cloned), report=lambda line: None)
     (tmp_path / "flights.npz").unlink()
     again = resume(str(interrupted.run.path), report=lambda line: None)
-    assert len(again.model.dataset) == 200
+    model: Any = again.model
+    assert len(model.dataset) == 200
     for ours, theirs in zip(
         again.model.policy.parameters(), whole.model.policy.parameters(), strict=True
     ):

@@ -3,6 +3,7 @@
 import pickle
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,7 +64,8 @@ def run(tmp_path_factory):
 
 
 def statistics(path):
-    return load_model(path).vec_normalize.obs_rms
+    model: Any = load_model(path)
+    return model.vec_normalize.obs_rms
 
 
 def test_evaluations_are_those_of_the_saved_agent(run):
@@ -84,7 +86,7 @@ def test_evaluations_are_those_of_the_saved_agent(run):
 def test_stock_sb3_reads_what_rl_zoo3_would_have_left(run):
     file = run.config.with_name("vecnormalize.pkl")
     plain = QuadcopterVecEnv(EPISODES, max_episode_steps=60, noise=0.0)
-    env = VecNormalize.load(str(file), plain)
+    env: Any = VecNormalize.load(str(file), plain)
     env.training = False
     env.norm_reward = False
     env.seed(seed_for("evaluation", 0))
@@ -182,7 +184,8 @@ def test_an_agent_goes_on_with_its_statistics_or_is_refused(run, tmp_path):
     settings = {**SETTINGS, "n_timesteps": 400}
     del settings["gradient_steps"]
     following = job(tmp_path, "ppo_bc", settings, trained_agent=str(run.model))
-    with closing(make_environments(following.config, 8, 0)) as env:
+    made: Any = make_environments(following.config, 8, 0)
+    with closing(made) as env:
         build_model(following, env)
         np.testing.assert_array_equal(env.obs_rms.mean, statistics(run.model).mean)
         assert env.training
@@ -196,8 +199,8 @@ def test_an_agent_goes_on_with_its_statistics_or_is_refused(run, tmp_path):
 
 
 def test_best_model_freezes_and_synchronises_the_environments_of_a_user():
-    env = VecNormalize(QuadcopterVecEnv(4, seed=0))
-    held = VecNormalize(VecMonitor(QuadcopterVecEnv(4, max_episode_steps=20)))
+    env: Any = VecNormalize(QuadcopterVecEnv(4, seed=0))
+    held: Any = VecNormalize(VecMonitor(QuadcopterVecEnv(4, max_episode_steps=20)))
     model = PPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=1, device="cpu")
     best = BestModel(held, 64, 4, 0, by="survival")
     model.learn(64, callback=best)

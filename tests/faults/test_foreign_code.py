@@ -365,7 +365,7 @@ def test_spaces_of_gym_are_read_as_gymnasium_s():
     model, foreign = load_model(AGENT), AGENT
     for key in ("action_space", "observation_space"):
         space = copy.deepcopy(getattr(model, key))
-        space._np_random = Calls(np.random._pickle.__randomstate_ctor, "MT19937")
+        space._np_random = Calls(vars(np.random)["_pickle"].__randomstate_ctor, "MT19937")
         content = pickle.dumps(space, protocol=3).replace(b"gymnasium.spaces", b"gym.spaces")
         foreign = foreign_zip(key, foreign, f"{key}.zip", content)
     ours = load_model(foreign)
