@@ -149,7 +149,12 @@ def test_the_example_builds_the_observation_that_the_package_builds(name, tmp_pa
     model = PPO.load(path, device="cpu")
     settings = {**sb3_quad.env_kwargs(path), "noise": 0.0, "vehicles": None}
     env = QuadcopterVecEnv(
-        1, "state_recovery", {"velocity_std": 1.0}, max_episode_steps=1000, seed=3, **settings
+        1,
+        "state_recovery",
+        task_kwargs={"velocity_std": 1.0},
+        max_episode_steps=1000,
+        seed=3,
+        **settings,
     )
     observation, action = (
         runpy.run_path(str(EXAMPLE))["Observation"](model.flight_settings),

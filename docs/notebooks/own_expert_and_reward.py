@@ -179,7 +179,11 @@ class CalmActions(VecEnvWrapper):
 def make_env(n_envs, seed):
     """Flights to targets 10 m away, where tilts and restless rotors cost more."""
     env = QuadcopterVecEnv(
-        n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed
+        n_envs,
+        "target_tracking",
+        task_kwargs={"tilt_cost": 0.004},
+        max_episode_steps=500,
+        seed=seed,
     )
     return CalmActions(env, cost=2.0)
 
