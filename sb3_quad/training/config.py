@@ -450,12 +450,13 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
     observed = own.observed
-    del observed["rotor_layout"], observed["position_integral"]
+    del observed["rotor_layout"]
+    integral = observed.pop("position_integral")
     adopted = {
         **changes,
         "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
         # The changes to these are in the settings already.
-        "eval_env_kwargs": {"position_integral": own.position_integral, **config.eval_env_kwargs},
+        "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
     }
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
