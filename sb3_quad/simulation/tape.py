@@ -56,7 +56,6 @@ class FlightTape:
         # Control steps that each row has flown, and whether it crashed or left the range then
         self.lengths = np.full(n, n_steps)
         self.lost = np.ones(n, np.bool_)
-        self._at = 0
         self._integrals = np.zeros((n_steps, *batch.integral.shape))
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
         self._winds = np.zeros((n_steps, *batch.wind.shape))
