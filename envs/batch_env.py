@@ -17,6 +17,7 @@ from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.references import Motion, Reference
 from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.state import TARGET, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec
@@ -51,6 +52,8 @@ class FlightKeywords(TypedDict, total=False):
     position_integral: StrMapping | PositionIntegral | None
     vehicles: StrMapping | VehicleDistribution | None
     randomize: StrMapping | Randomization | None
+    preview: Sequence[int] | None
+    reference: str | StrMapping | Reference | Motion | None
     max_episode_steps: int | Sequence[int]
 
 
@@ -114,8 +117,44 @@ class BatchEnv:
         :param position: r_T, (3,) for all these rows or (rows, 3), world frame, m.
         :raises ConfigError: a wrong shape, or a number that is not finite.
         """
+        self.set_reference(position, indices=indices)
+
+    def set_reference(
+        self,
+        position: npt.ArrayLike,
+        velocity: npt.ArrayLike = (0.0, 0.0, 0.0),
+        acceleration: npt.ArrayLike = (0.0, 0.0, 0.0),
+        heading: npt.ArrayLike | None = None,
+        heading_rate: npt.ArrayLike = 0.0,
+        indices: Rows = None,
+    ) -> None:
+        """Set what these rows should do now: a position, how it moves, and a heading.
+
+        It stays so until you set another one or their episode ends, and does not move by itself:
+        call it before each step. A curve of the environment's ``reference`` ends with it.
+
+        :param position: (3,) for all these rows or (rows, 3), world frame, m.
+        :param velocity: likewise, m/s.
+        :param acceleration: likewise, m/s².
+        :param heading: of the body's x axis from the world's, one number or one for each of these
+            rows, rad. None: nothing is asked of it.
+        :param heading_rate: likewise, rad/s.
+        :raises ConfigError: a wrong shape, or a number that is not finite.
+        """
         rows = self.batch.rows(indices)
-        self.batch.state[TARGET, rows] = per_row("target", position, rows.size, 3)
+        n = rows.size
+        parts = [
+            per_row("position", position, n, 3),
+            per_row("velocity", velocity, n, 3),
+            per_row("acceleration", acceleration, n, 3),
+            np.zeros((2, n)),
+            np.zeros((1, n)),
+        ]
+        if heading is not None:
+            angle = per_row("heading", heading, n)[0]
+            parts[3] = np.stack([np.cos(angle), np.sin(angle)])
+            parts[4] = per_row("heading_rate", heading_rate, n)
+        self.batch.set_reference(np.concatenate(parts), rows)
 
     def set_wrench(
         self,

@@ -18,8 +18,8 @@ from sb3_quad.simulation.state import (
     FORCE_WORLD,
     POSITION,
     QUATERNION,
+    REFERENCE,
     ROTOR_SPEEDS,
-    TARGET,
     TORQUE_BODY,
     TORQUE_WORLD,
     VELOCITY,
@@ -168,7 +168,7 @@ class Observer:
         n = batch.n
         self.settings = batch.observation
         self.numbers = batch.integral_numbers
-        self.target = th.tensor(batch.state[TARGET].T)
+        self.refer(batch)
         scaling = th.tensor(np.broadcast_to(batch.scaling, (len(batch.scaling), n)).T.copy())
         # The compiled code keeps these in float32.
         scaling = scaling.float()
@@ -186,14 +186,28 @@ class Observer:
             frame[age > began] = 0.0
             self.frames.insert(0, th.tensor(frame).double())
 
+    def refer(self, batch):
+        """Take over where a batch's references are, and what it sees of their future."""
+        reference = th.tensor(batch.state[REFERENCE].T)
+        self.target, self.target_velocity = reference[:, 0:3], reference[:, 3:6]
+        cosine, sine = reference[:, 9], reference[:, 10]
+        cosine = cosine + ((cosine == 0.0) & (sine == 0.0))
+        zero = th.zeros_like(sine)
+        rows = [th.stack([cosine, -sine, zero], 1), th.stack([sine, cosine, zero], 1)]
+        up = th.stack([zero, zero, zero + 1.0], 1)
+        self.from_heading = th.stack([*rows, up], 1)
+        self.turning = up * reference[:, 11:]
+        size = len(self.settings.ages) * self.settings.frame_size
+        self.preview = th.tensor(batch.observe()).double()[:, size:]
+
     def features(self, state):
         """Return the features without noise, in their units, (n, 18)."""
         to_body = rotation(state.quaternion).transpose(1, 2)
         parts = [
-            state.position - self.target,
-            to_body.flatten(1),
-            turn(to_body, state.velocity),
-            state.body_rates,
+            turn(self.from_heading.transpose(1, 2), state.position - self.target),
+            (to_body @ self.from_heading).flatten(1),
+            turn(to_body, state.velocity - self.target_velocity),
+            state.body_rates - turn(to_body, self.turning),
         ]
         return th.cat(parts, dim=1)
 
@@ -222,7 +236,8 @@ class Observer:
         if self.settings.last_action:
             scaled = th.cat([scaled, action.clamp(-1.0, 1.0)], dim=1)
         self.frames.append(scaled)
-        return th.cat([self.frames[-1 - age] for age in self.settings.ages], dim=1)
+        frames = [self.frames[-1 - age] for age in self.settings.ages]
+        return th.cat([*frames, self.preview], dim=1)
 
 
 def noise_of(batch):
@@ -267,6 +282,7 @@ def fly(batch, act, steps, substeps, start=None):
             state = vehicles.physics_step(state, wanted, wrench, wind, dt)
         # The batch flies along for its random numbers.
         batch.step_on(action.detach().numpy(), substeps)
+        observer.refer(batch)
         states.append(state.flat())
         actions.append(action)
         observations.append(observer.look(state, action, noise_of(batch)))

@@ -168,6 +168,14 @@ SEEN = {
     ),
     "observation_mean": st.just(np.linspace(-0.5, 0.5, 18).tolist()),
     "observation_std": st.just(np.linspace(0.5, 6.0, 18).tolist()),
+    "preview": st.just([0, 3, 20]),
+    "reference": st.sampled_from(
+        [
+            "figure_eight",
+            {"curve": "circle", "heading": "path"},
+            {"curve": "random_smooth", "heading": "random", "heading_rate": 2.0},
+        ]
+    ),
 }
 DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
 
@@ -192,6 +200,19 @@ DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
     steps=30,
     substeps=2,
     seed=0,
+)
+@example(
+    vehicle={},
+    randomize={"delay": [0, 3]},
+    seen={
+        "reference": {"curve": "random_smooth", "heading": "random", "heading_rate": 2.0},
+        "preview": [0, 5],
+        "history": [0, 2],
+        "last_action": True,
+    },
+    steps=40,
+    substeps=2,
+    seed=1,
 )
 def test_flights_and_gradients_are_those_of_autograd(
     vehicle, randomize, seen, steps, substeps, seed
@@ -411,6 +432,7 @@ def test_apg_follows_the_gradient_of_the_flight_and_the_policy_together(activati
         env,
         n_steps=steps,
         max_grad_norm=1e9,
+        max_row_ratio=1e9,
         policy_kwargs={"net_arch": [17, 16], "activation_fn": activation},
         seed=0,
         device="cpu",
@@ -426,11 +448,13 @@ def test_apg_follows_the_gradient_of_the_flight_and_the_policy_together(activati
     batch = env.batch
     batch.restore(start.kept)
     batch.reset()
-    target = th.tensor(batch.state[MOVING:].T).expand(steps, n, 3)
+    reference = th.tensor(batch.state[MOVING:].T).expand(steps, n, -1)
     flight = fly(batch, lambda _, seen: actor(seen), steps, model.substeps)
     parts = State.of(flight.states.movedim(2, 0).flatten(1))
     parts = [part.unflatten(0, (steps, n)) for part in parts]
-    flight_cost(FlownStates._make([*parts, target, flight.actions])).mean().backward()
+    flight_cost(
+        FlownStates._make([*parts, *reference.split([3, 3, 3, 2, 1], 2), flight.actions])
+    ).mean().backward()
     beyond = (flight.actions.abs() > 1.0).double().mean()
     assert 0.02 < beyond < 0.7
 

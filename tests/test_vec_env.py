@@ -515,7 +515,7 @@ def test_bad_actions_are_refused_and_change_nothing():
 @pytest.mark.parametrize(
     ("method", "arguments", "says"),
     [
-        ("set_target", [(1, 2)], r"target of shape \(2,\)"),
+        ("set_target", [(1, 2)], r"position of shape \(2,\)"),
         ("set_target", [(1, 2, np.nan)], "finite"),
         ("set_wrench", [(1, 2, 3, 4)], "force of shape"),
         ("set_wrench", [(1, 2, 3), (0, 0, 0), "earth"], "force_frame 'earth'"),

@@ -88,6 +88,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         a fiftieth.
     :param n_steps: Control steps of each flight in an update. Whole flights take some 300.
     :param max_grad_norm: The gradient is scaled down to this length where it is longer.
+    :param max_row_ratio: At each step the gradient by the actions of an environment is scaled down
+        to this many times the median length over all of them, since a few flights on the verge of
+        chaos would outweigh the others.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. From scratch, whole flights learn badly: clone an expert first (DAgger), or
         fly short windows with ``carry_on``.
@@ -119,6 +122,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         device: th.device | str = "auto",
         *,
         initial_policy: BaseAlgorithm | StrPath | None = None,
+        max_row_ratio: float = 3.0,
         carry_on: bool = False,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         substeps: int | None = 2,
@@ -148,6 +152,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             supported_action_spaces=(spaces.Box,),
             _init_setup_model=False,
         )
+        self.max_row_ratio = max_row_ratio
         self.carry_on = carry_on
         self.cost = cost
         self.substeps = substeps
@@ -237,7 +242,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         network = Pullback(self.policy, self.n_envs)
         by_observations = np.zeros_like(self._observations[0])
         for step in reversed(range(self.n_steps)):
-            by_actions = tape.backward(step, by_observations)
+            by_actions = self._limited(tape.backward(step, by_observations))
             by_observations = network(self._observations[step], by_actions)
 
         network.set_gradients()
@@ -252,3 +257,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self._n_updates += 1
 
         self._log_update({"cost": [cost], "gradient_norm": [float(norm)]})
+
+    def _limited(self, gradients: FloatArray) -> FloatArray:
+        """Return gradients (n, a), the longest shortened to ``max_row_ratio`` times the median."""
+        lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
+        # Rows that were lost have none.
+        present = lengths[lengths > 0.0]
+        if present.size == 0:
+            return gradients
+        longest = self.max_row_ratio * np.median(present)
+        return gradients * (longest / np.maximum(lengths, longest))

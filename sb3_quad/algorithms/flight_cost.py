@@ -13,6 +13,8 @@ COARSE, FINE = 0.5, 0.05
 # Weight of the body rates at the target. Without it an agent oscillates there with delays or motors
 # that it has not seen often.
 CALM = 0.03
+# Weight of the heading's error, rad, where one is asked for
+HEADING = 0.1
 # Below this height, m, a flight is in danger.
 LOW = 1.5
 
@@ -28,7 +30,11 @@ class FlownStates(NamedTuple):
     velocity: th.Tensor  # (..., 3), m/s
     body_rates: th.Tensor  # (..., 3), body frame, rad/s
     rotor_speeds: th.Tensor  # (..., 4), rad/s
-    target: th.Tensor  # (..., 3), m
+    target: th.Tensor  # (..., 3), m: the position of the reference
+    target_velocity: th.Tensor  # (..., 3), m/s
+    target_acceleration: th.Tensor  # (..., 3), m/s²
+    target_heading: th.Tensor  # (..., 2), cosine and sine; zeros where none is asked for
+    target_heading_rate: th.Tensor  # (..., 1), rad/s
     actions: th.Tensor  # (..., 4), before they are clipped to [-1, 1]
 
     @property
@@ -40,6 +46,17 @@ class FlownStates(NamedTuple):
     def r33(self) -> th.Tensor:
         """The cosine of the tilt."""
         return 1.0 - 2.0 * self.quaternion[..., 1:3].square().sum(dim=-1)
+
+    @property
+    def heading_error(self) -> th.Tensor:
+        """2 sin(e / 2) of the angle e between the heading and the one that is asked for, if any,
+        and 0 if none is; the vehicle's nose is projected on the ground.
+        """
+        w, x, y, z = self.quaternion.unbind(dim=-1)
+        nose = th.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], dim=-1)
+        nose = nose / (nose.square().sum(dim=-1, keepdim=True) + 1e-6).sqrt()
+        asked = self.target_heading
+        return length(asked - nose * asked.square().sum(dim=-1, keepdim=True))
 
 
 def cost_and_gradients(
@@ -71,13 +88,14 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     The distance costs d / (d + 0.5) + d / (d + 0.05), which is steep in the last metre and flat
     far away, so that no target is too far to matter. Body rates cost little on the way, and more
     within half a metre of the target. Small terms stand against a tilt and against actions beyond
-    their limits. Below a height of 1.5 m the ground costs, since the crash itself has
-    no gradient.
+    their limits, and against another heading than the one that is asked for. Below a height of
+    1.5 m the ground costs, since the crash itself has no gradient.
     """
     d = flown.distance
     cost = d / (d + COARSE) + d / (d + FINE)
     weight = 0.002 + CALM / (1.0 + (d / COARSE) ** 2)
     cost = cost + weight * length(flown.body_rates) + 0.001 * (1.0 - flown.r33)
+    cost = cost + HEADING * flown.heading_error
     beyond = flown.actions - flown.actions.clamp(-1.0, 1.0)
     cost = cost + 0.01 * beyond.square().sum(dim=-1)
     return cost + 0.5 * (LOW - flown.position[..., 2]).clamp(min=0.0)

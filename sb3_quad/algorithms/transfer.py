@@ -12,10 +12,11 @@ from stable_baselines3.common.utils import update_learning_rate
 from sb3_quad.algorithms.buffers import AggregatedDataset
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
-from sb3_quad.base.types import StrPath
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.statistics import share_statistics, statistics_of
 from sb3_quad.controllers.zips import load_model
+from sb3_quad.simulation.settings import KEY
 
 
 def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> None:
@@ -56,6 +57,7 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
     share_statistics(statistics_of(teacher), model.get_env(), training=True)
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{name}: holds parameters that are not finite")
+    _add_preview(theirs, ours, getattr(model, KEY, {}))
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:
         theirs["log_std"] = ours["log_std"]
     try:
@@ -66,6 +68,16 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
             f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
             " train takes them from it unless --conf-file is given"
         ) from None
+
+
+def _add_preview(theirs: StrDict, ours: StrDict, settings: StrMapping) -> None:
+    """Let parameters read a ``preview`` that their agent did not have, by weights of zero, in
+    place.
+    """
+    added = 3 * len(settings.get("preview") or ())
+    for name, weights in theirs.items():
+        if name in ours and weights.ndim == 2 and ours[name].shape[1] == weights.shape[1] + added:
+            theirs[name] = th.nn.functional.pad(weights, (0, added))
 
 
 # At least so many states are flown for a clone, and so many steps in each environment.

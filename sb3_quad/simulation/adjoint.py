@@ -12,7 +12,7 @@ keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as
 import math
 
 from sb3_quad.simulation.compiled import LANES, compiled
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
+from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, heading_of
 from sb3_quad.simulation.physics import (
     fly,
     four,
@@ -216,6 +216,26 @@ def undo_noise(b, by_feature):
                 both = math.sqrt(relative * relative + fixed * fixed)
                 slope = 1.0 + noise * level * relative / both
             by_feature[k, lane] *= slope * b.inverse_std[k, lane]
+
+
+@compiled(fastmath=True)
+def undo_relation(b, by_feature):
+    """Undo what :func:`.observation.features` does for a reference that moves, in place."""
+    f = by_feature
+    for lane in range(LANES):
+        cosine, sine = heading_of(b, lane)
+        rate = b.target_heading_rate[0, lane]
+        for row in range(3):
+            k = F.rotation + 3 * row
+            x, y = f[k, lane], f[k + 1, lane]
+            f[k, lane] = cosine * x - sine * y
+            f[k + 1, lane] = sine * x + cosine * y
+            f[k + 2, lane] -= rate * f[F.body_rates + row, lane]
+            for axis in range(3):
+                f[k + axis, lane] -= b.target_velocity[axis, lane] * f[F.velocity + row, lane]
+        x, y = f[F.position, lane], f[F.position + 1, lane]
+        f[F.position, lane] = cosine * x - sine * y
+        f[F.position + 1, lane] = sine * x + cosine * y
 
 
 @compiled(fastmath=True)

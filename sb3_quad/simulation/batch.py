@@ -26,10 +26,12 @@ from sb3_quad.simulation.kernel import (
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.references import NO_TRACKS
 from sb3_quad.simulation.sampling import GUST_SIZE, GUST_VALUE
 from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import (
     FORCE_WORLD,
+    REFERENCE,
     STATE_SIZE,
     WRENCH_SIZE,
     P,
@@ -38,6 +40,7 @@ from sb3_quad.simulation.state import (
 )
 from sb3_quad.simulation.tasks import resolve_tasks
 from sb3_quad.simulation.threads import share_out
+from sb3_quad.simulation.tracks import COURSE_SIZE, C
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -61,6 +64,7 @@ _KEPT = (
     "wind_gust",
     "frames",
     "integral",
+    "course",
 )
 
 
@@ -125,6 +129,16 @@ class QuadcopterBatch:
         self.integral = np.zeros((3 * bool(integral), n))
         self.integral_numbers = np.array((integral or PositionIntegral()).numbers(control_step))
         self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
+
+        # An array without columns stands for targets that rest.
+        tracks = (
+            NO_TRACKS if settings.reference is None else settings.reference.tracks(control_step)
+        )
+        self.moves = settings.reference is not None
+        self.tracks = tracks.table
+        self.track_numbers = tracks.numbers()
+        self.course = np.zeros((COURSE_SIZE, n * self.moves))
+        self.previews = np.array(self.observation.preview or (), dtype=np.int64)
 
         tasks = resolve_tasks(settings.task, settings.task_kwargs)
         self.task_parameters, self.task_weights = tasks
@@ -364,6 +378,15 @@ class QuadcopterBatch:
                 )
         for name, array in snapshot.items():
             getattr(self, name)[...] = array
+
+    def set_reference(self, reference: FloatArray, rows: IntArray) -> None:
+        """Let rows follow what they are told, (REFERENCE_SIZE, rows), from now on."""
+        self.state[REFERENCE, rows] = reference
+        if self.course.size:
+            self.course[C.begin, rows] = -1.0
+        if not self.moves and reference[3:].any():
+            self.moves = True
+            self._bind()
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a

@@ -56,6 +56,8 @@ class ObservationSettings(Frozen):
     """ages of the frames, control steps, such as [0, 1, 2, 4]; zeros before the episode"""
     position_integral: PositionIntegral | None = None
     """fields of PositionIntegral; {} for its defaults"""
+    preview: tuple[Age, ...] | None = None
+    """control steps ahead, such as [0, 5, 10, 20], whose acceleration of the reference is seen"""
 
     @field_validator("history")
     @classmethod
@@ -67,6 +69,13 @@ class ObservationSettings(Frozen):
             raise ValueError(
                 f"{list(value)}: must rise from 0, the present frame, to at most {MAX_AGE}"
             )
+        return value
+
+    @field_validator("preview")
+    @classmethod
+    def _looks_ahead(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
+        if value is not None and not all(0 <= ahead <= MAX_AGE for ahead in value):
+            raise ValueError(f"{list(value)}: must be of 0 to {MAX_AGE} control steps")
         return value
 
     @property
@@ -82,7 +91,7 @@ class ObservationSettings(Frozen):
     @property
     def size(self) -> int:
         """Numbers in an observation."""
-        return len(self.ages) * self.frame_size
+        return len(self.ages) * self.frame_size + 3 * len(self.preview or ())
 
     @property
     def is_extended(self) -> bool:

@@ -56,6 +56,7 @@ from sb3_quad.simulation.state import (
 )
 from sb3_quad.simulation.tasks import SCORED, T
 from sb3_quad.simulation.threads import DONE, LEFT, finish
+from sb3_quad.simulation.tracks import follow, observe_preview
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 CHUNK = 2 * LANES  # rows that a thread takes at once
@@ -145,6 +146,8 @@ def _block_type() -> Any:
         for name, part in row_slices(sizes).items():
             aliases.append((whole, name, part.start, sizes[name]))
     aliases += [("scored", name, row, ()) for row, name in enumerate(SCORED)]
+    # The state with a target that rests
+    aliases.append(("state", "resting", 0, X.target_velocity))
     for whole, name, row, shape in aliases:
         # Rows of the whole, float64, from one row on
         place = fields[whole][1] + 8 * LANES * row
@@ -163,6 +166,7 @@ def step(
     gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations,
+    moves, course, tracks, track_numbers, previews,
     physics_step, substeps, own_delays, autoreset,
 ):  # fmt: skip
     """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
@@ -200,6 +204,10 @@ def step(
     :param limits: int64 (n,), control steps of the episodes under way; ``max_steps`` (n,), of those
         that follow.
     :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
+    :param moves: whether targets move or have a heading; without it their rows of the state behind
+        the position are not read.
+    :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, as for ``tracks`` and
+        ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
     :param own_delays: whether delays differ by row.
     :param autoreset: whether a row that ends begins its next episode within the same step.
@@ -241,7 +249,10 @@ def step(
                 b, first, count, False, scaling, vehicles, task_index, task_parameters,
                 physics_step,
             )  # fmt: skip
-            load_rows(state, first, count, b.state)
+            if moves:
+                load_rows(state, first, count, b.state)
+            else:
+                load_rows(state, first, count, b.resting)
             if mode == FLY:
                 # Gusts add to what was set or sampled.
                 load_rows(wrench, first, count, b.wrench)
@@ -253,12 +264,14 @@ def step(
                 for k in range(X.target):
                     for lane in range(count):
                         state[k, first + lane] = b.state[k, lane]
+            if tracks.shape[0] > 0:
+                follow(b, first, count, state, streams, course, tracks, track_numbers)
             score(b)
             # The noise of the observation is that of the next step.
             for lane in range(count):
                 streams[STEP, first + lane] += np.uint32(1)
             load_rows(streams, first, count, b.stream)
-            observe(b)
+            observe(b, moves)
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)
             if wind_gust.shape[1] > 0:
@@ -273,6 +286,8 @@ def step(
                     if integral.shape[0] > 0:
                         integrate_position(b, i, lane, integral_numbers, integral)
             _write_observations(b, count, integral, ages, frames, observations)
+            if previews.size > 0:
+                observe_preview(b, count, previews, course, tracks, track_numbers, observations)
             ended = _end_episodes(
                 b, first, count, autoreset, observations, rewards, dones, returns, limits,
                 outcome, last_observations,
@@ -299,8 +314,9 @@ def step(
                     wrench, gust, wind, wind_gust,
                 )  # fmt: skip
                 start_episode(
-                    i, state, queue, streams, task_index, vehicles, task_parameters, task_weights
-                )
+                    i, state, queue, streams, task_index, vehicles, task_parameters, task_weights,
+                    course, tracks, track_numbers,
+                )  # fmt: skip
                 if frames.shape[1] > 0:
                     clear_frames(i, frames, integral)
         # Lanes behind the last row keep a row of the last block, which nobody reads.
@@ -311,8 +327,10 @@ def step(
                 b.stream[k, lane] = streams[k, b.row[lane]]
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
-        observe(b)
+        observe(b, moves)
         _write_observations(b, count, integral, ages, frames, observations)
+        if previews.size > 0:
+            observe_preview(b, count, previews, course, tracks, track_numbers, observations)
     atomic_add(control, DONE, taken)
     if leads:
         finish(control, chunks)

@@ -80,12 +80,21 @@ def turn_features(turn: Turn) -> FloatArray:
     return matrix
 
 
-@fast
-def features(b):
+@inlined
+def features(b, moves):
     """Write the features of a loaded block, in the units of the table and without noise.
 
     They go to ``b.feature``, float32.
+
+    :param moves: whether references move or have a heading; else the target rests.
     """
+    _features_at_rest(b)
+    if moves:
+        _relate(b)
+
+
+@fast
+def _features_at_rest(b):
     out = b.feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
@@ -98,6 +107,39 @@ def features(b):
             for row in range(3):
                 out[F.rotation + 3 * row + k, lane] = float32(r[k][row])
         store(out[F.velocity :], lane, float32(vx), float32(vy), float32(vz))
+
+
+@inlined
+def heading_of(b, lane):
+    """Return cosine and sine of the heading whose frame a lane observes; the world's if none is
+    asked for.
+    """
+    cosine, sine = b.target_heading[0, lane], b.target_heading[1, lane]
+    is_free = cosine * cosine + sine * sine == 0.0
+    return cosine + is_free, sine
+
+
+@fast
+def _relate(b):
+    """Make features relative to a reference that moves, in place: velocities are those relative to
+    it, and world axes are turned to its heading.
+    """
+    out = b.feature
+    for lane in range(LANES):
+        c, s = heading_of(b, lane)
+        cosine, sine = float32(c), float32(s)
+        rate = float32(b.target_heading_rate[0, lane])
+        ux, uy, uz = vector(b.target_velocity, lane)
+        for row in range(3):
+            k = F.rotation + 3 * row
+            x, y, z = vector(out[k:], lane)
+            out[F.velocity + row, lane] -= float32(ux) * x + float32(uy) * y + float32(uz) * z
+            out[F.body_rates + row, lane] -= rate * z
+            out[k, lane] = cosine * x + sine * y
+            out[k + 1, lane] = cosine * y - sine * x
+        x, y = out[F.position, lane], out[F.position + 1, lane]
+        out[F.position, lane] = cosine * x + sine * y
+        out[F.position + 1, lane] = cosine * y - sine * x
 
 
 @inlined
@@ -130,12 +172,12 @@ def _disturb_and_scale(b):
 
 
 @inlined
-def observe(b):
+def observe(b, moves):
     """Write the scaled features of a loaded block with their noise to ``b.feature``.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
     """
-    features(b)
+    features(b, moves)
     random_words(b)
     standard_normals(b)
     _disturb_and_scale(b)

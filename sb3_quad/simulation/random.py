@@ -24,7 +24,9 @@ from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 # Purposes: the last word of the counter
-OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND = range(7)
+OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND, REFERENCE = range(
+    8
+)
 ROUNDS = 10
 _MASK = uint64(0xFFFFFFFF)
 _SHIFT = uint64(32)

@@ -19,6 +19,7 @@ from sb3_quad.simulation.random import (
 from sb3_quad.simulation.randomization import FIXED, N, R, V, between
 from sb3_quad.simulation.state import P, W, X, first_rows, row_slices
 from sb3_quad.simulation.tasks import T
+from sb3_quad.simulation.tracks import deepest, start_course
 from sb3_quad.simulation.vehicle_distribution import arm_length, sample_from_distribution
 
 GUSTS = {"value": 3, "keeps": 1, "adds": 1}
@@ -36,7 +37,9 @@ _SUM_STD = math.sqrt(3 * (128**2 - 1) / 12)
 
 
 @compiled
-def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights):
+def start_episode(
+    i, state, queue, streams, task_index, vehicles, tasks, weights, course, tracks, track_numbers
+):
     """Begin the episode that row i's stream has come to, in place: sample task, state and target.
 
     Targets are never below ground.
@@ -49,6 +52,7 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     :param tasks: float64 (K, columns), :meth:`sb3_quad.simulation.tasks.Task.parameters` of each
         task.
     :param weights: float64 (K,), cumulative.
+    :param course: see :mod:`.tracks`, as for ``tracks`` and ``track_numbers``.
     """
     u = uniforms(streams, i, 7, EPISODE_START)
     task_index[i] = np.sum(weights[:-1] <= u[0])
@@ -61,6 +65,8 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     nearest = task[T.nearest_target]
     distance = nearest + (task[T.target_distance] - nearest) * u[12]
     ground = vehicle[P.collision_radius] + task[T.target_clearance]
+    if tracks.shape[0] > 0:
+        ground += deepest(i, streams, tracks, track_numbers)
     lowest = -1.0
     if distance > 0.0:
         lowest = min(max(-1.0, (ground - task[T.start_position + 2]) / distance), 1.0)
@@ -68,6 +74,9 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     for axis in range(3):
         s[X.position + axis] = task[T.start_position + axis]
         s[X.target + axis] = s[X.position + axis] + offset[axis]
+    s[X.target_velocity :] = 0.0
+    if course.shape[1] > 0:
+        start_course(i, state, streams, course, tracks, track_numbers)
 
     s[X.quaternion : X.velocity] = 0.0
     s[X.quaternion] = 1.0

@@ -15,6 +15,7 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.references import Reference
 from sb3_quad.simulation.tasks import find_mixture, resolve_tasks
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
@@ -75,6 +76,9 @@ class FlightSettings(ObservationSettings):
     """fields of VehicleDistribution, or {distribution: name}: a vehicle for each episode"""
     randomize: Randomization | None = None
     """fields of Randomization: dynamics that differ by episode"""
+    reference: Reference | None = None
+    """name of a curve, fields of Reference, path of a CSV file, or function of time: what the
+    target does in an episode; None: it rests"""
     max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = MAX_EPISODE_STEPS
     """control steps after which an episode is truncated, for all rows or for each"""
 
@@ -106,7 +110,13 @@ class FlightSettings(ObservationSettings):
         """Return the settings that were given and do not belong to a task: vehicles, noise,
         observation.
         """
-        kept = self.model_fields_set - {"task", "task_kwargs", "max_episode_steps", "randomize"}
+        kept = self.model_fields_set - {
+            "task",
+            "task_kwargs",
+            "max_episode_steps",
+            "randomize",
+            "reference",
+        }
         return {name: value for name, value in self if name in kept}
 
     @property
@@ -147,6 +157,9 @@ class FlightSettings(ObservationSettings):
         changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
         if self.rotor_layout is not None:
             changes["rotor_layout"] = load_vehicle(self.rotor_layout)
+        if self.reference is not None and self.reference.function is not None:
+            # A function cannot be written, and an agent flies any reference.
+            changes["reference"] = None
         setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
 
 

@@ -50,11 +50,18 @@ STATE = {
     "body_rates": 3,
     "rotor_speeds": 4,
     "target": 3,
+    "target_velocity": 3,
+    "target_acceleration": 3,
+    # Its cosine and sine; both zero where nothing is asked of the heading
+    "target_heading": 2,
+    "target_heading_rate": 1,
 }
 STATE_SIZE = sum(STATE.values())
-POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = row_slices(STATE).values()
+POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = [*row_slices(STATE).values()][:6]
 
 X = first_rows(STATE)
+# The rows that say where the vehicle should be: position, velocity, acceleration, heading, its rate
+REFERENCE = slice(X.target, STATE_SIZE)
 
 WRENCH = {"force_world": 3, "force_body": 3, "torque_world": 3, "torque_body": 3}
 WRENCH_SIZE = sum(WRENCH.values())
@@ -115,8 +122,18 @@ class QuadcopterState:
 
     @property
     def target(self) -> FloatArray:
-        """r_T, shape (n, 3), world frame, m."""
+        """r_T, shape (n, 3), world frame, m: the position of the reference."""
         return self.array[TARGET].T
+
+    @property
+    def target_velocity(self) -> FloatArray:
+        """Velocity of the reference, shape (n, 3), world frame, m/s."""
+        return self.array[X.target_velocity : X.target_acceleration].T
+
+    @property
+    def target_heading(self) -> FloatArray:
+        """Cosine and sine of the heading that is asked for, (n, 2); zeros where none is."""
+        return self.array[X.target_heading : X.target_heading_rate].T
 
     @property
     def rotation(self) -> FloatArray:

@@ -7,7 +7,13 @@ from numba import float32
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
-from sb3_quad.simulation.adjoint import MOVING, undo_features, undo_flight, undo_noise
+from sb3_quad.simulation.adjoint import (
+    MOVING,
+    undo_features,
+    undo_flight,
+    undo_noise,
+    undo_relation,
+)
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
 from sb3_quad.simulation.kernel import (
@@ -148,6 +154,7 @@ class FlightTape:
             self._winds[step],
             batch.vehicles,
             batch.scaling,
+            batch.moves,
             batch.ages,
             self._integrals,
             batch.integral_numbers,
@@ -173,8 +180,8 @@ class FlightTape:
 @compiled
 def undo(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
-    ages, integrals, integral_numbers, by_observation, by_frames, by_integral, gradient, by_actions,
-    physics_step, substeps,
+    moves, ages, integrals, integral_numbers, by_observation, by_frames, by_integral, gradient,
+    by_actions, physics_step, substeps,
 ):  # fmt: skip
     """Undo a control step and the observation after it; see :class:`FlightTape`.
 
@@ -214,7 +221,7 @@ def undo(
                 load_rows(states[step + 1], first, count, b.state)
                 load_rows(streams, first, count, b.stream)
                 b.stream[STEP] += np.uint32(step + 1)
-                features(b)
+                features(b, moves)
                 random_words(b)
                 standard_normals(b)
                 _undo_frames(
@@ -222,6 +229,8 @@ def undo(
                     by_observation, by_frames, by_integral, by_feature, by_actions,
                 )  # fmt: skip
                 undo_noise(b, by_feature)
+                if moves:
+                    undo_relation(b, by_feature)
                 undo_features(b, by_feature, own)
 
             load_rows(states[step], first, count, b.state)
