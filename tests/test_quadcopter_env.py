@@ -294,7 +294,7 @@ def test_bad_actions_raise(env: QuadcopterEnv, action: Any, message: str) -> Non
         (lambda env: env.reset(options={"state": {"position": (0, 0, 0.1)}}), "ground"),
         (lambda env: env.reset(options={"state": 3}), "state"),
         (lambda env: env.reset(options={"target": (0, 0)}), "options: target"),
-        (lambda env: env.set_target((0, 0, np.nan)), "target .*finite"),
+        (lambda env: env.set_target((0, 0, np.nan)), "position .*finite"),
         (lambda env: env.set_wrench(force=(1, 2)), r"force of shape \(2,\): must be \(3,\)"),
         (lambda env: env.set_wrench(force=(1, 2, 3), force_frame="wrld"), "force_frame 'wrld'"),
         (lambda env: env.set_noise(-1), "noise"),

@@ -266,4 +266,4 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         if present.size == 0:
             return gradients
         longest = self.max_row_ratio * np.median(present)
-        return gradients * (longest / np.maximum(lengths, longest))
+        return np.asarray(gradients * (longest / np.maximum(lengths, longest)))

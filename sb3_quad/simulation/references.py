@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
 from pydantic import Field, PositiveFloat, model_validator
 
 from sb3_quad.base.errors import ConfigError, raised_as
@@ -34,6 +35,7 @@ PIECES = 256
 PIECE_SECONDS = 10.0
 HARMONICS = np.arange(1, 7)
 MAX_SECONDS = 600.0
+_COLUMNS = ["t", "x", "y", "z", "heading"]
 # Coefficients of a piece of a polynomial with the least snap, and its derivatives that are
 # continuous
 _COEFFICIENTS = 8
@@ -74,7 +76,7 @@ class Reference(Frozen):
     | `helix` | the circle, and C upwards in each turn, for ``duration`` |
     | `lissajous` | (A sin ωt, B sin 2ωt, C sin 3ωt) |
     | `polynomial` | least snap through ``waypoints``, from rest to rest, looping where it closes |
-    | `file` | natural cubic splines through the rows of a CSV file: t, x, y, z, maybe heading |
+    | `file` | cubic Hermite splines through the rows of a CSV file: t, x, y, z, maybe heading |
     | `function` | what ``function`` returns, for ``duration`` |
     | `random_smooth` | one of 256 random sums of sines, which repeat after 10 s |
     """
@@ -153,10 +155,11 @@ class Reference(Frozen):
     def _heading(self, table: FloatArray, dt: float) -> FloatArray | None:
         """Return the heading of each row of a table, (t,), rad; None: nothing is asked of it."""
         if isinstance(self.heading, str):
-            return np.unwrap(np.arctan2(table[:, 4], table[:, 3]))
+            return np.asarray(np.unwrap(np.arctan2(table[:, 4], table[:, 3])))
         if self.heading is None:
             return None
-        return self.heading + self.heading_rate * dt * np.arange(len(table))
+        times = dt * np.arange(len(table), dtype=np.float64)
+        return np.asarray(self.heading + self.heading_rate * times)
 
     def _curve_table(self, dt: float) -> FloatArray:
         """Return the positions of a curve with their derivatives; their start may be anywhere."""
@@ -164,7 +167,7 @@ class Reference(Frozen):
             return self._polynomial(dt)
         if self.curve == "file":
             times, points = read_points(Path(str(self.file)))
-            return self._sampled(_spline(times, points), times[-1] - times[0], dt)
+            return self._sampled(_interpolated(times, points), times[-1], dt)
         if self.curve == "function":
             return self._sampled(self.function, self.duration, dt)
         return self._sines(dt)
@@ -243,23 +246,23 @@ class Reference(Frozen):
         comes from its own stream.
         """
         length = round(PIECE_SECONDS / dt)
-        times = dt * np.arange(length)
+        times = dt * np.arange(length, dtype=np.float64)
         base = 2.0 * math.pi / (length * dt)
         random = np.random.default_rng(0)
         pieces = []
         for number in range(PIECES):
-            weights = random.normal(size=(3, len(HARMONICS))) / HARMONICS**1.5
+            weights: Any = random.normal(size=(3, len(HARMONICS))) / HARMONICS**1.5
             weights[2] *= 0.5
-            phases = random.uniform(0.0, 2.0 * math.pi, size=weights.shape)
+            phases: Any = random.uniform(0.0, 2.0 * math.pi, size=weights.shape)
             waves = []
             for axis in range(3):
                 for harmonic in HARMONICS:
-                    k = harmonic - 1
-                    waves.append((axis, weights[axis, k], harmonic, phases[axis, k]))
+                    at = axis, harmonic - 1
+                    waves.append((axis, weights[at], harmonic, phases[at]))
             table = _waves(tuple(waves), times, base)
             greatest = np.linalg.norm(table[:, _VELOCITY], axis=1).max()
             steepest = np.linalg.norm(table[:, _ACCELERATION], axis=1).max()
-            scale = min(
+            scale: Any = min(
                 self.speed * random.uniform(0.1, 1.0) / greatest, self.acceleration / steepest
             )
             if number < round(self.resting * PIECES):
@@ -298,48 +301,39 @@ def _waves(waves: tuple[Any, ...], times: FloatArray, rate: float) -> FloatArray
 
 
 def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Return the times (t,) and positions (t, 3), or (t, 4) with headings, of a CSV file.
+    """Return the times (t,), from 0 on, and positions (t, 3), or (t, 4) with headings, of a CSV
+    file.
 
     Its first line names the columns: t, x, y, z and maybe heading; s, m, rad.
 
     :raises ConfigError: a file that cannot be read, or whose times do not rise.
     """
     with raised_as(ConfigError, str(path)):
-        data = np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64)
-    names = ["x", "y", "z", "heading"]
-    given = list(data.dtype.names or ())
-    if given[:4] != ["t", *names[:3]] or given[4:] not in ([], names[3:]) or data.size < 2:
+        frame = pd.read_csv(path, dtype=np.float64)
+    if [*frame.columns] not in (_COLUMNS[:4], _COLUMNS) or len(frame) < 2:
         raise ConfigError(f"{path}: needs two or more rows with the columns t,x,y,z[,heading]")
-    points = np.stack([data[name] for name in given[1:]], axis=1)
-    times = data["t"]
-    if not (np.diff(times) > 0).all() or not np.isfinite(points).all():
-        raise ConfigError(f"{path}: t must rise from row to row, and every number be finite")
-    if times[-1] - times[0] > MAX_SECONDS:
-        raise ConfigError(f"{path}: lasts longer than {MAX_SECONDS:g} s")
-    return times, points
+    numbers = frame.to_numpy()
+    times = numbers[:, 0] - numbers[0, 0]
+    if not np.isfinite(numbers).all() or not 0.0 < np.diff(times).min() <= times[-1] <= MAX_SECONDS:
+        raise ConfigError(
+            f"{path}: every number must be finite, and t rise from row to row, by {MAX_SECONDS:g} s"
+            " at most"
+        )
+    return times, numbers[:, 1:]
 
 
-def _spline(times: FloatArray, points: FloatArray) -> Motion:
-    """Return the natural cubic splines through points, as a function of the time since the
-    first.
-    """
-    h = np.diff(times)
-    slopes = np.diff(points, axis=0) / h[:, None]
-    # Second derivatives at the points; zero at both ends
-    matrix = np.eye(len(times))
-    right = np.zeros_like(points)
-    for k in range(1, len(times) - 1):
-        matrix[k, k - 1 : k + 2] = h[k - 1], 2.0 * (h[k - 1] + h[k]), h[k]
-        right[k] = 6.0 * (slopes[k] - slopes[k - 1])
-    second = np.linalg.solve(matrix, right)
+def _interpolated(times: FloatArray, points: FloatArray) -> Motion:
+    """Return cubic Hermite splines through points, as a function of time."""
+    slopes = np.gradient(points, times, axis=0)
 
     def motion(t: FloatArray) -> FloatArray:
-        at = np.clip(np.searchsorted(times - times[0], t, side="right") - 1, 0, len(h) - 1)
-        u = (t - (times[at] - times[0]))[:, None]
-        width = h[at][:, None]
-        cubic = (second[at + 1] - second[at]) / (6.0 * width)
-        linear = slopes[at] - width * (2.0 * second[at] + second[at + 1]) / 6.0
-        return np.asarray(points[at] + u * (linear + u * (0.5 * second[at] + u * cubic)))
+        after = np.clip(np.searchsorted(times, t, side="right"), 1, len(times) - 1)
+        before = after - 1
+        width = (times[after] - times[before])[:, None]
+        u = (t - times[before])[:, None] / width
+        mean = points[before] + u * u * (3.0 - 2.0 * u) * (points[after] - points[before])
+        bend = u * (1.0 - u) * width * ((1.0 - u) * slopes[before] - u * slopes[after])
+        return np.asarray(mean + bend)
 
     return motion
 
@@ -372,7 +366,7 @@ def least_snap(points: FloatArray, seconds: FloatArray) -> FloatArray:
         matrix[row, :_COEFFICIENTS] = _powers(0.0, derivative)
         matrix[row + 1, -_COEFFICIENTS:] = _powers(seconds[-1], derivative)
         row += 2
-    return np.linalg.solve(matrix, right).reshape(m, _COEFFICIENTS, 3)
+    return np.asarray(np.linalg.solve(matrix, right)).reshape(m, _COEFFICIENTS, 3)
 
 
 def _powers(time: float, derivative: int) -> FloatArray:
