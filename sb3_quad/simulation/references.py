@@ -6,7 +6,8 @@ environment is; in flight, :mod:`.tracks` reads them.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -23,10 +24,6 @@ Motion = Callable[[FloatArray], FloatArray]
 """The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]
-CURVES = (
-    *("hover", "circle", "figure_eight", "helix", "lissajous"),
-    *("polynomial", "file", "function", "random_smooth"),
-)
 REFERENCE_SIZE = STATE_SIZE - X.target
 _POSITION, _VELOCITY, _ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 _HEADING, _HEADING_RATE = slice(9, 11), 11
@@ -36,10 +33,18 @@ PIECE_SECONDS = 10.0
 HARMONICS = np.arange(1, 7)
 MAX_SECONDS = 600.0
 _COLUMNS = ["t", "x", "y", "z", "heading"]
-# Coefficients of a piece of a polynomial with the least snap, and its derivatives that are
-# continuous
+# Of a segment of a polynomial with the least snap
 _COEFFICIENTS = 8
-_SMOOTH = 6
+# Curves of sines, as functions of the angle ωt and the sizes A, B and C
+_SINES: Mapping[str, Callable[..., Any]] = {
+    "hover": lambda p, a, b, c: (0.0 * p, 0.0 * p, 0.0 * p),
+    "circle": lambda p, a, b, c: (a * np.cos(p), a * np.sin(p), 0.0 * p),
+    "figure_eight": lambda p, a, b, c: (a * np.sin(p), b * np.sin(2.0 * p), c * np.sin(p)),
+    "helix": lambda p, a, b, c: (a * np.cos(p), a * np.sin(p), c * p / (2.0 * math.pi)),
+    "lissajous": lambda p, a, b, c: (a * np.sin(p), b * np.sin(2.0 * p), c * np.sin(3.0 * p)),
+}
+
+CURVES = (*_SINES, "polynomial", "file", "function", "random_smooth")
 
 
 class Tracks(NamedTuple):
@@ -75,7 +80,7 @@ class Reference(Frozen):
     | `figure_eight` | (A sin ωt, B sin 2ωt, C sin ωt) |
     | `helix` | the circle, and C upwards in each turn, for ``duration`` |
     | `lissajous` | (A sin ωt, B sin 2ωt, C sin 3ωt) |
-    | `polynomial` | least snap through ``waypoints``, from rest to rest, looping where it closes |
+    | `polynomial` | least snap through ``waypoints``, from rest to rest |
     | `file` | cubic Hermite splines through the rows of a CSV file: t, x, y, z, maybe heading |
     | `function` | what ``function`` returns, for ``duration`` |
     | `random_smooth` | one of 256 random sums of sines, which repeat after 10 s |
@@ -86,12 +91,12 @@ class Reference(Frozen):
     speed: PositiveFloat = Field(default=2.0, le=100)
     """greatest speed, m/s; of random_smooth the limit, below which each piece has its own"""
     size: tuple[Metres, Metres, Metres] | None = None
-    """A, B and C, m; None: 2, 1 and 0 (helix: 0.5, lissajous: 0.5)"""
+    """A, B and C, m; None: 2, 1 and 0.5 (figure_eight: 0)"""
     acceleration: PositiveFloat = Field(default=8.0, le=1e3)
     """random_smooth: limit of the acceleration, m/s²"""
     resting: float = Field(default=0.0, ge=0, le=1)
     """random_smooth: share of pieces that rest"""
-    heading: float | Literal["path", "random"] | None = None
+    heading: Literal["path", "random"] | float | None = None
     """at the start, rad; path: along the velocity; random: of each piece of random_smooth its own,
     with a rate up to heading_rate; None: nothing is asked of it"""
     heading_rate: float = Field(default=0.0, ge=-20, le=20)
@@ -136,15 +141,10 @@ class Reference(Frozen):
         """
         if self.curve == "random_smooth":
             return self._random_tracks(dt)
-        loops = self.curve not in ("helix", "polynomial", "file", "function")
-        table = self._curve_table(dt)
-        position = table[:, _POSITION]
-        if not np.isfinite(table).all():
-            raise ConfigError(f"reference {self.curve}: its positions are not all finite")
-        position -= position[0].copy()
-        heading = self._heading(table, dt)
-        if heading is not None:
-            _set_heading(table, heading, dt)
+        motion, seconds = self._motion(dt)
+        loops = self.curve in _SINES and self.curve != "helix"
+        with raised_as(ConfigError, f"reference {self.curve}"):
+            table = self._table(motion, round(seconds / dt), dt, loops)
         if not loops:
             # It rests where it ends.
             table = np.vstack([table, table[-1]])
@@ -152,152 +152,120 @@ class Reference(Frozen):
             table[-1, _HEADING_RATE] = 0.0
         return Tracks(table, len(table), loops)
 
-    def _heading(self, table: FloatArray, dt: float) -> FloatArray | None:
-        """Return the heading of each row of a table, (t,), rad; None: nothing is asked of it."""
-        if isinstance(self.heading, str):
-            return np.asarray(np.unwrap(np.arctan2(table[:, 4], table[:, 3])))
-        if self.heading is None:
-            return None
-        times = dt * np.arange(len(table), dtype=np.float64)
-        return np.asarray(self.heading + self.heading_rate * times)
-
-    def _curve_table(self, dt: float) -> FloatArray:
-        """Return the positions of a curve with their derivatives; their start may be anywhere."""
+    def _motion(self, dt: float) -> tuple[Motion, float]:
+        """Return a curve as a function of time, and how long it takes, s."""
         if self.curve == "polynomial":
-            return self._polynomial(dt)
+            return self._polynomial()
         if self.curve == "file":
             times, points = read_points(Path(str(self.file)))
-            return self._sampled(_interpolated(times, points), times[-1], dt)
+            return _interpolated(times, points), times[-1]
         if self.curve == "function":
-            return self._sampled(self.function, self.duration, dt)
-        return self._sines(dt)
-
-    def _sines(self, dt: float) -> FloatArray:
-        """Return one period of a curve that is made of sines."""
-        default = {"helix": 0.5, "lissajous": 0.5}.get(self.curve, 0.0)
-        a, b, c = self.size or (2.0, 1.0, default)
-        # Amplitude, multiple of ω and phase by axis
-        waves = {
-            "hover": (),
-            "circle": ((0, a, 1, 0.5 * math.pi), (1, a, 1, 0.0)),
-            "helix": ((0, a, 1, 0.5 * math.pi), (1, a, 1, 0.0)),
-            "figure_eight": ((0, a, 1, 0.0), (1, b, 2, 0.0), (2, c, 1, 0.0)),
-            "lissajous": ((0, a, 1, 0.0), (1, b, 2, 0.0), (2, c, 3, 0.0)),
-        }[self.curve]
-        if not waves:
-            # A second at rest, which repeats.
-            return np.zeros((round(1.0 / dt), REFERENCE_SIZE))
-        climb = c / (2.0 * math.pi) if self.curve == "helix" else 0.0
-        # The greatest speed per ω, found on a fine grid
-        unit = _waves(waves, np.linspace(0.0, 2.0 * math.pi, 7201), 1.0)
-        unit[:, 5] += climb
-        rate = self.speed / np.linalg.norm(unit[:, _VELOCITY], axis=1).max()
+            return self.function, self.duration
+        a, b, c = self.size or (2.0, 1.0, 0.0 if self.curve == "figure_eight" else 0.5)
+        sines = _SINES[self.curve]
+        # The greatest speed per ω, on a fine grid
+        grid = np.linspace(0.0, 2.0 * math.pi, 7201)
+        way = np.gradient(np.stack(sines(grid, a, b, c)), grid, axis=1)
         # A whole number of control steps, so that it loops without a jump.
-        period = max(round(2.0 * math.pi / rate / dt), 4)
-        rate = 2.0 * math.pi / (period * dt)
-        steps = period if self.curve != "helix" else round(self.duration / dt)
-        times = dt * np.arange(steps)
-        table = _waves(waves, times, rate)
-        table[:, 2] += climb * rate * times
-        table[:, 5] += climb * rate
-        return table
+        steps = round(2.0 * math.pi * np.linalg.norm(way, axis=0).max() / self.speed / dt)
+        seconds = max(steps, 10) * dt
+        omega = 2.0 * math.pi / seconds
+        if self.curve == "helix":
+            seconds = self.duration
+        return lambda t: np.stack(sines(omega * t, a, b, c), axis=1), seconds
 
-    def _sampled(self, motion: Motion, duration: float, dt: float) -> FloatArray:
-        """Return a table of a function, its derivatives by central differences."""
-        # Two steps more on each side, so that both differences have their neighbours.
-        times = dt * np.arange(-2, round(duration / dt) + 3)
-        with raised_as(ConfigError, f"reference {self.curve}"):
-            inside = np.clip(times, 0.0, duration)
-            values = np.asarray(motion(inside), dtype=np.float64)
-        if values.ndim != 2 or values.shape[0] != len(times) or values.shape[1] not in (3, 4):
-            raise ConfigError(
-                f"reference {self.curve}: gives shape {values.shape} for {len(times)} times; must"
-                f" be ({len(times)}, 3) or, with a heading, ({len(times)}, 4)"
+    def _table(self, motion: Motion, steps: int, dt: float, loops: bool) -> FloatArray:
+        """Return a table of a function, its derivatives by central differences.
+
+        :raises ValueError: it gives something else than positions.
+        """
+        # Where it loops, two steps more on each side: both differences have their neighbours.
+        more = 2 if loops else 0
+        times = dt * np.arange(-more, steps + more, dtype=np.float64)
+        values = np.asarray(motion(times), dtype=np.float64)
+        columns = values.size / len(times)
+        if values.ndim != 2 or columns not in (3, 4) or not np.isfinite(values).all():
+            raise ValueError(
+                f"gives shape {values.shape} for {len(times)} times; must be finite numbers of"
+                f" shape ({len(times)}, 3) or, with a heading, ({len(times)}, 4)"
             )
         table = np.zeros((len(times), REFERENCE_SIZE))
-        table[:, _POSITION] = values[:, :3]
-        table[:, _VELOCITY] = np.gradient(values[:, :3], dt, axis=0)
+        table[:, _POSITION] = values[:, :3] - values[more, :3]
+        table[:, _VELOCITY] = np.gradient(table[:, _POSITION], dt, axis=0)
         table[:, _ACCELERATION] = np.gradient(table[:, _VELOCITY], dt, axis=0)
-        if values.shape[1] == 4:
-            _set_heading(table, values[:, 3], dt)
-        return table[2:-2]
+        heading: Any = None
+        if columns == 4:
+            heading = values[:, 3]
+        elif self.heading == "path":
+            heading = np.unwrap(np.arctan2(table[:, 4], table[:, 3]))
+        elif isinstance(self.heading, float):
+            heading = self.heading + self.heading_rate * times
+        if heading is not None:
+            _set_heading(table, heading, dt)
+        return table[more : more + steps]
 
-    def _polynomial(self, dt: float) -> FloatArray:
+    def _polynomial(self) -> tuple[Motion, float]:
         """Return the motion of the least snap through the waypoints (Mellinger and Kumar, "Minimum
-        snap trajectory generation and control for quadrotors", ICRA 2011).
+        snap trajectory generation and control for quadrotors", ICRA 2011), and its duration, s.
 
-        The times between them are such that the mean speed is half of ``speed``, then the whole is
-        stretched so that the greatest speed is ``speed``.
+        The times between waypoints are as the distances, then the whole is stretched so that the
+        greatest speed is ``speed``.
         """
-        points = np.array(self.waypoints, dtype=np.float64)
-        if points[0].any():
-            points = np.vstack([np.zeros(3), points])
+        points = np.vstack([np.zeros(3), np.array(self.waypoints)])
         lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        if not lengths.all():
+        # A first waypoint at the start is the start.
+        points = points[int(lengths[0] == 0.0) :]
+        seconds = lengths[int(lengths[0] == 0.0) :]
+        if not seconds.all():
             raise ConfigError("reference polynomial: two waypoints in a row are the same point")
-        seconds = 2.0 * lengths / self.speed
-        coefficients = least_snap(points, seconds)
-        speeds = _evaluate(coefficients, seconds, 0.01 * seconds.min())[:, _VELOCITY]
-        seconds = seconds * np.linalg.norm(speeds, axis=1).max() / self.speed
-        return _evaluate(least_snap(points, seconds), seconds, dt)
+        grid = np.linspace(0.0, seconds.sum(), 5000)
+        way = np.gradient(least_snap(points, seconds)(grid), grid, axis=0)
+        seconds = seconds * np.linalg.norm(way, axis=1).max() / self.speed
+        return least_snap(points, seconds), seconds.sum()
 
     def _random_tracks(self, dt: float) -> Tracks:
         """Return random pieces. They are the same in every environment; which of them a row flies
         comes from its own stream.
         """
         length = round(PIECE_SECONDS / dt)
-        times = dt * np.arange(length, dtype=np.float64)
         base = 2.0 * math.pi / (length * dt)
         random = np.random.default_rng(0)
         pieces = []
         for number in range(PIECES):
-            weights: Any = random.normal(size=(3, len(HARMONICS))) / HARMONICS**1.5
-            weights[2] *= 0.5
-            phases: Any = random.uniform(0.0, 2.0 * math.pi, size=weights.shape)
-            waves = []
-            for axis in range(3):
-                for harmonic in HARMONICS:
-                    at = axis, harmonic - 1
-                    waves.append((axis, weights[at], harmonic, phases[at]))
-            table = _waves(tuple(waves), times, base)
+            amplitudes: Any = random.normal(size=(3, len(HARMONICS))) / HARMONICS**1.5
+            amplitudes[2] *= 0.5
+            phases = random.uniform(0.0, 2.0 * math.pi, size=amplitudes.shape)
+            motion = partial(_sum_of_sines, base, phases, amplitudes)
+            table = self._table(motion, length, dt, True)
+            speed = self.speed * random.uniform(0.1, 1.0)
             greatest = np.linalg.norm(table[:, _VELOCITY], axis=1).max()
             steepest = np.linalg.norm(table[:, _ACCELERATION], axis=1).max()
-            scale: Any = min(
-                self.speed * random.uniform(0.1, 1.0) / greatest, self.acceleration / steepest
-            )
-            if number < round(self.resting * PIECES):
+            scale = min(speed / greatest, self.acceleration / steepest)
+            if number < self.resting * PIECES:
                 scale = 0.0
             table[:, : _ACCELERATION.stop] *= scale
-            table[:, _POSITION] -= table[0, _POSITION].copy()
+            # Whole turns in a piece, so that it loops.
             turns = round(random.uniform(-1.0, 1.0) * self.heading_rate / base)
             start = random.uniform(-math.pi, math.pi)
             if self.heading == "random":
-                # Whole turns in a piece, so that it loops.
-                _set_heading(table, start + turns * base * times, dt)
-            else:
-                heading = self._heading(table, dt)
-                if heading is not None:
-                    _set_heading(table, heading, dt)
+                angle = start + turns * base * dt * np.arange(length, dtype=np.float64)
+                _set_heading(table, angle, dt)
             pieces.append(table)
         return Tracks(np.concatenate(pieces), length, True)
+
+
+def _sum_of_sines(
+    rate: float, phases: FloatArray, amplitudes: FloatArray, times: FloatArray
+) -> FloatArray:
+    """Return sums of sines, (t, 3); amplitudes and phases are (3, harmonics)."""
+    angles = np.multiply.outer(rate * times, HARMONICS)[:, None, :] + phases
+    return np.asarray((amplitudes * np.sin(angles)).sum(axis=2))
 
 
 def _set_heading(table: FloatArray, heading: FloatArray, dt: float) -> None:
     """Write the direction and the rate of a heading, (t,), rad, into a table, in place."""
     table[:, _HEADING] = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     table[:, _HEADING_RATE] = np.gradient(heading, dt)
-
-
-def _waves(waves: tuple[Any, ...], times: FloatArray, rate: float) -> FloatArray:
-    """Return a table of sums of sines, (axis, amplitude, multiple of ``rate``, phase) each."""
-    table = np.zeros((len(times), REFERENCE_SIZE))
-    for axis, amplitude, multiple, phase in waves:
-        omega = multiple * rate
-        angle = omega * times + phase
-        table[:, axis] += amplitude * np.sin(angle)
-        table[:, 3 + axis] += amplitude * omega * np.cos(angle)
-        table[:, 6 + axis] -= amplitude * omega**2 * np.sin(angle)
-    return table
 
 
 def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -338,35 +306,45 @@ def _interpolated(times: FloatArray, points: FloatArray) -> Motion:
     return motion
 
 
-def least_snap(points: FloatArray, seconds: FloatArray) -> FloatArray:
-    """Return the polynomials of degree 7 with the least integral of the squared snap.
+def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
+    """Return the motion along polynomials of degree 7 with the least integral of the squared snap.
 
     :param points: (m + 1, 3), with rest at both ends.
     :param seconds: (m,), from each point to the next.
-    :return: (m, 8, 3), coefficients of rising powers of the time since the segment's start.
     """
     m = len(seconds)
-    # In between, the optimum is continuous up to the sixth derivative.
-    matrix = np.zeros((m * _COEFFICIENTS, m * _COEFFICIENTS))
-    right = np.zeros((m * _COEFFICIENTS, 3))
-    row = 0
+    rows = []
+    right = []
     for k in range(m):
-        own = slice(k * _COEFFICIENTS, (k + 1) * _COEFFICIENTS)
         for time, point in ((0.0, points[k]), (seconds[k], points[k + 1])):
-            matrix[row, own] = _powers(time, 0)
-            right[row] = point
-            row += 1
-        for derivative in range(1, _SMOOTH + 1):
-            if k > 0:
-                before = slice(own.start - _COEFFICIENTS, own.start)
-                matrix[row, before] = _powers(seconds[k - 1], derivative)
-                matrix[row, own] = -_powers(0.0, derivative)
-                row += 1
+            rows.append(_constraint(m, {k: _powers(time, 0)}))
+            right.append(point)
+        # In between, the optimum is continuous up to the sixth derivative.
+        for derivative in range(1, 7) if k > 0 else ():
+            ends = {k - 1: _powers(seconds[k - 1], derivative), k: -_powers(0.0, derivative)}
+            rows.append(_constraint(m, ends))
+            right.append(np.zeros(3))
     for derivative in (1, 2, 3):
-        matrix[row, :_COEFFICIENTS] = _powers(0.0, derivative)
-        matrix[row + 1, -_COEFFICIENTS:] = _powers(seconds[-1], derivative)
-        row += 2
-    return np.asarray(np.linalg.solve(matrix, right)).reshape(m, _COEFFICIENTS, 3)
+        rows.append(_constraint(m, {0: _powers(0.0, derivative)}))
+        rows.append(_constraint(m, {m - 1: _powers(seconds[-1], derivative)}))
+        right += [np.zeros(3), np.zeros(3)]
+    coefficients = np.linalg.solve(np.array(rows), np.array(right)).reshape(m, _COEFFICIENTS, 3)
+    starts = np.concatenate([[0.0], np.cumsum(seconds)])
+
+    def motion(t: FloatArray) -> FloatArray:
+        segment = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, m - 1)
+        powers = np.vander(t - starts[segment], _COEFFICIENTS, increasing=True)
+        return np.asarray(np.einsum("tk,tka->ta", powers, coefficients[segment]))
+
+    return motion
+
+
+def _constraint(segments: int, parts: Mapping[int, FloatArray]) -> FloatArray:
+    """Return a row of the linear system: factors of the coefficients of some segments."""
+    row = np.zeros((segments, _COEFFICIENTS))
+    for segment, factors in parts.items():
+        row[segment] = factors
+    return row.ravel()
 
 
 def _powers(time: float, derivative: int) -> FloatArray:
@@ -375,16 +353,3 @@ def _powers(time: float, derivative: int) -> FloatArray:
     for power in range(derivative, _COEFFICIENTS):
         result[power] = math.perm(power, derivative) * time ** (power - derivative)
     return result
-
-
-def _evaluate(coefficients: FloatArray, seconds: FloatArray, dt: float) -> FloatArray:
-    """Return a table of segments of polynomials."""
-    ends = np.cumsum(seconds)
-    times = dt * np.arange(math.floor(ends[-1] / dt) + 1)
-    table = np.zeros((len(times), REFERENCE_SIZE))
-    segment = np.minimum(np.searchsorted(ends, times, side="right"), len(seconds) - 1)
-    since = times - np.concatenate([[0.0], ends])[segment]
-    for row, (k, time) in enumerate(zip(segment, since, strict=True)):
-        for derivative, place in enumerate((_POSITION, _VELOCITY, _ACCELERATION)):
-            table[row, place] = _powers(time, derivative) @ coefficients[k]
-    return table
