@@ -1,7 +1,8 @@
 """Measure control steps per second of environments and training loops.
 
-The environments are PyBullet's, alone and vectorised, and the compiled batch. A training loop is
-a rollout with its update; APG's update includes the way back through the recorded flights.
+The environments are PyBullet's, alone and vectorised, and the compiled batch. A
+training loop is a rollout with its update; APG's includes the way back through
+the recorded flights.
 
 examples:
   # everything, about a minute
