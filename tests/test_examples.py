@@ -114,6 +114,16 @@ def test_own_experts_and_vehicles_recover(run, name):
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
 
 
+@pytest.mark.slow
+def test_learning_speed(run, tmp_path):
+    method = "model's gradient from the clone"
+    run("learning_speed.py", "rows.csv", "a.png", "--cpu-seconds", "1", "--methods", method)
+    rows = (tmp_path / "rows.csv").read_text()
+    assert "clone of the PID,0," in rows and f"{method},0," in rows
+    run("learning_speed.py", "rows.csv", "b.png", "--draw")
+    assert Image.open(tmp_path / "b.png").size[0] > 500
+
+
 def test_cloning_plot(run, tmp_path):
     rows = [
         f'"our reward, {kind}",tracking,{error}'
