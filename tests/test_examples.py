@@ -274,3 +274,20 @@ def test_a_gradient_of_ones_own_leads_to_the_mark(run):
     output = run("gradient_of_your_environment.py", "--updates", "20")
     before, after = map(float, re.findall(r"([\d.]+) m from the mark", output))
     assert after < 0.5 * before
+
+
+def test_an_agent_follows_a_stick(tmp_path):
+    """Without a window, from a stick that a test moves: forward, turning, then at rest."""
+    spec = importlib.util.spec_from_file_location("joystick", EXAMPLES / "joystick.py")
+    joystick = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(joystick)
+    moves = [*400 * [(1.0, 0.0, 0.2, 0.5)], *400 * [(0.0, 0.0, 0.0, 0.0)]]
+    asked, off, jumps = iter(moves), [], []
+    for env, guide in joystick.fly("itm-robust", lambda: next(asked, None), render_mode=None):
+        off.append(np.linalg.norm(env.true_state().position[0] - guide.position))
+        jumps.append(np.linalg.norm(guide.acceleration))
+    assert len(off) == 800 and max(off) < 0.5 and off[-1] < 0.1
+    assert max(jumps) < 6.0 and abs(guide.heading - 0.75 * 4.0) < 0.3
+    forward = env.true_state().rotation[0, :2, 0]
+    turned = np.arctan2(forward[1], forward[0]) - guide.heading
+    assert abs(np.arcsin(np.sin(turned))) < np.radians(10.0)
