@@ -280,9 +280,9 @@ def test_it_follows_a_reference_that_it_previews(tmp_path, file_format, looks):
     FlightSettings(**{**FOLLOWS, **LOOKS[looks]}).write_into(model)
     model.save(tmp_path / "agent.zip")
     exported = export_policy(tmp_path / "agent.zip", file_format, n_observations=400)
-    assert "21-23 acceleration of the reference in 5 control steps" in exported.metadata[
-        "observation"
-    ]
+    assert (
+        "21-23 acceleration of the reference in 5 control steps" in exported.metadata["observation"]
+    )
     file, state, seen = load(file_format, exported, "agent"), None, env.reset()
     for step in range(30):
         truth = env.true_state()
@@ -566,18 +566,19 @@ def test_bad_input_is_one_line(zips, tmp_path, capsys, monkeypatch, arguments, m
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("stateful", [False, True])
-def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, capsys, stateful):
+@pytest.mark.parametrize("section", ["Python", "A policy with a state", "A reference that moves"])
+def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, capsys, section):
     pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
+    stateful = section == "A policy with a state"
     path = extended / "all.zip" if stateful else zips / "tanh.zip"
     for file_format, file in (("onnx", "agent.onnx"), ("c", "agent.h")):
         assert main(["export", str(path), "--format", file_format, "-o", file]) == 0
     printed = capsys.readouterr().out
     assert ("state: zeros begin" in printed) == stateful
-    section, scope = DOCS.split("## A policy with a state" if stateful else "## Python")[1], {}
-    exec(section.split("```python")[1].split("```")[0], scope)
-    (tmp_path / "main.c").write_text(section.split("```c\n")[1].split("```")[0])
+    text, scope = DOCS.split(f"## {section}")[1], {}
+    exec(text.split("```python")[1].split("```")[0], scope)
+    (tmp_path / "main.c").write_text(text.split("```c\n")[1].split("```")[0])
     subprocess.run([COMPILER, *FLAGS, "main.c", "-lm", "-o", "main"], check=True)
     done = subprocess.run(["./main"], check=True, capture_output=True, text=True).stdout.split()
     np.testing.assert_allclose(
