@@ -15,6 +15,7 @@ from stable_baselines3 import PPO
 from sb3_quad.cli import main
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -303,7 +304,8 @@ def test_an_agent_follows_a_stick():
 
 def test_the_observation_in_plain_sb3_is_that_of_the_environment():
     """Along a figure eight with a heading that turns, of an agent with frames and a preview."""
-    sees = {"history": [0, 2], "last_action": True, "preview": [0, 5], "position_integral": {}}
+    sees = {"history": [0, 2], "last_action": True, "preview": [0, 5]}
+    sees["position_integral"] = PositionIntegral().model_dump()
     curve = {"curve": "figure_eight", "speed": 1.0, "heading": 0.3, "heading_rate": 0.5}
     env = QuadcopterVecEnv(
         1, task_kwargs={"target_distance": 0.5}, noise=0.0, reference=curve, **sees

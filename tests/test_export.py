@@ -294,7 +294,9 @@ def test_it_follows_a_reference_that_it_previews(tmp_path, file_format, looks):
             references = np.ascontiguousarray(np.column_stack([speed, angle, rate]), np.float32)
             result, state = file(inputs, state, references)
         else:
-            related = np.hstack([relate(*row) for row in zip(features, ahead, speed, c, s)])
+            related = np.hstack(
+                [relate(*row) for row in zip(features, ahead, speed, c, s, strict=True)]
+            )
             result, state = file(related.reshape(len(c), -1), state)
         actions = model.predict(seen, deterministic=True)[0]
         np.testing.assert_allclose(result, ITM.action_to_thrust(actions), atol=2e-4)

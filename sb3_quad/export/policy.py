@@ -46,11 +46,12 @@ def export_policy(
     """Make a file that flies by itself of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC;
     ``MlpPolicy``).
 
-    It takes the features of an observation in physical units, see ``metadata["observation"]``, and
-    relative to a reference that moves, ``metadata["reference"]``. It gives the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
-    Earlier frames that the policy sees are in a state, ``metadata["state"]``. A vehicle that is not
-    given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it, or
-    else ``itm`` and Table A.2.
+    It takes the features of an observation in physical units, see ``metadata["observation"]``,
+    relative to a reference that moves, see ``metadata["reference"]``. It gives the four rotors'
+    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the
+    policy sees are in a state, ``metadata["state"]``. A vehicle that is not given, and the scaling,
+    are those that :func:`agent_settings` finds in the zip or next to it, or else ``itm`` and Table
+    A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: in whose body frame and order of the rotors the file speaks; its thrust limits,
