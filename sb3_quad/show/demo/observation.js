@@ -158,7 +158,7 @@ export class Observer {
     });
     const [c, d] = headingOf(s);
     this.preview.forEach((steps, k) => {
-      const [x, y, z] = ahead(steps);
+      const [x, y, z] = Array.from(ahead(steps));
       out.set([c * x + d * y, c * y - d * x, z].map((each) => each / ACCELERATION_STD), this.ages.length * size + 3 * k);
     });
     return out;
