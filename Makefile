@@ -29,7 +29,7 @@ help:
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
 	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
-	@echo "make transfer-table print the table of docs/research/export.md, ARGS=\"-n 64 --seed 2\""
+	@echo "make transfer-table print the table of docs/research/export.md, ARGS=\"-n 64 --curves\""
 	@echo "make test-extras    install each extra into an empty environment, as docs/installation.md says, and try it; ARGS=\"tune zoo\" some"
 	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
 	@echo "make docs-links     ask each address outside of the site, where there is a network"
@@ -67,11 +67,11 @@ fuzz: $(INSTALLED)
 test-zoo: $(ZOO_INSTALLED)
 	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py tests/test_ray.py tests/test_tracking.py $(ARGS)
 
-# Shipped agents as NAME@VEHICLE.onnx; AGENTS="any-quadcopter run/agent.zip" others.
-AGENTS ?= any-quadcopter crazyflie-robust
+# Shipped agents as NAME@VEHICLE.onnx; AGENTS="any-quadcopter run/agent.zip" others. ARGS="--curves -n 64": how they follow.
+AGENTS ?= any-quadcopter crazyflie-robust itm-robust
 OTHERS := examples/other_simulators
 TRANSFER_FILES := build/transfer
-FLOWN := cf2x_L250 cf21B_500 rotorpy_crazyflie rotorpy_hummingbird l2f_crazyflie
+FLOWN := itm crazyflie hummingbird cf2x_L250 cf21B_500 rotorpy_crazyflie rotorpy_hummingbird l2f_crazyflie
 TRANSFER_PY := OMP_NUM_THREADS=1 TRANSFER_FILES=. $(abspath $(TRANSFER_VENV))/bin/python -W ignore
 
 test-transfer: $(TRANSFER_INSTALLED) transfer-files
@@ -82,13 +82,14 @@ transfer-table: $(TRANSFER_INSTALLED) transfer-files
 		echo; echo "In $${where%%,*}:"; echo; \
 		$(TRANSFER_PY) $(abspath $(OTHERS))/in_$${where%%,*}.py *.onnx $${where#*,} $(ARGS); \
 	done; echo; echo "In sb3_quad:"; echo; \
-	PYTHONPATH=$(CURDIR) $(abspath $(PY)) $(abspath $(OTHERS))/in_own.py *.onnx --delay 0 1 $(ARGS)
+	PYTHONPATH=$(CURDIR):$$($(abspath $(PY)) -c 'import sysconfig; print(sysconfig.get_path("purelib"))') \
+	$(TRANSFER_PY) $(abspath $(OTHERS))/in_own.py *.onnx --delay 0 1 $(ARGS)
 
-# A crazyflie-robust flies the crazyflies only.
+# A crazyflie-robust flies the crazyflies only, itm-robust itm.
 transfer-files: $(INSTALLED)
 	@rm -rf $(TRANSFER_FILES) && mkdir -p $(TRANSFER_FILES)
 	@for agent in $(AGENTS); do name=$$(basename $$agent .zip); for vehicle in $(FLOWN); do \
-		case $$name@$$vehicle in crazyflie*@*hummingbird) continue;; esac; \
+		case $$name@$$vehicle in itm-*@itm) ;; itm-*|crazyflie-*@itm|crazyflie-*@*hummingbird) continue;; esac; \
 		$(PY) -m sb3_quad.cli export $$agent --format onnx --vehicle $$vehicle -o $(TRANSFER_FILES)/$$name@$$vehicle.onnx >/dev/null || exit 1; \
 	done; done
 

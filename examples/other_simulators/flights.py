@@ -7,7 +7,7 @@ up; SI units; a control step of 10 ms.
 
 import argparse
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,6 +22,19 @@ STEPS = 1500  # control steps of a flight
 TASKS = {"targets": (0.1, np.pi), "recoveries": (0.25, np.radians(10.0))}
 MAX_DISTANCE = 30.0  # m; farther from its target a flight is out of range
 ARRIVED = 0.1  # m
+SETTLED = 200  # control steps after which the errors of a curve count
+# The motion of a target at rest: position, velocity and acceleration in each control step of a
+# flight and a second after it, which is what an agent sees of the future.
+REST = np.zeros((STEPS + 101, 3, 3))
+QUARTER = np.pi / 2.0
+# Sines along x, y and z: sizes (m), multiples of a rate, phases; and greatest speed over that rate.
+SINES = {
+    "figure_eight": ((2.0, 1.0, 0.0), (1, 2, 0), (0.0, 0.0, 0.0), np.sqrt(8.0)),
+    "circle": ((2.0, 2.0, 0.0), (1, 1, 0), (QUARTER, 0.0, 0.0), 2.0),
+    # That of crazyflow's FigureEightEnv, which takes 10 s: 0.889 m/s.
+    "vertical_eight": ((1.0, 0.0, 0.5), (1, 0, 2), (0.0, 0.0, 0.0), np.sqrt(2.0)),
+}
+CURVES = ("figure_eight_1", "figure_eight_2", "figure_eight_4", "circle_2")
 
 
 @dataclass
@@ -49,6 +62,19 @@ class State:
         return np.moveaxis(np.array(rows), -1, 0)
 
 
+@dataclass
+class Setpoint:
+    """Where n vehicles should be, and how that moves, in the world frame.
+
+    Positions (n, 3), m, velocity (3,), m/s, and the accelerations (steps, 3), m/s², from this
+    control step on. No heading is asked for.
+    """
+
+    position: Array
+    velocity: Array
+    accelerations: Array
+
+
 class Simulator(Protocol):
     """n vehicles of one kind in another simulator."""
 
@@ -74,13 +100,13 @@ class Simulator(Protocol):
 class Policy(Protocol):
     """A function from observations (n, 18) to thrusts (n, 4), N.
 
-    Experts use the true state and the targets (n, 3) instead.
+    Experts use the true state instead.
     """
 
     def reset(self, n: int) -> None:
         """Begin n flights."""
 
-    def __call__(self, observation: Array, state: State, target: Array) -> Array:
+    def __call__(self, observation: Array, state: State, setpoint: Setpoint) -> Array:
         """The thrusts to command."""
 
 
@@ -98,7 +124,11 @@ class ExportedAgent:
         self._session = onnxruntime.InferenceSession(
             file, options, providers=["CPUExecutionProvider"]
         )
-        rotors = self._session.get_modelmeta().custom_metadata_map["rotors"]
+        facts = self._session.get_modelmeta().custom_metadata_map
+        rotors = facts["rotors"]
+        # In how many control steps it sees the acceleration of its reference.
+        ahead = re.findall(r"of the reference in (\d+) control steps", facts["observation"])
+        self._ahead = [int(steps) for steps in ahead]
         signs = []
         for x, y, yaw in re.findall(r"x (\S+) m, y (\S+) m, yaw moment ([+-])", rotors):
             signs.append([np.sign(float(x)), np.sign(float(y)), float(yaw + "1")])
@@ -114,7 +144,9 @@ class ExportedAgent:
         if len(inputs) > 1:
             self._state = np.zeros((n, inputs[1].shape[1]), np.float32)
 
-    def __call__(self, observation: Array, state: State, target: Array) -> Array:
+    def __call__(self, observation: Array, state: State, setpoint: Setpoint) -> Array:
+        seen = setpoint.accelerations[self._ahead].ravel().astype(np.float32)
+        observation = np.hstack([observation, np.tile(seen, (len(observation), 1))])
         if self._state is None:
             (thrusts,) = self._session.run(None, {"observation": observation})
         else:
@@ -124,7 +156,11 @@ class ExportedAgent:
 
 
 class Raptor:
-    """RAPTOR's policy (package ``foundation-policy``), used as in examples/raptor.py."""
+    """RAPTOR's policy (package ``foundation-policy``), used as in examples/raptor.py.
+
+    As its authors do, it sees position and velocity relative to the setpoint. Where rotors form a
+    plus, it sees the vehicle and the world turned by 45°.
+    """
 
     # Signs of x, y and yaw moment of each motor.
     MOTORS = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
@@ -134,18 +170,25 @@ class Raptor:
 
         self._policy = foundation_policy.Raptor()
         self._thrusts = simulator.thrusts
-        signs = np.sign(simulator.rotors).astype(int).tolist()
+        self._turn = np.eye(3)
+        if not simulator.rotors[:, :2].all():
+            c = np.sqrt(0.5)
+            self._turn = np.array([[c, -c, 0.0], [c, c, 0.0], [0.0, 0.0, 1.0]])
+        signs = np.sign(simulator.rotors @ self._turn.T).astype(int).tolist()
         self._order = [self.MOTORS.index(tuple(rotor)) for rotor in signs]
 
     def reset(self, n: int) -> None:
         self._policy.reset()
         self._last = np.zeros((n, 4), np.float32)
 
-    def __call__(self, observation: Array, state: State, target: Array) -> Array:
+    def __call__(self, observation: Array, state: State, setpoint: Setpoint) -> Array:
         position, to_body, velocity, rates = np.split(observation, [3, 12, 15], axis=1)
         rotation = to_body.reshape(-1, 3, 3).transpose(0, 2, 1)
-        velocity = np.einsum("nij,nj->ni", rotation, velocity).clip(-1.0, 1.0)
-        position = position.clip(-0.5, 0.5)
+        turn = self._turn
+        velocity = (np.einsum("nij,nj->ni", rotation, velocity) @ turn.T).clip(-1.0, 1.0)
+        position = (position @ turn.T).clip(-0.5, 0.5)
+        rotation = turn @ rotation @ turn.T
+        rates = rates @ turn.T
         inputs = np.hstack([position, rotation.reshape(-1, 9), velocity, rates, self._last])
         self._last = self._policy.evaluate_step(inputs).astype(np.float32).clip(-1.0, 1.0)
         commands = self._last[:, self._order].astype(np.float64)
@@ -173,11 +216,37 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def observe(state: State, target: Array) -> Array:
-    """The 18 numbers of docs/export.md, (n, 18)."""
+def make_curve(name: str) -> Array:
+    """Position, velocity and acceleration at each control step, (steps, 3, 3), m, m/s, m/s².
+
+    Positions are relative to the start. A round is a whole number of control steps, as in
+    docs/following.md.
+
+    :param name: one of ``SINES`` and the greatest speed, m/s, as in ``figure_eight_2``.
+    :raises SystemExit: for another name.
+    """
+    shape, _, speed = name.rpartition("_")
+    if shape not in SINES or not re.fullmatch(r"\d+(\.\d+)?", speed) or float(speed) == 0.0:
+        raise SystemExit(f"{name}: no curve; must be {' or '.join(SINES)}, with _SPEED (m/s)")
+    sizes, harmonics, phases, per_rate = SINES[shape]
+    steps = round(2.0 * np.pi * per_rate / float(speed) / CONTROL_STEP)
+    rates = 2.0 * np.pi / (steps * CONTROL_STEP) * np.array(harmonics)
+    times = CONTROL_STEP * np.arange(len(REST))[:, None]
+    motion = np.zeros_like(REST)
+    for k in range(3):
+        # Each derivative of a sine is a quarter of its round ahead.
+        angles = rates * times + np.array(phases) + k * np.pi / 2.0
+        motion[:, k] = np.array(sizes) * rates**k * np.sin(angles)
+    motion[:, 0] -= motion[0, 0]
+    return motion
+
+
+def observe(state: State, setpoint: Setpoint) -> Array:
+    """The 18 numbers of docs/export.md, relative to the setpoint, (n, 18)."""
     to_body = state.rotation.transpose(0, 2, 1)
-    velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
-    return np.hstack([state.position - target, to_body.reshape(-1, 9), velocity, state.body_rates])
+    velocity = np.einsum("nij,nj->ni", to_body, state.velocity - setpoint.velocity)
+    position = state.position - setpoint.position
+    return np.hstack([position, to_body.reshape(-1, 9), velocity, state.body_rates])
 
 
 def check_rotors(make: Callable[[int], Simulator]) -> None:
@@ -191,6 +260,8 @@ def check_rotors(make: Callable[[int], Simulator]) -> None:
     turned = _after_hover(make(4), 0.2)
     rates = turned.body_rates - hovering.body_rates
     climb = turned.velocity[:, 2] - hovering.velocity[:, 2]
+    # Rotors of a plus turn it about one of two axes only.
+    rates[np.abs(rates) < 1e-3 * np.abs(rates).max()] = 0.0
     x, y, yaw = simulator.rotors.T
     if not np.array_equal(np.sign(rates), np.sign(np.stack([y, -x, yaw], axis=1))):
         raise SystemExit(
@@ -235,24 +306,8 @@ def fly(
     :param delay: control steps from a command to its effect.
     """
     start, target = sample_starts(task, simulator.n, seed)
-    rng = np.random.default_rng([seed, 1])
-    simulator.reset(start)
-    policy.reset(simulator.n)
-    commands = [np.full((simulator.n, 4), simulator.hover)] * delay
-    state = start
-    lost = np.zeros(simulator.n, np.bool_)
-    errors = np.zeros((STEPS, simulator.n))
-    for step in range(STEPS):
-        factors = 1.0 + noise * rng.standard_normal((simulator.n, 18))
-        observation = observe(state, target) * factors
-        # The simulator may give anything for a vehicle that has crashed, also NaN.
-        observation[lost] = 0.0
-        commands.append(policy(observation.astype(np.float32), state, target))
-        simulator.step(np.where(lost[:, None], simulator.hover, commands.pop(0)))
-        state = simulator.state()
-        errors[step] = np.linalg.norm(state.position - target, axis=1)
-        lost |= ~(errors[step] <= MAX_DISTANCE) | (state.position[:, 2] <= simulator.ground)
-        errors[step, lost] = np.inf
+    errors, state = _errors(simulator, policy, start, target, REST, seed, noise, delay)
+    lost = np.isinf(errors[-1])
     distance, tilt = TASKS[task]
     near = errors <= ARRIVED
     first = np.where(near.any(axis=0), near.argmax(axis=0) + 1, np.inf)
@@ -261,6 +316,79 @@ def fly(
     last = np.where(near[-1], STEPS + 1 - near_at_the_end, np.inf)
     succeeded = ~lost & (errors[-1] <= distance) & (state.rotation[:, 2, 2] >= np.cos(tilt))
     return Flights(~lost, succeeded, errors[-1], first * CONTROL_STEP, last * CONTROL_STEP)
+
+
+@dataclass
+class Following:
+    """How n flights followed a curve, (n,) each: root mean square and greatest distance, m.
+
+    They count from 2 s on, and are infinite for a flight that crashed or got out of range.
+    """
+
+    rms: Array
+    greatest: Array
+
+
+def follow(
+    simulator: Simulator,
+    policy: Policy,
+    curve: str,
+    seed: int,
+    noise: float,
+    delay: int,
+    moving: bool = False,
+) -> Following:
+    """Follow a curve from a hover at its start; parameters as those of ``fly``.
+
+    :param moving: begin with the curve's velocity instead, level.
+    """
+    start = sample_starts("targets", simulator.n, seed)[0]
+    motion = make_curve(curve)
+    if moving:
+        start.velocity = np.tile(motion[0, 1], (simulator.n, 1))
+    errors, _ = _errors(simulator, policy, start, start.position, motion, seed, noise, delay)
+    settled = errors[SETTLED:]
+    return Following(np.sqrt(np.mean(settled**2, axis=0)), settled.max(axis=0))
+
+
+def _errors(
+    simulator: Simulator,
+    policy: Policy,
+    start: State,
+    target: Array,
+    motion: Array,
+    seed: int,
+    noise: float,
+    delay: int,
+) -> tuple[Array, State]:
+    """Fly, and return the distances after each control step, (STEPS, n), m, and the last state.
+
+    :param motion: of the target, as from ``make_curve``.
+    """
+    rng = np.random.default_rng([seed, 1])
+    simulator.reset(start)
+    policy.reset(simulator.n)
+    commands: list[Array] = []
+    state = start
+    lost = np.zeros(simulator.n, np.bool_)
+    errors = np.zeros((STEPS, simulator.n))
+    for step in range(STEPS):
+        position, velocity, _ = motion[step]
+        setpoint = Setpoint(target + position, velocity, motion[step:, 2])
+        factors = 1.0 + noise * rng.standard_normal((simulator.n, 18))
+        observation = observe(state, setpoint) * factors
+        # The simulator may give anything for a vehicle that has crashed, also NaN.
+        observation[lost] = 0.0
+        commands.append(policy(observation.astype(np.float32), state, setpoint))
+        command = np.full((simulator.n, 4), simulator.hover)
+        if step >= delay:
+            command = commands.pop(0)
+        simulator.step(np.where(lost[:, None], simulator.hover, command))
+        state = simulator.state()
+        errors[step] = np.linalg.norm(state.position - target - motion[step + 1, 0], axis=1)
+        lost |= ~(errors[step] <= MAX_DISTANCE) | (state.position[:, 2] <= simulator.ground)
+        errors[step, lost] = np.inf
+    return errors, state
 
 
 HEADER = (
@@ -287,6 +415,17 @@ def table_row(labels: Iterable[str], targets: Flights, recoveries: Flights) -> s
     return f"| {' | '.join(cells)} |"
 
 
+def curve_cell(flights: Following) -> str:
+    """Format a cell: means over the flights that survived, and how many did if not all."""
+    survived = np.isfinite(flights.rms)
+    if not survived.any():
+        return "0 % survive"
+    cell = f"{flights.rms[survived].mean():.3f} / {flights.greatest[survived].mean():.3f} m"
+    if not survived.all():
+        cell += f" ({_percent(survived)} % survive)"
+    return cell
+
+
 def _percent(flights: Array) -> str:
     return f"{100 * flights.mean():.1f}"
 
@@ -308,9 +447,9 @@ class Cell:
 
 
 def parse_options(
-    description: str, cells: Iterable[str], others: Iterable[str]
+    description: str, cells: Iterable[str], others: Iterable[str], curves: Sequence[str]
 ) -> argparse.Namespace:
-    """Read the command line of a script with these cells and other controllers."""
+    """Read the command line of a script with these cells, other controllers and curves."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -324,9 +463,8 @@ def parse_options(
         "--cells",
         nargs="+",
         choices=cells,
-        default=[*cells],
         metavar="CELL",
-        help=f"some of {', '.join(cells)} (all)",
+        help=f"some of {', '.join(cells)} (all; of curves those without wind)",
     )
     add(
         "--others",
@@ -343,6 +481,14 @@ def parse_options(
         default=[0],
         help="control steps from a command to its effect; each of several is flown (0)",
     )
+    add(
+        "--curves",
+        nargs="*",
+        metavar="CURVE",
+        help="follow curves instead, named as figure_eight_2 is, 2 m/s at most, or circle_2; "
+        f"--curves alone: {', '.join(curves)}",
+    )
+    add("--moving", action="store_true", help="begin with the curve's velocity, not in a hover")
     add("-n", type=int, default=256, help="flights of each task in a cell (256)")
     add("--seed", type=int, default=1, help="seed of starts and noise (1)")
     add(
@@ -351,19 +497,33 @@ def parse_options(
         default=0.05,
         help="relative standard deviation of each observed number (0.05)",
     )
-    return parser.parse_args()
+    options = parser.parse_args()
+    if options.curves == []:
+        options.curves = curves
+    return options
 
 
 def main(
-    description: str, cells: Mapping[str, Cell], others: Mapping[str, Callable[[Any], Policy]]
+    description: str,
+    cells: Mapping[str, Cell],
+    others: Mapping[str, Callable[[Any], Policy | None]],
+    curves: Sequence[str] = CURVES,
 ) -> None:
     """Run a script's command: check the rotors, fly, print the table.
 
-    :param others: controllers to compare with, by name; each is made for a simulator.
+    :param others: controllers to compare with, by name; each is made for a simulator, or is
+        none that flies there.
+    :param curves: those that it follows if none are named.
     """
-    options = parse_options(description, [*cells], [*others])
-    print(HEADER)
-    for cell in (cells[name] for name in options.cells):
+    options = parse_options(description, [*cells], [*others], curves)
+    header = HEADER
+    names = options.cells or [*cells]
+    if options.curves:
+        columns = ["vehicle", "conditions", "controller", *options.curves]
+        header = f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|"
+        names = options.cells or [name for name in cells if "," not in cells[name].conditions]
+    print(header)
+    for cell in (cells[name] for name in names):
         check_rotors(cell.make)
         simulator = cell.make(options.n)
         policies: dict[str, Policy] = {}
@@ -372,14 +532,25 @@ def main(
             if vehicle in ("", cell.vehicle):
                 policies[name] = ExportedAgent(file, simulator)
         for name in options.others:
-            policies[name] = others[name](simulator)
+            made = others[name](simulator)
+            if made is not None:
+                policies[name] = made
         for delay in options.delay:
             conditions = cell.conditions
             if delay > 0:
                 conditions += f", {10 * delay} ms delay"
+            how = (options.seed, options.noise, delay)
             for name, policy in policies.items():
-                flights = []
-                for task in TASKS:
-                    how = (options.seed, options.noise, delay)
-                    flights.append(fly(simulator, policy, task, *how))
-                print(table_row([cell.vehicle, conditions, name], *flights), flush=True)
+                # A controller may bring a simulator that takes its commands, without a delay.
+                flown = getattr(policy, "simulator", simulator)
+                if delay > 0 and flown is not simulator:
+                    continue
+                labels = [cell.vehicle, conditions, name]
+                if options.curves:
+                    for curve in options.curves:
+                        followed = follow(flown, policy, curve, *how, moving=options.moving)
+                        labels.append(curve_cell(followed))
+                    print(f"| {' | '.join(labels)} |", flush=True)
+                else:
+                    flights = [fly(flown, policy, task, *how) for task in TASKS]
+                    print(table_row(labels, *flights), flush=True)

@@ -1,4 +1,6 @@
-r"""Fly exported agents in crazyflow (TU Munich), and RAPTOR's policy to compare with.
+r"""Fly exported agents in crazyflow (TU Munich).
+
+Its own controller and RAPTOR's policy fly there, too, to compare with.
 
     sb3-quad export any-quadcopter --format onnx --vehicle cf2x_L250 \
         -o any-quadcopter@cf2x_L250.onnx
@@ -7,7 +9,8 @@ r"""Fly exported agents in crazyflow (TU Munich), and RAPTOR's policy to compare
 
 crazyflow: rotors M1 to M4 as Bitcraze numbers them; quaternions x, y, z, w; commands are rotor
 speeds in rpm. Its first principles: rotors that spin up and down at different rates, drag,
-gyroscopic propellers; Runge-Kutta with a step of 2 ms.
+gyroscopic propellers; Runge-Kutta with a step of 2 ms. Its controller, Mellinger's as in the
+Crazyflie's firmware, sees the true state; the others see observations with noise.
 """
 
 from functools import partial
@@ -19,18 +22,23 @@ from crazyflow.control.transform import motor_force2rotor_vel
 from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.sim import Sim
 from crazyflow.sim.integration import Integrator
-from flights import CONTROL_STEP, Array, Cell, Raptor, State, main
+from flights import CONTROL_STEP, CURVES, Array, Cell, Raptor, Setpoint, State, main
 
 FREQUENCY = 500  # Hz, of its physics
 
 
 class Crazyflow:
-    """n vehicles ``drone`` in n of its worlds."""
+    """n vehicles ``drone`` in n of its worlds.
+
+    :param control: what commands are: rotor speeds, or crazyflow's setpoints (n, 16).
+    """
 
     ground = 0.02  # m: half the height of its collision box
 
-    def __init__(self, drone: str, n: int) -> None:
+    def __init__(self, drone: str, n: int, control: Control = Control.rotor_vel) -> None:
         self.n = n
+        self.drone = drone
+        self._control = control
         parameters = load_params(Dynamics.first_principles, drone)
         # Coefficients of the thrust (N), a polynomial in rpm.
         self._curve = np.asarray(parameters["rpm2thrust"], np.float64).ravel()
@@ -42,7 +50,7 @@ class Crazyflow:
         self.rotors = np.stack([-pitch * arm, roll * arm, yaw], axis=1)
         kind = {
             "dynamics": Dynamics.first_principles,
-            "control": Control.rotor_vel,
+            "control": control,
             "integrator": Integrator.rk4,
         }
         self._sim = Sim(n_worlds=n, drone=drone, freq=FREQUENCY, **kind)
@@ -63,8 +71,11 @@ class Crazyflow:
         self._sim.data = self._sim.data.replace(states=self._sim.data.states.replace(**arrays))
 
     def step(self, thrusts: Array) -> None:
-        speeds = self._speeds(thrusts.clip(*self._limits))
-        self._sim.rotor_vel_control(jnp.asarray(speeds[:, None], jnp.float32))
+        if self._control is Control.state:
+            self._sim.state_control(jnp.asarray(thrusts[:, None], jnp.float32))
+        else:
+            speeds = self._speeds(thrusts.clip(*self._limits))
+            self._sim.rotor_vel_control(jnp.asarray(speeds[:, None], jnp.float32))
         self._sim.step(round(FREQUENCY * CONTROL_STEP))
 
     def state(self) -> State:
@@ -81,10 +92,31 @@ class Crazyflow:
         return np.asarray(motor_force2rotor_vel(thrusts, self._curve))
 
 
+class Mellinger:
+    """crazyflow's own controller, with its gains; its commands are setpoints.
+
+    It runs inside of crazyflow: position at 100 Hz, attitude at 500 Hz.
+    """
+
+    def __init__(self, simulator: Crazyflow) -> None:
+        self.simulator = Crazyflow(simulator.drone, simulator.n, Control.state)
+
+    def reset(self, n: int) -> None:
+        pass
+
+    def __call__(self, observation: Array, state: State, setpoint: Setpoint) -> Array:
+        position = setpoint.position
+        # The attitude x, y, z, w, of which it takes the heading, and body rates.
+        rest = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+        same = np.concatenate([setpoint.velocity, setpoint.accelerations[0], rest])
+        return np.hstack([position, np.tile(same, (len(position), 1))])
+
+
 CELLS = {
     "cf2x_L250": Cell("cf2x_L250", "drag", partial(Crazyflow, "cf2x_L250")),
     "cf21B_500": Cell("cf21B_500", "drag", partial(Crazyflow, "cf21B_500")),
 }
 
 if __name__ == "__main__":
-    main(__doc__ or "", CELLS, {"RAPTOR": Raptor})
+    others = {"RAPTOR": Raptor, "Mellinger (true state)": Mellinger}
+    main(__doc__ or "", CELLS, others, (*CURVES, "vertical_eight_0.889"))

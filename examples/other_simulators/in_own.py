@@ -3,6 +3,8 @@ r"""Fly the same exported agents and RAPTOR's policy, on the same starts, in our
     python examples/other_simulators/in_own.py any-quadcopter@cf2x_L250.onnx \
         --cells cf2x_L250 --delay 0 1
 
+RotorPy's SE3 controller flies RotorPy's vehicles where RotorPy is installed.
+
 A cell is a vehicle file of that name. You give the delay here; the file's own delay is ignored.
 """
 
@@ -10,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from flights import Array, Cell, Raptor, State, main
+from flights import Array, Cell, Policy, Raptor, State, main
 
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
@@ -25,6 +27,7 @@ class Own:
 
     def __init__(self, vehicle: str, wind: float, n: int) -> None:
         self.n = n
+        self.name = vehicle
         self._vehicle = load_vehicle(vehicle).model_copy(update={"delay": 0})
         self.hover = self._vehicle.hover_thrust
         self.ground = self._vehicle.collision_radius
@@ -63,9 +66,23 @@ CELLS = {
     "cf21B_500": Cell("cf21B_500", "drag", partial(Own, "cf21B_500", 0.0)),
     "l2f_crazyflie": Cell("l2f_crazyflie", "no drag", partial(Own, "l2f_crazyflie", 0.0)),
 }
+for name in ("itm", "crazyflie", "hummingbird"):
+    CELLS[name] = Cell(name, "no drag", partial(Own, name, 0.0))
 for name in ("rotorpy_crazyflie", "rotorpy_hummingbird"):
     CELLS[name] = Cell(name, "drag", partial(Own, name, 0.0))
     CELLS[name + "_wind"] = Cell(name, "drag, wind 4 m/s", partial(Own, name, 4.0))
 
+
+
+def se3(simulator: Own) -> Policy | None:
+    """RotorPy's controller for RotorPy's vehicles, with its gains for them."""
+    brand, _, vehicle = simulator.name.partition("_")
+    if brand != "rotorpy":
+        return None
+    from in_rotorpy import SE3, parameters_of
+
+    return SE3(parameters_of(vehicle, simulator.n))
+
+
 if __name__ == "__main__":
-    main(__doc__ or "", CELLS, {"RAPTOR": Raptor})
+    main(__doc__ or "", CELLS, {"RAPTOR": Raptor, "SE3 (true state)": se3})

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import roma
 import torch
-from flights import CONTROL_STEP, Array, Cell, Raptor, State, main
+from flights import CONTROL_STEP, Array, Cell, Raptor, Setpoint, State, main
 from rotorpy.controllers.quadrotor_control import BatchedSE3Control
 from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams
 from rotorpy.wind.default_winds import BatchedConstantWind, BatchedNoWind, BatchedSinusoidWind
@@ -28,6 +28,23 @@ from rotorpy.wind.default_winds import BatchedConstantWind, BatchedNoWind, Batch
 DEVICE = torch.device("cpu")
 torch.set_default_dtype(torch.float64)
 torch.set_num_threads(1)
+
+
+def to_fields(state: State) -> dict[str, torch.Tensor]:
+    """A state as RotorPy has it."""
+    fields = {
+        "x": state.position,
+        "v": state.velocity,
+        "q": np.roll(state.quaternion, -1, axis=1),
+        "w": state.body_rates,
+    }
+    return {name: torch.tensor(values) for name, values in fields.items()}
+
+
+def parameters_of(vehicle: str, n: int) -> BatchedMultirotorParams:
+    """The parameters of n vehicles of ``rotorpy.vehicles``."""
+    module = importlib.import_module(f"rotorpy.vehicles.{vehicle}_params")
+    return BatchedMultirotorParams([module.quad_params] * n, n, DEVICE)
 
 
 class Loaded(BatchedMultirotor):
@@ -83,7 +100,7 @@ class RotorPy:
         self.ground = {"crazyflie": 0.0145, "hummingbird": 0.06}[vehicle]
         positions = np.stack([*parameters["rotor_pos"].values()])
         self.rotors = np.column_stack([positions[:, :2], parameters["rotor_directions"]])
-        self.parameters = BatchedMultirotorParams([parameters] * n, n, DEVICE)
+        self.parameters = parameters_of(vehicle, n)
         rng = np.random.default_rng(0)
         arm = np.linalg.norm(positions[0])
         efficiency = torch.tensor(1.0 + weakness * rng.uniform(-1.0, 1.0, (n, 4)))
@@ -96,15 +113,8 @@ class RotorPy:
     def reset(self, start: State) -> None:
         self._time = 0.0
         speeds = np.full((self.n, 4), np.sqrt(self.hover / self._k_eta))
-        quaternions = np.roll(start.quaternion, -1, axis=1)
-        fields = {
-            "x": start.position,
-            "v": start.velocity,
-            "q": quaternions,
-            "w": start.body_rates,
-            "rotor_speeds": speeds,
-        }
-        self.fields = {name: torch.tensor(values) for name, values in fields.items()}
+        self.fields = to_fields(start)
+        self.fields["rotor_speeds"] = torch.tensor(speeds)
         self.fields["wind"] = torch.zeros(self.n, 3)
         self._vehicles = Loaded(self.parameters, self.n, self.fields, DEVICE, integrator="rk4")
         self._vehicles.payload = self._payload
@@ -137,21 +147,23 @@ class SE3:
     Its gains come from RotorPy's vehicle file.
     """
 
-    def __init__(self, simulator: RotorPy) -> None:
-        self._simulator = simulator
-        self._control = BatchedSE3Control(simulator.parameters, simulator.n, DEVICE)
+    def __init__(self, parameters: BatchedMultirotorParams) -> None:
+        self._control = BatchedSE3Control(parameters, parameters.num_drones, DEVICE)
 
     def reset(self, n: int) -> None:
-        self._rest = {
-            "x_dot": torch.zeros(n, 3),
-            "x_ddot": torch.zeros(n, 3),
-            "yaw": torch.zeros(n),
-            "yaw_dot": torch.zeros(n),
-        }
+        pass
 
-    def __call__(self, observation: Array, state: State, target: Array) -> Array:
-        wanted = {"x": torch.tensor(target), **self._rest}
-        commands = self._control.update(0.0, self._simulator.fields, wanted)
+    def __call__(self, observation: Array, state: State, setpoint: Setpoint) -> Array:
+        n = len(state.position)
+        wanted = {
+            "x": setpoint.position,
+            "x_dot": np.tile(setpoint.velocity, (n, 1)),
+            "x_ddot": np.tile(setpoint.accelerations[0], (n, 1)),
+            "yaw": np.zeros(n),
+            "yaw_dot": np.zeros(n),
+        }
+        fields = to_fields(state)
+        commands = self._control.update(0.0, fields, {k: torch.tensor(v) for k, v in wanted.items()})
         return np.asarray(commands["cmd_motor_thrusts"].numpy())
 
 
@@ -183,4 +195,4 @@ for vehicle in ("crazyflie", "hummingbird"):
         )
 
 if __name__ == "__main__":
-    main(__doc__ or "", CELLS, {"RAPTOR": Raptor, "SE3 (true state)": SE3})
+    main(__doc__ or "", CELLS, {"RAPTOR": Raptor, "SE3 (true state)": lambda simulator: SE3(simulator.parameters)})
