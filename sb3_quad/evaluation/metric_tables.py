@@ -69,13 +69,12 @@ def settling_row(tolerance: float) -> Row:
     return Row(f"settling time ({tolerance:g} m)", "s", verb="settle")
 
 
-def estimate_cell(
-    estimate: Estimate | None, factor: float = 1.0, decimals: int = 2, none: str = "–"
-) -> Cell:
-    """Return an estimate with its interval, both times ``factor``; the words ``none`` for None."""
+def estimate_cell(row: Row, estimate: Estimate | None, none: str = "–") -> Cell:
+    """Return the cell of an estimate with its interval in a row; the words ``none`` for None."""
     if estimate is None:
         return Cell(words=none)
-    return Cell(factor * estimate.value, (factor * estimate.low, factor * estimate.high), decimals)
+    ends = (row.factor * estimate.low, row.factor * estimate.high)
+    return Cell(row.factor * estimate.value, ends, row.decimals)
 
 
 def metric_cells(metrics: Metrics) -> Cells:
@@ -105,13 +104,13 @@ def _measured(row: Row, value: Any) -> Cell:
     if not isinstance(value, Moment):
         # A share has as many digits as a single flight takes to show.
         if row.unit == "%":
-            return estimate_cell(value, 100.0, decimals=len(str(value.n // 200)))
-        return estimate_cell(value, decimals=row.decimals)
+            row = replace(row, decimals=len(str(value.n // 200)))
+        return estimate_cell(row, value)
     # A mean time says how many flights it is of, unless it is all or none.
     note = ""
     if 0.0 < value.share.value < 1.0:
         note = f"{100 * value.share.value:.3g} % {row.verb}"
-    return replace(estimate_cell(value.time, none="never"), note=note)
+    return replace(estimate_cell(row, value.time, none="never"), note=note)
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
@@ -128,12 +127,13 @@ def reference_cells(reference: Reference) -> Cells:
     for name, row in {**ROWS, "final_error": MEDIAN}.items():
         number = getattr(reference, name, None)
         if number is not None:
-            cells[row] = _printed(number, 100.0 if row.unit == "%" else 1.0)
-    for row in {SUCCESS, SURVIVAL} & {*cells}:
-        cells[row] = replace(cells[row], note=reference.note)
+            cells[row] = _printed(row, number)
+            if row in (SUCCESS, SURVIVAL):
+                cells[row] = replace(cells[row], note=reference.note)
     # Here None has a meaning: never within the tolerance.
     for tolerance, time in reference.time_to.items():
-        cells[time_row(tolerance)] = _printed(time)
+        row = time_row(tolerance)
+        cells[row] = _printed(row, time)
     return cells
 
 
@@ -267,11 +267,12 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
-def _printed(value: Printed, factor: float = 1.0) -> Cell:
+def _printed(row: Row, value: Printed) -> Cell:
     """A number as its source prints it; a pair is a range, None a time that never came."""
     if value is None:
         return Cell(words="never")
     if isinstance(value, tuple):
         # Tables have a proper minus sign.
-        return Cell(words=" to ".join(f"{factor * end:g}" for end in value).replace("-", "−"))
-    return Cell(factor * value, decimals=len(f"{factor * value:g}".partition(".")[2]))
+        return Cell(words=" to ".join(f"{row.factor * end:g}" for end in value).replace("-", "−"))
+    value *= row.factor
+    return Cell(value, decimals=len(f"{value:g}".partition(".")[2]))

@@ -104,6 +104,11 @@ class Row:
         """The name and the unit."""
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
+    @property
+    def factor(self) -> float:
+        """From values to cells, which give shares in %."""
+        return 100.0 if self.unit == "%" else 1.0
+
 
 @dataclass(frozen=True)
 class Table:

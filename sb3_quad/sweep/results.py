@@ -34,13 +34,13 @@ from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
 from sb3_quad.sweep.folder import RunResult, Sweep
 
-# By measure: its row, the factor from values to cells, and their decimals.
+# The rows of the measures.
 ROWS = {
-    "success": (metric_tables.SUCCESS, 100.0, 2),
-    "survival": (metric_tables.SURVIVAL, 100.0, 2),
-    "reward": (metric_tables.REWARD, 1.0, 2),
-    "final_error": (metric_tables.MEDIAN, 1.0, 3),
-    "time": (Row("mean time until there, or stable", "s"), 1.0, 2),
+    "success": metric_tables.SUCCESS,
+    "survival": metric_tables.SURVIVAL,
+    "reward": metric_tables.REWARD,
+    "final_error": metric_tables.MEDIAN,
+    "time": Row("mean time until there, or stable", "s"),
 }
 COMPARED = ("success", "reward")
 CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
@@ -144,7 +144,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     comparisons = []
     for scenario, group in flights.groupby(level="scenario", sort=False):
         rows = []
-        for measure, (row, factor, decimals) in ROWS.items():
+        for measure, row in ROWS.items():
             key = {"scenario": scenario, "measure": measure}
             statistic = np.nanmedian if measure == "final_error" else np.nanmean
             # Of each configuration a row for each run, a column for each episode.
@@ -156,7 +156,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
                     summary.estimates.append({**dict(mean), **key, "configuration": name})
             # No row for what the environment does not report.
             if any(means.values()):
-                cells = [estimate_cell(mean, factor, decimals) for mean in means.values()]
+                cells = [estimate_cell(row, mean) for mean in means.values()]
                 rows.append(replace(row, cells=cells))
             if measure not in COMPARED:
                 continue
@@ -167,10 +167,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
                 if difference is not None:
                     key |= {"first": first, "second": second, "verdict": verdict(difference)}
                     summary.comparisons.append({**dict(difference), **key})
-                    cells = [
-                        Cell(words=key["verdict"]),
-                        estimate_cell(difference, factor, decimals),
-                    ]
+                    cells = [Cell(words=key["verdict"]), estimate_cell(row, difference)]
                     comparisons.append(
                         Row(f"{scenario}, {row.heading}: {first} than {second}", cells=cells)
                     )
@@ -224,11 +221,10 @@ def verdict(difference: Estimate) -> str:
 
 def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) -> None:
     """Write the report of the finished runs: a section for each table, and the learning curves."""
-    parts: list[Section] = []
-    for table in tables:
-        parts.append(
-            Section(f"table-{len(parts)}", table.title, tables=[table], facts=table.caption)
-        )
+    parts = [
+        Section(f"table-{number}", table.title, tables=[table], facts=table.caption)
+        for number, table in enumerate(tables)
+    ]
     plots = _curves(folder, summary)
     if plots:
         parts.append(

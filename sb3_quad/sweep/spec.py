@@ -38,10 +38,9 @@ class Configuration(SettingsOptions, RunOptions):
     vehicle: str | None = None
     """env_kwargs' vehicle, by name or YAML file"""
 
-    @property
-    def given(self) -> StrDict:
-        """The keys that have another value than their default."""
-        return self.model_dump(include={*Configuration.model_fields}, exclude_defaults=True)
+    def given(self, options: type[Frozen]) -> StrDict:
+        """Return the keys of some options that have another value than their default."""
+        return self.model_dump(include={*options.model_fields}, exclude_defaults=True)
 
 
 class Resources(Frozen):
