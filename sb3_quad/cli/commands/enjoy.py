@@ -75,17 +75,14 @@ FLAGS: Flags = {
     "agent": {
         "--load-best": (
             {"dest": "which", "action": "store_const", "const": "best"},
-            None,
             "fly the best agent of the evaluations",
         ),
         "--load-checkpoint N": (
             {"dest": "which", "type": whole},
-            None,
             "fly the checkpoint after N timesteps",
         ),
         "--load-last-checkpoint": (
             {"dest": "which", "action": "store_const", "const": "last"},
-            None,
             "fly the last checkpoint",
         ),
     },
@@ -95,17 +92,15 @@ FLAGS: Flags = {
         "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
     },
     "actions": {
-        "--deterministic": (SWITCH, False, "fly the mean of a policy's actions (default)"),
-        "--stochastic": (SWITCH, False, "sample a policy's actions"),
+        "--deterministic": (SWITCH, "fly the mean of a policy's actions (default)"),
+        "--stochastic": (SWITCH, "sample a policy's actions"),
     },
     "controllers CONTROLLER": (
         {"nargs": "*"},
-        None,
         "controllers to fly, in addition to the agent of --algo",
     ),
     "-n --n-timesteps N": (
         positive,
-        None,
         "control steps, in as many episodes as needed (one episode)",
     ),
     "--n-envs N": (positive, 1, "number of parallel episodes, with consecutive seeds (1)"),
@@ -114,16 +109,15 @@ FLAGS: Flags = {
     "--vehicle": "vehicle, by name or YAML file (the scenario's, else the first agent's own)",
     "--target": (
         {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")},
-        None,
         "target to fly to, m",
     ),
-    "--no-render": (SWITCH, False, "only fly and print the results"),
+    "--no-render": (SWITCH, "only fly and print the results"),
     "-o --output FILE": (
         SEVERAL,
         [],
         "write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
     ),
-    "--size WxH": (_size, None, "size of one controller's panel, pixels"),
+    "--size WxH": (_size, "size of one controller's panel, pixels"),
     "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
     **TRUST,
     **OVERWRITE,

@@ -54,7 +54,7 @@ DEFAULT_FOLDER = "evaluations"
 
 
 FLAGS: Flags = {
-    "controllers CONTROLLER": (SEVERAL, None, "controllers to fly, see below"),
+    "controllers CONTROLLER": (SEVERAL, "controllers to fly, see below"),
     "--suite": (
         str,
         "thesis",
@@ -62,12 +62,12 @@ FLAGS: Flags = {
     ),
     "-o --output FOLDER": f"folder for the results ({DEFAULT_FOLDER}/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
-    "--episodes N": (whole, None, "episodes of each scenario (the suite's number)"),
-    "--seed N": (whole, None, "seed of each scenario (the suite's seed)"),
+    "--episodes N": (whole, "episodes of each scenario (the suite's number)"),
+    "--seed N": (whole, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
     "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
     "--workers N": (whole, 1, "number of parallel processes (1)"),
-    "--overwrite": (SWITCH, False, "remove the results that the folder holds"),
+    "--overwrite": (SWITCH, "remove the results that the folder holds"),
     "--reward MODULE:FUNCTION": (
         "show the mean of a reward of your own, function(state, actions) per control step"
     ),

@@ -45,7 +45,6 @@ def _line(text: str) -> tuple[str, dict[str, float]]:
 FLAGS: Flags = {
     "groups RUN": (
         SEVERAL,
-        None,
         "run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
     ),
     "--line NAME:SUCCESS:REWARD": (
@@ -55,7 +54,6 @@ FLAGS: Flags = {
     ),
     "--thesis TASK": (
         {"choices": [*THESIS_SCENARIOS]},
-        None,
         f"draw the thesis's results for {' or '.join(THESIS_SCENARIOS)} as horizontal lines",
     ),
     "--show PANEL": (

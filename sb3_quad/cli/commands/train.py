@@ -84,8 +84,8 @@ SETTINGS_FLAGS: Flags = {
         "settings: a YAML file, or one of the package, such as thesis/dagger.yml "
         "(ALGO.yml: undisturbed, PID expert)"
     ),
-    "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
-    "--num-threads N": (positive, None, "threads (the cores; one where PyTorch computes)"),
+    "-params --hyperparams": (PAIRS, "settings to change, such as n_steps:500"),
+    "--num-threads N": (positive, "threads (the cores; one where PyTorch computes)"),
     "--gym-packages MODULE": (SEVERAL, [], "modules that register further environments"),
     **TRUST,
     **PROGRESS,
@@ -95,11 +95,11 @@ SETTINGS_FLAGS: Flags = {
 # The flags of rl-zoo's ``train.py``, with their meanings.
 FLAGS: Flags = {
     **SETTINGS_FLAGS,
-    "--thesis": (SWITCH, False, f"the thesis's method: --conf-file {THESIS}"),
+    "--thesis": (SWITCH, f"the thesis's method: --conf-file {THESIS}"),
     "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
     **field_flags(JobOptions),
     # These replace what the fields say.
-    "--seed N": (seed, None, "seed (0); negative: a random one, recorded in args.yml"),
+    "--seed N": (seed, "seed (0); negative: a random one, recorded in args.yml"),
     **PROGRESS,
 }
 
