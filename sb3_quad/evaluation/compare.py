@@ -7,7 +7,7 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.types import StrDict, StrMapping
-from sb3_quad.base.validate import validate
+from sb3_quad.controllers.agent_settings import settings_of_record
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
@@ -19,7 +19,7 @@ from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import in_words
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
 THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
 
@@ -143,12 +143,7 @@ def _own_settings(controller: Any) -> FlightSettings | None:
     record = getattr(controller, KEY, None)
     if not isinstance(record, dict):
         return None
-    where = f"{type(controller).__name__}.{KEY}"
-    vehicle = validate(Vehicle, record.get("vehicle"), f"{where}: vehicle")
-    # The task of its training does not matter here.
-    default = FlightSettings()
-    changes = {"vehicle": vehicle, "task": default.task, "task_kwargs": default.task_kwargs}
-    return validate(FlightSettings, record | changes, where)
+    return settings_of_record(record, f"{type(controller).__name__}.{KEY}")
 
 
 def _task_table(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
+from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.controllers.resolve import resolve_expert
@@ -106,8 +106,7 @@ def evaluate(
     :raises ConfigError: an unknown backend; a reward that cannot be imported; a folder that holds
         results of another call, that cannot be written, or that another process is writing to.
     """
-    if backend not in FLEETS:
-        raise ConfigError(unknown("backend", backend, FLEETS))
+    refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
         # A missing PyBullet is one error here, not one for each controller.
         importlib.import_module("sb3_quad.base.bullet")

@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import ACTIONS
@@ -150,8 +150,7 @@ def build_network(reference: Reference, where: str = "model") -> Network:
         :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
     """
-    if reference.output not in OUTPUTS:
-        raise ConfigError(unknown("output", reference.output, OUTPUTS))
+    refuse_unknown("output", [reference.output], OUTPUTS)
     # The policy must be one whose layers we know, on the spaces that its settings describe.
     model = reference.model
     layers = deterministic_layers(model.policy, where)

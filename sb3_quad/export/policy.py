@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
@@ -75,8 +75,7 @@ def export_policy(
         "torchscript": (write_torchscript, load.load_torchscript),
         "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
     }
-    if file_format not in formats:
-        raise ConfigError(unknown("format", file_format, formats))
+    refuse_unknown("format", [file_format], formats)
     write, read = formats[file_format]
     # The zip says how its agent flies, unless another vehicle is given.
     algorithm = saved_algorithm(path)

@@ -107,7 +107,7 @@ class RunFolder:
         return read_yaml(self.config), read_yaml(self.arguments)
 
 
-def made_with() -> dict[str, str]:
+def made_with() -> StrDict:
     """Return the commit of the checkout and the versions of the packages that train a run.
 
     The commit has a mark where files differ from it.

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, PositiveFloat, ValidationError, field_validator, model_validator
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import refuse_unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, explain, validate
@@ -282,8 +282,7 @@ class Suite(Frozen):
         :raises ConfigError: an unknown name.
         """
         scenarios = {scenario.name: scenario for scenario in self.scenarios}
-        if name not in scenarios:
-            raise ConfigError(unknown("scenario", name, scenarios))
+        refuse_unknown("scenario", [name], scenarios)
         return scenarios[name]
 
     def with_changes(
@@ -320,9 +319,7 @@ class Suite(Frozen):
                         f"scenario {scenario.name}{flown_by}",
                     )
                 )
-        for name in names:
-            if name not in known:
-                raise ConfigError(unknown("scenario", name, known))
+        refuse_unknown("scenario", names, known)
         return self.model_copy(update={"scenarios": tuple(changed)})
 
     @model_validator(mode="after")
