@@ -54,9 +54,8 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     :param job: of an environment of this package.
     """
     how = dict(job.flight_settings)
-    controllers = {"agent": model, "expert": job.for_evaluation().make_expert()}
     return compare(
-        controllers,
+        {"agent": model, "expert": job.for_evaluation().make_expert()},
         [how.pop("task")],
         FRESH_EPISODES,
         seed_for("table", job.seed),

@@ -64,8 +64,9 @@ def plot_curves(
                     band(panel, colours[name], name + seeds, points, **POINTS)
             for style, (name, heights) in zip(cycle(("--", ":", "-.")), lines.items()):
                 if measure in heights:
-                    height = heights[measure] * factor
-                    panel.axhline(height, color="0.3", ls=style, linewidth=1.2, label=name)
+                    panel.axhline(
+                        heights[measure] * factor, color="0.3", ls=style, linewidth=1.2, label=name
+                    )
     # A title of the figure would lie on the legend.
     panels[0, 0].set_title(title, loc="left")
     legend(figure)

@@ -161,8 +161,9 @@ def _pipeline(configuration: Configuration) -> Pipeline:
         return with_settings(load_pipeline(file), settings)
     algo = configuration.algo or DEFAULT_ALGO
     env = configuration.env or DEFAULT_ENV
-    stage = Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings)
-    return Pipeline(stages=(stage,))
+    return Pipeline(
+        stages=(Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings),)
+    )
 
 
 def _in_words(varied: StrMapping) -> str:

@@ -35,13 +35,13 @@ def write_results(search: Search) -> None:
     if best is None:
         return
     config = search.config(best)
-    # The best settings say where they come from, in comments that train skips.
     settings = yaml.safe_dump({config.env_id: config.settings}, sort_keys=False)
-    origin = (
+    # The best settings say where they come from, in comments that train skips.
+    write_text(
+        folder / BEST,
         f"# Found by sb3-quad tune: trial {best.number} of study {search.name}, "
-        f"{in_words(search, best)}.\n# {train_command(search)}\n"
+        f"{in_words(search, best)}.\n# {train_command(search)}\n{settings}",
     )
-    write_text(folder / BEST, origin + settings)
 
 
 def _row(search: Search, trial: FrozenTrial) -> StrDict:
