@@ -207,8 +207,11 @@ class TrainingConfig(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
         if self.task:
-            keywords = {**self.env_kwargs, **self.eval_env_kwargs}
-            refuse_unknown(f"keyword of {self.env_id}", keywords, FlightSettings.model_fields)
+            refuse_unknown(
+                f"keyword of {self.env_id}",
+                [*self.env_kwargs, *self.eval_env_kwargs],
+                FlightSettings.model_fields,
+            )
             # Evaluations fly with both; each of the two must fit.
             self.flight_settings.with_changes(**self.eval_env_kwargs)
             refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)

@@ -267,10 +267,23 @@ def _write_status(folder: Path, content: StrDict) -> None:
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
-    """Return the zip that a stage passes on, after the offset correction where it has one."""
+    """Return the zip that a stage passes on, after the offset correction where it has one.
+
+    :raises TrainingError: it misses what the stage requires.
+    """
     if stage.correct_offset and run.corrected_model.is_file():
         return run.corrected_model
-    agent = _passed_on(stage, run)
+    if run.evaluations.is_file():
+        rates = np.nan_to_num(read_curve(run.path).values("success"))
+        success = rates.max() if stage.pass_on == "best" else rates[-1]
+        if success < stage.require.success_rate:
+            raise TrainingError(
+                f"stage {stage.name!r}: success {success:.3f} "
+                f"misses what it requires ({stage.require}); its run is {run.path}"
+            )
+    agent = run.model
+    if stage.pass_on == "best" and run.best_model.is_file():
+        agent = run.best_model
     if not stage.correct_offset:
         return agent
     model = load_zip(job.config.algorithm, agent, device=job.device)
@@ -284,21 +297,3 @@ def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Pa
         f"{run.corrected_model}"
     )
     return run.corrected_model
-
-
-def _passed_on(stage: Stage, run: RunFolder) -> Path:
-    """Return the zip that a stage passes on, before the offset correction.
-
-    :raises TrainingError: it misses what the stage requires.
-    """
-    if run.evaluations.is_file():
-        rates = np.nan_to_num(read_curve(run.path).values("success"))
-        success = rates.max() if stage.pass_on == "best" else rates[-1]
-        if success < stage.require.success_rate:
-            raise TrainingError(
-                f"stage {stage.name!r}: success {success:.3f} "
-                f"misses what it requires ({stage.require}); its run is {run.path}"
-            )
-    if stage.pass_on == "best" and run.best_model.is_file():
-        return run.best_model
-    return run.model

@@ -112,10 +112,12 @@ def made_with() -> StrDict:
 
     The commit has a mark where files differ from it.
     """
-    command = shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'")
     try:
         commit = subprocess.check_output(
-            command, cwd=Path(__file__).parent, text=True, stderr=subprocess.DEVNULL
+            shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'"),
+            cwd=Path(__file__).parent,
+            text=True,
+            stderr=subprocess.DEVNULL,
         )
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"

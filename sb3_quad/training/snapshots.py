@@ -133,8 +133,7 @@ class SnapshotFile(BaseCallback):
         if not self._state:
             return ""
         write_bytes(self._run.model, self._state["model"].tobytes())
-        timesteps = int(self._state["timesteps"])
-        return f"; the model after {timesteps:,} timesteps is in {self._run.model}"
+        return f"; the model after {self._state['timesteps']:,} timesteps is in {self._run.model}"
 
 
 def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: Any) -> Any:
