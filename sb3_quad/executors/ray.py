@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from sb3_quad.base.errors import ConfigError, WorkerDied
+from sb3_quad.base.errors import ConfigError, WorkerDied, raised_as
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import TRUST_VARIABLE
@@ -49,7 +49,8 @@ class RayExecutor:
             "log_to_driver": False,
             "logging_level": "ERROR",
         }
-        try:
+        # Ray raises exceptions of many kinds.
+        with raised_as(ConfigError, f"Ray cluster {address or 'on this machine'}: cannot be used"):
             if address is None:
                 # Ray warns about a variable that this package does not use.
                 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -64,13 +65,6 @@ class RayExecutor:
                     environment["py_modules"] = [str(_copy_package(Path(folder)))]
                     self._ray.init(address=address, **options)
             total = self._ray.cluster_resources()
-        except ConfigError:
-            raise
-        except Exception as error:
-            # Ray raises exceptions of many kinds.
-            raise ConfigError(
-                f"Ray cluster {address or 'on this machine'}: cannot be used ({one_line(error)})"
-            ) from None
         self.workers = workers
         if num_cpus:
             self.workers = max(1, int(total.get("CPU", 0) // num_cpus))

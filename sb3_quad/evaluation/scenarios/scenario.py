@@ -7,7 +7,14 @@ from functools import cache
 from operator import attrgetter
 from typing import Annotated, Any
 
-from pydantic import Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PositiveFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from sb3_quad.base.errors import refuse_unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
@@ -88,7 +95,9 @@ class Scenario(Frozen):
     """number of episodes"""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """every episode derives its own from it"""
-    tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1)
+    tolerances: Annotated[
+        tuple[PositiveFloat, ...], AfterValidator(lambda values: tuple(sorted(set(values))))
+    ] = Field(default=TOLERANCES, min_length=1)
     """of arrival, |r - r_T|, m"""
     reference: dict[str, Reference] = {}
     """from a column's title to others' metrics"""
@@ -104,11 +113,6 @@ class Scenario(Frozen):
         if isinstance(value, str) and VEHICLES.is_path(value):
             return load_vehicle(value)
         return value
-
-    @field_validator("tolerances")
-    @classmethod
-    def _rising(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        return tuple(sorted(set(value)))
 
     @model_validator(mode="after")
     def _possible(self) -> "Scenario":
