@@ -250,7 +250,7 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
 
     :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
-    ends: list[StrDict] = []
+    ends = []
 
     def note(local_variables: StrDict, global_variables: StrDict) -> None:
         if not local_variables["done"]:

@@ -185,7 +185,7 @@ def field_flags(model: type[BaseModel], *names: str) -> StrDict:
 
     :param names: the fields; without any, all of them.
     """
-    flags: StrDict = {}
+    flags = {}
     for name in names or model.model_fields:
         field = model.model_fields[name]
         # The alternatives of a union such as `int | None`, or the type itself.

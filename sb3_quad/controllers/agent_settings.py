@@ -83,7 +83,7 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
             )
     # A task is saved by its fields; a mixture holds weights by name instead.
     task = record.get("task")
-    changes = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}
+    changes: StrDict = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}
     if isinstance(task, dict) and "name" in task:
         changes["task"] = validate(Task, task, where)
     return validate(FlightSettings, record | changes, where)
@@ -104,7 +104,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
 
     # The folder has the name of the environment, which says the task.
     where = f"{config}: env_kwargs"
-    given: StrDict = {}
+    given = {}
     if config.parent.name in ENVIRONMENTS:
         given["task"] = ENVIRONMENTS[config.parent.name]
     for part in parts:

@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
-from sb3_quad.base.types import BoolArray, Float32Array, StrDict
+from sb3_quad.base.types import BoolArray, Float32Array
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.statistics import statistics_of
@@ -219,7 +219,7 @@ class Controller:
         if not hasattr(self.source, "predict"):
             return self.source(observation)
         # Without a state yet, the policy begins by itself. Many policies take no such keywords.
-        keywords: StrDict = {}
+        keywords = {}
         if self._predict_state is not None:
             keywords["state"] = self._predict_state
             if episode_start is not None:

@@ -82,7 +82,7 @@ def metric_cells(metrics: Metrics) -> Cells:
 
     What does not exist of these flights, such as the error of survivors without any, has no cell.
     """
-    values: dict[Row, Any] = {row: getattr(metrics, name) for name, row in ROWS.items()}
+    values = {row: getattr(metrics, name) for name, row in ROWS.items()}
     near = arrival_tolerance(map(attrgetter("tolerance"), metrics.arrivals))
     for arrival in metrics.arrivals:
         values[time_row(arrival.tolerance)] = arrival

@@ -144,7 +144,7 @@ def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[
 
 def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Table:
     """Success or survival in each group of scenarios; of several, from the worst to the best."""
-    others: list[str] = []
+    others = []
     for _, scenarios in groups:
         for name, reference in scenarios[0].reference.items():
             if row in reference_cells(reference) and name not in others:

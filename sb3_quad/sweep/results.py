@@ -88,7 +88,7 @@ def write_results(
     :return: means, intervals and comparisons of all runs that are finished, and their tables.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    lines: list[StrDict] = []
+    lines = []
     parts = {}
     summary = SweepResults(sweep=sweep.spec.name, runs=len(sweep.runs))
     # In the order of the plan, not in that in which runs ended.

@@ -2,7 +2,6 @@
 agent.
 """
 
-from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
 
@@ -60,7 +59,7 @@ def execute(
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     results = read_results(folder)
-    calls: dict[Future[RunResult], Run] = {}
+    calls = {}
     # All runs are submitted at once; the executor starts as many as it has workers.
     for run in sweep.runs:
         # Files in the folder of a run name others, which must be found from anywhere.

@@ -56,7 +56,7 @@ def make_runs(spec: SweepSpec) -> list[Run]:
         two runs of one name.
     """
     # Every configuration is checked before the first run starts.
-    runs: dict[str, Run] = {}
+    runs = {}
     for label, data in _cells(spec):
         configuration = validate(
             Configuration, data, f"configuration {label!r}" if label else "sweep"

@@ -224,7 +224,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     status = validate(Status, content, where)
     jobs = stage_jobs(status, {**status.job, **changes})
     runs = list(status.runs)
-    results: dict[str, StageResult] = {}
+    results = {}
     agent = ""
 
     def note(number: int, run: RunFolder) -> None:

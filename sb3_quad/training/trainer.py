@@ -146,7 +146,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
     the former.
     """
     config = job.config
-    eval_envs: dict[str, VecEnv] = {}
+    eval_envs = {}
     with ExitStack() as stack:
         seed = seed_for("training", job.seed)
         env = stack.enter_context(

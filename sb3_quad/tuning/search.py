@@ -186,7 +186,7 @@ class Search:
         # A training ends with a whole rollout.
         total = math.ceil(config.n_timesteps / config.rollout) * config.rollout
         every = math.ceil(total / self.n_evaluations)
-        values: list[float] = []
+        values = []
 
         def should_continue(success: float, reward: float) -> bool:
             if config.task is None:

@@ -71,7 +71,7 @@ class SearchSpace:
 
     def values(self, parameters: StrMapping) -> StrDict:
         """Return the values of the varied settings that some parameters stand for."""
-        values: StrDict = {}
+        values = {}
         for name, parameter in parameters.items():
             values[name] = parameter
             if isinstance(parameter, str) and parameter[:1] in ("[", "{"):
@@ -101,7 +101,7 @@ class SearchSpace:
         """Return the parameters that stand for the settings as they are; None if one of these lies
         outside the space.
         """
-        start: StrDict = {}
+        start = {}
         for name, dimension in self.dimensions.items():
             value = _current(self.config, name)
             is_list = isinstance(dimension, CategoricalDistribution)

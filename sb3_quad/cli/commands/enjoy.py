@@ -248,7 +248,7 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
 
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)
-    changes: StrDict = {}
+    changes = {}
     # With --algo, --env names the environment of the run rather than the task.
     task = options.task or (options.env and not options.algo and env_task)
     if task and task != settings.task:

@@ -20,7 +20,6 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     OVERWRITE,
     SEVERAL,
@@ -75,7 +74,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.report.curves import plot_curves
     from sb3_quad.report.plots import picture
 
-    groups: StrDict = {}
+    groups = {}
     for text in options.groups:
         name, folders = _group(text)
         if name in groups:

@@ -73,7 +73,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         raise ConfigError(
             f"{where}: must hold 'name' and a list 'scenarios', each with keys and values"
         )
-    scenarios: list[Scenario] = []
+    scenarios = []
     for number, entry in enumerate(entries):
         place = f"{where}: scenario {entry.get('name', number)}"
         vehicle = entry.get("vehicle")
