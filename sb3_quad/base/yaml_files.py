@@ -122,8 +122,7 @@ class YamlFolder:
             raise ConfigError(
                 f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file"
             )
-        text = files[name].read_text(encoding="utf-8")
-        return text, name.removesuffix(self.suffix) + self.suffix
+        return files[name].read_text(encoding="utf-8"), name.removesuffix(self.suffix) + self.suffix
 
     def read(self, source: StrPath) -> tuple[dict[Any, Any], str]:
         """Return the keys and values of a file by name or path, and its name for messages.
