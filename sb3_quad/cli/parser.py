@@ -107,10 +107,10 @@ class Pairs(Action):
         setattr(namespace, self.dest, pairs)
 
 
-PAIRS: StrDict = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
-YES_OR_NO: StrDict = {"action": BooleanOptionalAction}
-SWITCH: StrDict = {"action": "store_true"}
-SEVERAL: StrDict = {"nargs": "+"}
+PAIRS = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
+YES_OR_NO = {"action": BooleanOptionalAction}
+SWITCH = {"action": "store_true"}
+SEVERAL = {"nargs": "+"}
 
 
 def whole(text: str) -> int:
@@ -150,9 +150,9 @@ def above_zero(text: str) -> float:
     return number
 
 
-KINDS: dict[Any, Any] = {bool: SWITCH, StrDict: PAIRS, float: float, str: str}
+KINDS = {bool: SWITCH, StrDict: PAIRS, float: float, str: str}
 """The types (or keywords of ``add_argument``) of flags by those of their fields; else ``whole``."""
-OWN_KINDS: StrDict = {"trained_agent": agent_path, "wandb_tags": SEVERAL}
+OWN_KINDS = {"trained_agent": agent_path, "wandb_tags": SEVERAL}
 """Those of single fields."""
 Flags: TypeAlias = "Mapping[str, str | tuple[Any, ...] | Flags]"
 """A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
@@ -212,15 +212,15 @@ EXECUTOR: Flags = {
         "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)"
     ),
 }
-TRUST: Flags = {
+TRUST = {
     "--trust": (
         SWITCH,
         "let zips run code that is pickled in them; only for files you trust (docs/security.md)",
     )
 }
-TRACEBACK: Flags = {"--traceback": (SWITCH, "print the traceback of an error, too")}
-OVERWRITE: Flags = {"--overwrite": (SWITCH, "replace existing files")}
-PROGRESS: Flags = {"-P --progress": (YES_OR_NO, "show a progress bar (yes in a terminal)")}
+TRACEBACK = {"--traceback": (SWITCH, "print the traceback of an error, too")}
+OVERWRITE = {"--overwrite": (SWITCH, "replace existing files")}
+PROGRESS = {"-P --progress": (YES_OR_NO, "show a progress bar (yes in a terminal)")}
 
 
 def given(options: Namespace, *names: str) -> StrDict:

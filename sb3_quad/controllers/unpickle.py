@@ -192,7 +192,7 @@ _CLASSES = _WITH_ATTRIBUTES | _by_name(
     """
 )
 # The function that is called for a name. Items and state of its result follow in the pickle.
-_FUNCTIONS: StrDict = {
+_FUNCTIONS = {
     "numpy.dtype": _dtype,
     # Random numbers: a space without a generator makes its own, which SB3 seeds.
     "numpy.random._pickle.__bit_generator_ctor": _none,

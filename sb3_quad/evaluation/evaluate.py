@@ -128,7 +128,7 @@ def evaluate(
         reward=str(getattr(reward, "__name__", reward or "")),
         package_version=__version__,
         controllers=[*records.values()],
-        scenarios=[*suite.scenarios],
+        scenarios=suite.scenarios,
         entries=[],
         failures=failures,
         digest=_digest(jobs, records),

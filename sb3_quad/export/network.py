@@ -22,7 +22,7 @@ from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
 
-ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
+ACTIVATIONS = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
 """Each output with the name and the unit of one of its four numbers."""
 

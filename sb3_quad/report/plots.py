@@ -29,7 +29,7 @@ STYLE = matplotlib.rc_params_from_file(
 )
 styled = matplotlib.rc_context(STYLE)
 # None removes these from the file, so that the same results give the same bytes.
-METADATA: Any = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
 @dataclass(frozen=True, eq=False)

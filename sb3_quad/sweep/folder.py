@@ -53,7 +53,7 @@ class Sweep(Frozen):
     """A sweep with all that its files say; resuming does not read the settings files again."""
 
     spec: SweepSpec
-    runs: tuple[Run, ...] = Field(min_length=1)
+    runs: list[Run] = Field(min_length=1)
     suite: Suite | None = None
 
 

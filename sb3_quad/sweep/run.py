@@ -145,7 +145,7 @@ def _train(run: Run, place: Path) -> PipelineResult:
         write_text(settings, yaml.safe_dump({stage.env: stage.settings}, sort_keys=False))
         stages.append(stage.model_copy(update={"conf_file": str(settings), "settings": {}}))
     return run_pipeline(
-        Pipeline(stages=tuple(stages)),
+        Pipeline(stages=stages),
         {**run.job, "seed": run.seed, "log_folder": str(place)},
         "pipeline",
         report,

@@ -45,7 +45,7 @@ class Run(Frozen):
     seed: int
     job: StrDict
     """arguments of TrainingJob, less config, seed and log_folder"""
-    stages: tuple[Stage, ...]
+    stages: list[Stage]
     """of its pipeline, with all their settings; a single run is one of one stage"""
 
 
@@ -74,7 +74,7 @@ def make_runs(spec: SweepSpec) -> list[Run]:
                 configuration=name,
                 seed=seed,
                 job=job,
-                stages=tuple(stages),
+                stages=stages,
             )
             if run.name in runs:
                 raise ConfigError(
@@ -162,7 +162,7 @@ def _pipeline(configuration: Configuration) -> Pipeline:
     algo = configuration.algo or DEFAULT_ALGO
     env = configuration.env or DEFAULT_ENV
     return Pipeline(
-        stages=(Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings),)
+        stages=[Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings)]
     )
 
 

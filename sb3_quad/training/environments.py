@@ -14,7 +14,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.process import ignore_interrupts
-from sb3_quad.base.types import StrDict
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.algorithms import as_list, instance
@@ -49,7 +48,7 @@ class _Subproc(RowSeeds, SubprocVecEnv):
         super().close()
 
 
-SINGLE: StrDict = {"dummy": _Dummy, "subproc": _Subproc}
+SINGLE = {"dummy": _Dummy, "subproc": _Subproc}
 
 
 def make_environments(

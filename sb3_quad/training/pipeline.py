@@ -74,11 +74,11 @@ class Stage(Frozen):
 class Pipeline(Frozen):
     """The stages, in order."""
 
-    stages: tuple[Stage, ...] = Field(min_length=1)
+    stages: list[Stage] = Field(min_length=1)
 
     @field_validator("stages")
     @classmethod
-    def _different_names(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    def _different_names(cls, stages: list[Stage]) -> list[Stage]:
         names = [stage.name for stage in stages]
         if len({*names}) < len(names):
             raise ValueError(f"{', '.join(names)}: give each a name of its own")
@@ -90,7 +90,7 @@ class Status(Pipeline):
 
     job: StrDict
     """options of every job"""
-    runs: tuple[str, ...]
+    runs: list[str] = []
     """the run folders of the stages that have begun"""
 
 
@@ -151,7 +151,7 @@ def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
         # The pipeline may be resumed from another folder.
         settings = with_vehicle_paths(merged(stage.settings, changes, stage.name))
         stages.append(stage.model_copy(update={"settings": settings}))
-    return pipeline.model_copy(update={"stages": tuple(stages)})
+    return pipeline.model_copy(update={"stages": stages})
 
 
 def run_pipeline(
@@ -170,7 +170,7 @@ def run_pipeline(
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was
         missed.
     """
-    status = Status(stages=pipeline.stages, job=dict(job), runs=())
+    status = Status(stages=pipeline.stages, job=dict(job))
     jobs = stage_jobs(pipeline, job)
     folder = claim_folder(Path(jobs[0].log_folder) / name, name)
     # The stages are written, too, since the settings file may change before a resume.

@@ -57,7 +57,7 @@ FLAGS: Flags = {
     "--seconds S": (above_zero, 3.0, "duration of each measurement (3)"),
     "--algo": (SEVERAL, ["dagger", "ppo_bc"], "algorithms of the training loops (dagger ppo_bc)"),
     "-conf --conf-file FILE": "settings of the training loops (ALGO.yml)",
-    "--training": (YES_OR_NO, "measure only, or no, training loops (both)"),
+    "--training": (YES_OR_NO, None, "measure only, or no, training loops (both)"),
 }
 
 

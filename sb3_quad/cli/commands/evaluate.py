@@ -114,7 +114,7 @@ def run(options: Namespace) -> int:
     columns = [label for label in labels if label in flown]
     if columns:
         console().print(
-            overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), columns)
+            overview(results.model_copy(update={"scenarios": suite.scenarios}), columns)
         )
     if flown:
         print(

@@ -88,7 +88,7 @@ def run(options: Namespace) -> int:
         return _execute(options, read_sweep(folder), folder)
     spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
-    sweep = Sweep(spec=spec, runs=tuple(make_runs(spec)), suite=suite_of(spec))
+    sweep = Sweep(spec=spec, runs=make_runs(spec), suite=suite_of(spec))
     if not options.dry_run:
         return _execute(options, sweep, None)
     for planned in sweep.runs:

@@ -278,7 +278,7 @@ class Suite(Frozen):
     """its purpose"""
     source: str = "reference"
     """where the reference comes from; heads its column"""
-    scenarios: tuple[Scenario, ...] = Field(min_length=1)
+    scenarios: list[Scenario] = Field(min_length=1)
 
     def scenario(self, name: str) -> Scenario:
         """Return the scenario of a name.
@@ -324,7 +324,7 @@ class Suite(Frozen):
                     )
                 )
         refuse_unknown("scenario", names, known)
-        return self.model_copy(update={"scenarios": tuple(changed)})
+        return self.model_copy(update={"scenarios": changed})
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
