@@ -8,9 +8,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
@@ -48,8 +47,7 @@ RECORDED_RANDOM = 8
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, the last one done
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A controller in a scenario, as the suite has it.
 
     :param reward: your own, as a function or ``package.module:function``; None: none.

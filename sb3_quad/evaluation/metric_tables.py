@@ -1,7 +1,6 @@
 """Tables of metrics: a column for each controller, then columns of others' metrics."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import groupby
 from operator import attrgetter
 from typing import Any
@@ -104,13 +103,13 @@ def _measured(row: Row, value: Any) -> Cell:
     if not isinstance(value, Moment):
         # A share has as many digits as a single flight takes to show.
         if row.unit == "%":
-            row = replace(row, decimals=len(str(value.n // 200)))
+            row = row._replace(decimals=len(str(value.n // 200)))
         return estimate_cell(row, value)
     # A mean time says how many flights it is of, unless it is all or none.
     note = ""
     if 0.0 < value.share.value < 1.0:
         note = f"{100 * value.share.value:.3g} % {row.verb}"
-    return replace(estimate_cell(row, value.time, none="never"), note=note)
+    return estimate_cell(row, value.time, none="never")._replace(note=note)
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
@@ -129,7 +128,7 @@ def reference_cells(reference: Reference) -> Cells:
         if number is not None:
             cells[row] = _printed(row, number)
             if row in (SUCCESS, SURVIVAL):
-                cells[row] = replace(cells[row], note=reference.note)
+                cells[row] = cells[row]._replace(note=reference.note)
     # Here None has a meaning: never within the tolerance.
     for tolerance, time in reference.time_to.items():
         row = time_row(tolerance)
@@ -156,7 +155,7 @@ def metric_rows(
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        rows.append(replace(row, cells=[*own, *cells_of(row, others)]))
+        rows.append(row._replace(cells=[*own, *cells_of(row, others)]))
     return rows
 
 
@@ -180,7 +179,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     for number, cell in enumerate(cells):
         others = np.fmax.reduce(np.delete(high, number), initial=-np.inf)
         # A cell that is alone is not the best.
-        marked.append(replace(cell, best=bool(low[number] > others > -np.inf)))
+        marked.append(cell._replace(best=bool(low[number] > others > -np.inf)))
     return marked
 
 
@@ -213,7 +212,7 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
         words = []
         for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
             if cell != NOTHING:
-                words.append(f"{who} {replace(cell, note='').text}")
+                words.append(f"{who} {cell._replace(note='').text}")
         if words:
             cells.append(Cell(words="; ".join(words)))
         section.append(Row(f"  {', '.join(names)}", row.unit, cells))

@@ -3,10 +3,9 @@ intervals, or words.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from html import escape as escape_html
 from operator import attrgetter
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import rich.console
 import rich.table
@@ -17,8 +16,7 @@ Align = Literal["left", "right"]
 WIDTH = 200  # characters of a line of a table as plain text, at most
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A metric with the ends of its 95 % interval, or words in its place.
 
     :param ends: of the interval; an infinite upper end is an unknown one.
@@ -66,8 +64,7 @@ class Cell:
         return f"{rounded:.{self.decimals}f}".replace("-", "−")
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """The head of a column of cells.
 
     :param colour: of the controller it stands for, ``#rrggbb``.
@@ -85,8 +82,7 @@ class Column:
         return f"{self.source}: {self.name}" if self.source else self.name
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A metric with its unit, and a cell for each column; without cells it is a heading.
 
     :param decimals: of its cells.
@@ -110,8 +106,7 @@ class Row:
         return 100.0 if self.unit == "%" else 1.0
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Rows of cells. ``rich`` prints it as it is; ``page.html.j2`` makes HTML of it.
 
     :param corner: heads the rows' names.

@@ -2,9 +2,8 @@
 
 import io
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import pandas as pd
@@ -32,8 +31,7 @@ styled = matplotlib.rc_context(STYLE)
 METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
-@dataclass(frozen=True, eq=False)
-class Plot:
+class Plot(NamedTuple):
     """A plot of a page; ``name``, unique in a page, is that of its files."""
 
     name: str

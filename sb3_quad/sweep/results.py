@@ -11,7 +11,6 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -157,7 +156,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
             # No row for what the environment does not report.
             if any(means.values()):
                 cells = [estimate_cell(row, mean) for mean in means.values()]
-                rows.append(replace(row, cells=cells))
+                rows.append(row._replace(cells=cells))
             if measure not in COMPARED:
                 continue
             for first, second in combinations(runs, 2):

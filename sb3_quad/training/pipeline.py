@@ -4,7 +4,6 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -108,8 +107,7 @@ class StageResult(NamedTuple):
     seconds: float
 
 
-@dataclass(frozen=True)
-class PipelineResult:
+class PipelineResult(NamedTuple):
     """How a pipeline ended.
 
     :param stages: the finished stages by name. After an interruption, some are missing and

@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import stable_baselines3
@@ -51,8 +51,7 @@ METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")
 OWN_TASK = ""  # the name of the evaluations on the task of the training
 
 
-@dataclass(frozen=True)
-class TrainingResult:
+class TrainingResult(NamedTuple):
     """How a run ended.
 
     :param seconds: wall-clock time of the training, evaluations included.

@@ -9,8 +9,7 @@ whole numbers, others get four significant digits.
 
 import json
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from optuna.distributions import (
     BaseDistribution,
@@ -57,8 +56,7 @@ class Factor(Frozen):
     around: float = Field(gt=1)
 
 
-@dataclass(frozen=True)
-class SearchSpace:
+class SearchSpace(NamedTuple):
     """The settings that are varied, by name, and those that stay.
 
     :param config: the settings that a search starts from.
