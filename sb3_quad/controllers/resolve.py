@@ -54,7 +54,7 @@ def resolve_expert(
         return factory(first_vehicle(vehicle, layout))
 
 
-def import_factory(text: str, kind: str = "expert") -> Any:
+def import_factory(text: str, kind: str) -> Any:
     """Return the factory of a named expert, or the one at ``package.module:factory``.
 
     :raises ConfigError: an unknown name, or a factory that cannot be imported.

@@ -94,10 +94,9 @@ def compare(
     own_reward = load_reward(reward)
     settings = _settings(controllers, env_kwargs)
     pilots = {}
-    for label, controller in controllers.items():
-        flown = settings[label]
+    for label, how in settings.items():
         pilots[label] = resolve_expert(
-            controller, flown.vehicle, "controller", layout=flown.rotor_layout
+            controllers[label], how.vehicle, "controller", layout=how.rotor_layout
         )
 
     comparison = Comparison()
@@ -154,11 +153,7 @@ def _task_table(
     n_flights: int,
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task."""
-    vehicles = {}
-    true_state = True
-    for label, how in settings.items():
-        vehicles[label] = first_vehicle(how.vehicle)
-        true_state &= not how.noise
+    vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
     first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
     scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
@@ -172,7 +167,7 @@ def _task_table(
     rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
 
     title = f"{task}: {n_flights} fresh episodes, the same for all"
-    if true_state:
+    if not any(how.noise for how in settings.values()):
         title += ", true state"
     caption = CAPTION
     if others.count(first) < len(others):

@@ -115,10 +115,9 @@ def evaluate(
 
     records, failures = _load_controllers(suite, controllers, report)
     # Scenario by scenario, so that a suite that is interrupted compares all controllers.
-    jobs = []
-    for scenario in suite.scenarios:
-        for spec in records:
-            jobs.append(Job(spec, scenario, backend, reward))
+    jobs = [
+        Job(spec, scenario, backend, reward) for scenario in suite.scenarios for spec in records
+    ]
     results = Results(
         suite=suite.name,
         description=suite.description,

@@ -67,7 +67,7 @@ Classes: TypeAlias = Annotated[
     list[tuple[str, StrDict]],
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
-Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
+Tasks: TypeAlias = Annotated[list[str], BeforeValidator(as_list)]
 # Units of the layers of all networks, or of each by name; the last form is that of older versions.
 Layers: TypeAlias = list[PositiveInt]
 NetArch: TypeAlias = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
@@ -92,7 +92,7 @@ class TrainingConfig(Frozen):
     """keywords of the environment's constructor"""
     eval_env_kwargs: Keywords = {}
     """put over env_kwargs in the evaluation's environments"""
-    eval_tasks: Tasks = ()
+    eval_tasks: Tasks = []
     """more tasks to evaluate on; the job's own task decides which model is best"""
     best_by: Literal["success", "survival"] = "success"
     """the rate that decides which model is best"""

@@ -34,10 +34,8 @@ class OneOf(Frozen):
     def _exactly_one(self) -> "OneOf":
         given = [name for name in self.ways if getattr(self, name) is not None]
         if len(given) != 1:
-            message = f"give exactly one of {', '.join(self.ways)}"
-            if given:
-                message += f", not {' and '.join(given)}"
-            raise ValueError(message)
+            found = " and ".join(given) or "none"
+            raise ValueError(f"give exactly one of {', '.join(self.ways)}, not {found}")
         return self
 
 
