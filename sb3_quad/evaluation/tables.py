@@ -149,10 +149,12 @@ class Table(NamedTuple):
     def __rich__(self) -> rich.table.Table:
         """The table as ``rich`` prints it; the best of a row is bold."""
         table = rich.table.Table(
-            title=escape(self.title) or None, caption=escape(self.caption) or None
+            title=escape(self.title) or None,
+            caption=escape(self.caption) or None,
+            title_justify="left",
+            caption_justify="left",
+            show_header=any([self.corner, *self._headings]),
         )
-        table.title_justify = table.caption_justify = "left"
-        table.show_header = any([self.corner, *self._headings])
         table.add_column(Text(self.corner), no_wrap=True)
         for column in self.columns:
             table.add_column(Text(column.heading), justify=column.align)

@@ -20,7 +20,7 @@ from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.simulation.observation import FEATURES, GROUPS
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
 
@@ -39,7 +39,7 @@ def export_policy(
     path: StrPath,
     file_format: str,
     output: str = "thrusts",
-    vehicle: str | Path | Vehicle | None = None,
+    vehicle: VehicleSource | None = None,
     name: str | None = None,
     n_observations: int = N_OBSERVATIONS,
 ) -> Export:

@@ -6,7 +6,7 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -40,7 +40,7 @@ STATUS_FILE = "pipeline.yml"
 class Requirement(Frozen):
     """The least that a stage must reach in its best evaluation before the next stage begins."""
 
-    success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
+    success_rate: float = Field(default=0.0, ge=0, le=1)
 
 
 class Stage(Frozen):

@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from sb3_quad.base.errors import refuse_unknown
-from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.seeds import Seed, row_seeds, seed_for
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
@@ -79,7 +79,7 @@ class Scenario(Frozen):
     """external forces and torques"""
     noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
     """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
-    duration: Annotated[float, Field(gt=0, le=600)] = 15.0
+    duration: float = Field(default=15.0, gt=0, le=600)
     """of an episode; the unit is s"""
     max_distance: PositiveFloat = 30.0
     """farther than this from the target ends an episode, m"""
@@ -91,9 +91,9 @@ class Scenario(Frozen):
     """each episode has one of these, unknown to the controller, such as {distribution: raptor}"""
     randomize: Randomization | None = None
     """what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"""
-    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 240
+    episodes: int = Field(default=240, ge=1, le=1_000_000)
     """number of episodes"""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    seed: Seed = 0
     """every episode derives its own from it"""
     tolerances: Annotated[
         tuple[PositiveFloat, ...], AfterValidator(lambda values: tuple(sorted(set(values))))
