@@ -12,7 +12,7 @@ from argparse import (
     RawDescriptionHelpFormatter,
 )
 from collections.abc import Container, Iterable, Mapping
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, ClassVar, NoReturn, TypeAlias
 
 from pydantic import BaseModel
 
@@ -38,7 +38,7 @@ SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
 class Parser(ArgumentParser):
     """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
 
-    siblings: Mapping[str, Container[str]] = {}
+    siblings: ClassVar[dict[str, Container[str]]] = {}
     """The options of each command."""
 
     def __init__(self, **kwargs: Any) -> None:

@@ -76,7 +76,23 @@ class RayExecutor:
         reference = call.remote(sys.argv, os.getcwd(), function, *arguments)
         self._references.append(reference)
         future = Future[Any]()
-        reference.future().add_done_callback(lambda done: self._hand_over(done, future))
+
+        def hand_over(done: "Future[Any]") -> None:
+            """Give the future the outcome of Ray's, with an error that is not of Ray's classes."""
+            error = done.exception()
+            if error is None:
+                future.set_result(done.result())
+            elif isinstance(error, self._ray.exceptions.RayTaskError):
+                future.set_exception(error.cause)
+            else:
+                future.set_exception(
+                    WorkerDied(
+                        f"its worker on the cluster ended, and {RETRIES} more after it "
+                        f"({one_line(error)[:120]})"
+                    )
+                )
+
+        reference.future().add_done_callback(hand_over)
         return future
 
     def stop(self) -> None:
@@ -94,21 +110,6 @@ class RayExecutor:
         for reference in self._references:
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
-
-    def _hand_over(self, done: "Future[Any]", future: "Future[Any]") -> None:
-        """Give a future the outcome of Ray's, with an error that is not one of Ray's classes."""
-        error = done.exception()
-        if error is None:
-            future.set_result(done.result())
-        elif isinstance(error, self._ray.exceptions.RayTaskError):
-            future.set_exception(error.cause)
-        else:
-            future.set_exception(
-                WorkerDied(
-                    f"its worker on the cluster ended, and {RETRIES} more after it "
-                    f"({one_line(error)[:120]})"
-                )
-            )
 
 
 def _check_address(address: str) -> None:

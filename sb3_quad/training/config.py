@@ -8,7 +8,7 @@ n-th part, which it has in the last of n updates.
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 import gymnasium
 from pydantic import (
@@ -49,28 +49,26 @@ from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
-VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
 NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 # For dummy and subproc. PyBullet allows about as many in a process.
 MAX_SINGLE = 1000
 
 
-Whole: TypeAlias = Annotated[
+Whole = Annotated[
     int,
     Field(lt=2**63),
     BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
 ]
-Keywords: TypeAlias = Annotated[
+Keywords = Annotated[
     StrDict, BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
 ]
-Classes: TypeAlias = Annotated[
+Classes = Annotated[
     list[tuple[str, StrDict]],
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
-Tasks: TypeAlias = Annotated[list[str], BeforeValidator(as_list)]
 # Units of the layers of all networks, or of each by name; the last form is that of older versions.
-Layers: TypeAlias = list[PositiveInt]
-NetArch: TypeAlias = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
+Layers = list[PositiveInt]
+NetArch = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
 
 
 class TrainingConfig(Frozen):
@@ -86,13 +84,13 @@ class TrainingConfig(Frozen):
     """timesteps to train on, over all environments; -n on the command line"""
     n_envs: Whole = 1
     """number of parallel environments"""
-    vec_env: VecEnvKind
+    vec_env: Literal["batch", "dummy", "subproc"]
     """batch by default for this package's environments, dummy for others"""
     env_kwargs: Keywords = {}
     """keywords of the environment's constructor"""
     eval_env_kwargs: Keywords = {}
     """put over env_kwargs in the evaluation's environments"""
-    eval_tasks: Tasks = []
+    eval_tasks: Annotated[list[str], BeforeValidator(as_list)] = []
     """more tasks to evaluate on; the job's own task decides which model is best"""
     best_by: Literal["success", "survival"] = "success"
     """the rate that decides which model is best"""
@@ -293,9 +291,8 @@ class TrainingJob(JobOptions):
 def describe(job: TrainingJob) -> str:
     """Return one line about what is going to be trained, in whole rollouts as SB3 trains."""
     config = job.config
-    rollout = config.rollout
     # The last rollout is flown whole.
-    timesteps = -(-config.n_timesteps // rollout) * rollout
+    timesteps = -(-config.n_timesteps // config.rollout) * config.rollout
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
     if timesteps != config.n_timesteps:
         line += f" ({config.n_timesteps:,} were asked for)"

@@ -5,7 +5,7 @@ The learning problem is the same in all of them.
 
 import importlib
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import gymnasium
 from gymnasium.wrappers import TimeLimit
@@ -19,7 +19,7 @@ from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.algorithms import as_list, instance
 from sb3_quad.training.config import TrainingConfig
 
-Env: TypeAlias = gymnasium.Env[Any, Any]
+Env = gymnasium.Env[Any, Any]
 WORKER_ENDED = (
     "a worker process of the environments ended (its error, if it had time for one, is above; "
     "else out of memory?); vec_env dummy needs no worker processes"

@@ -24,7 +24,6 @@ from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.config import (
     SETTINGS,
-    TrainingConfig,
     TrainingJob,
     describe,
     load_config,
@@ -187,7 +186,19 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
             if stage.correct_offset:
-                _check_correction(config)
+                if not config.task:
+                    raise ConfigError(
+                        f"correct_offset: {config.env_id} is not an environment of this package"
+                    )
+                if config.env_wrapper or config.vec_env_wrappers:
+                    raise ConfigError(
+                        "correct_offset: flies without wrappers; remove them, and normalize"
+                    )
+                if config.flight_settings.size != OBSERVATION_SIZE:
+                    raise ConfigError(
+                        f"correct_offset is for agents that see the {OBSERVATION_SIZE} features "
+                        "alone"
+                    )
             if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
                 raise ConfigError("normalize: must be as in the stage before, whose agent it has")
         except ConfigError as error:
@@ -197,18 +208,6 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
-
-
-def _check_correction(config: TrainingConfig) -> None:
-    """Check that the offset of an agent with these settings can be corrected."""
-    if not config.task:
-        raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
-    if config.env_wrapper or config.vec_env_wrappers:
-        raise ConfigError("correct_offset: flies without wrappers; remove them, and normalize")
-    if config.flight_settings.size != OBSERVATION_SIZE:
-        raise ConfigError(
-            f"correct_offset is for agents that see the {OBSERVATION_SIZE} features alone"
-        )
 
 
 def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:

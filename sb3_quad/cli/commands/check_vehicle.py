@@ -96,12 +96,11 @@ def run(options: Namespace) -> int:
     if options.episodes:
         derived = vehicle.geometric_gains is None
         gains = "derived from the parameters" if derived else "of its file"
-        controllers = {
-            "PID": PIDExpert(vehicle),
-            f"geometric, gains {gains}": GeometricExpert(vehicle),
-        }
         print_tables(
-            controllers,
+            {
+                "PID": PIDExpert(vehicle),
+                f"geometric, gains {gains}": GeometricExpert(vehicle),
+            },
             {"vehicle": vehicle, "noise": 0.0},
             options.episodes,
             seed_for("expert", options.seed),

@@ -47,6 +47,7 @@ from sb3_quad.cli.parser import (
     TRUST,
     YES_OR_NO,
     Flags,
+    given,
     whole,
 )
 
@@ -99,14 +100,9 @@ def run(options: Namespace) -> int:
             suite,
             controllers,
             folder,
-            options.backend,
-            options.workers,
-            options.overwrite,
             progress=show,
             report=warn,
-            executor=options.executor,
-            address=options.address,
-            reward=options.reward,
+            **given(options, "backend", "workers", "overwrite", "executor", "address", "reward"),
         )
     # The folder may hold the results of further controllers, from an earlier command.
     flown = {entry.controller for entry in results.entries}

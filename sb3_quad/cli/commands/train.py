@@ -183,8 +183,7 @@ def make_config(options: Namespace) -> Any:
     config = load_config(algo, env, options.conf_file, changes)
     # A file of settings takes precedence over those of the agent.
     if options.trained_agent is not None and options.conf_file is None:
-        changes = as_agent(options.trained_agent, config, changes)
-        config = load_config(algo, env, None, changes)
+        return load_config(algo, env, None, as_agent(options.trained_agent, config, changes))
     return config
 
 
