@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.console import Group
+
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.types import StrDict, StrMapping
@@ -25,7 +27,7 @@ THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
 
 
 class Comparison(dict[str, dict[str, Metrics]]):
-    """The metrics by label and task; ``str`` and notebooks show them as tables.
+    """The metrics by label and task; ``str``, ``rich`` and notebooks show them as tables.
 
     ``tables`` (one for each task) are what is shown.
     """
@@ -34,6 +36,9 @@ class Comparison(dict[str, dict[str, Metrics]]):
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.tables))
+
+    def __rich__(self) -> Group:
+        return Group(*self.tables)
 
     def _repr_markdown_(self) -> str:
         # Notebooks render this; a table in Markdown has no title of its own.

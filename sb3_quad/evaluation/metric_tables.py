@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -82,7 +81,7 @@ def metric_cells(metrics: Metrics) -> Cells:
     What does not exist of these flights, such as the error of survivors without any, has no cell.
     """
     values = {row: getattr(metrics, name) for name, row in ROWS.items()}
-    near = arrival_tolerance(map(attrgetter("tolerance"), metrics.arrivals))
+    near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
     for arrival in metrics.arrivals:
         values[time_row(arrival.tolerance)] = arrival
         # Settling and overshoot are shown of one tolerance only.

@@ -4,7 +4,6 @@ intervals, or words.
 
 from collections.abc import Iterable, Sequence
 from html import escape as escape_html
-from operator import attrgetter
 from typing import Literal, NamedTuple
 
 import rich.console
@@ -137,7 +136,7 @@ class Table(NamedTuple):
 
     @property
     def _headings(self) -> list[str]:
-        return [*map(attrgetter("heading"), self.columns)]
+        return [column.heading for column in self.columns]
 
     def __str__(self) -> str:
         """The table as plain text."""

@@ -76,8 +76,8 @@ def plot_curves(
 def _measures(curves: Sequence[Curve], show: Sequence[str]) -> list[str]:
     """The measures that get a row of panels."""
     # Runs of different algorithms have different losses: all of them are shown.
-    table = pd.concat([pd.DataFrame(dict(curve.measures)) for curve in curves])
-    present = table.dropna(axis="columns", how="all")
+    tables = [pd.DataFrame(dict(curve.measures)) for curve in curves]
+    present = pd.concat(tables).dropna(axis="columns", how="all")
     losses = [*present.filter(regex="loss$")]
     if not show:
         show = ["success", "reward"] if "success" in present else ["reward"]
@@ -96,8 +96,12 @@ def _mean_and_range(runs: Sequence[Curve], axis: str, measure: str) -> pd.DataFr
     Between its evaluations a run is interpolated. There is no line where a run has no values.
     """
     lines = [pd.Series(curve.values(measure), getattr(curve, axis)).dropna() for curve in runs]
-    table = pd.concat(lines, axis="columns").sort_index()
-    table = table.interpolate("index", limit_area="inside").dropna()
+    table = (
+        pd.concat(lines, axis="columns")
+        .sort_index()
+        .interpolate("index", limit_area="inside")
+        .dropna()
+    )
     # pandas cannot aggregate an empty table: a run has no values, or no two runs overlap.
     if table.empty:
         return table

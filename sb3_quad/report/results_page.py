@@ -174,7 +174,5 @@ def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]
 
 
 def _columns(results: Results, others: Iterable[str]) -> list[Column]:
-    columns = [*map(Column, results.colours, results.colours.values())]
-    for name in others:
-        columns.append(Column(name, source=results.source))
-    return columns
+    own = map(Column, results.colours, results.colours.values())
+    return [*own, *(Column(name, source=results.source) for name in others)]

@@ -8,7 +8,6 @@ the Statistical Precipice, NeurIPS 2021): with one seed they cover the choice of
 """
 
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations
@@ -24,7 +23,7 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation import metric_tables
-from sb3_quad.evaluation.learning_curves import Curve, read_curve
+from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.evaluation.metric_tables import estimate_cell
 from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
@@ -241,7 +240,7 @@ def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
     """Plot the evaluations along the way; of pipelines, one plot for each algorithm and environment
     of a stage.
     """
-    curves: dict[str, dict[str, list[Curve]]] = defaultdict(lambda: defaultdict(list))
+    curves: StrDict = {}
     for name, seeds in summary.configurations.items():
         for seed in seeds:
             # Below it, a run folder is <algo>/<Env>_<number>; its stages have their own.
@@ -249,7 +248,8 @@ def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
             for path in sorted(place.glob("*/*/evaluations.npz")):
                 *_, algo, run, _ = path.parts
                 kind = f"{algo} {run.rpartition('_')[0]}"
-                curves[kind][name].append(read_curve(path.parent))
+                runs = curves.setdefault(kind, {}).setdefault(name, [])
+                runs.append(read_curve(path.parent))
     plots: list[Plot] = []
     for kind, groups in curves.items():
         # An environment of others may report neither success nor reward.

@@ -4,7 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
-from operator import attrgetter
 from typing import Annotated, Any
 
 from pydantic import (
@@ -328,7 +327,7 @@ class Suite(Frozen):
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = Counter(map(attrgetter("name"), self.scenarios))
+        names = Counter(scenario.name for scenario in self.scenarios)
         for name, times in names.items():
             if times > 1:
                 raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
