@@ -3,7 +3,6 @@ folder of its own.
 """
 
 import hashlib
-import importlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -107,7 +106,7 @@ def evaluate(
     refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
         # A missing PyBullet is one error here, not one for each controller.
-        importlib.import_module("sb3_quad.base.bullet")
+        from sb3_quad.base import bullet  # noqa: F401
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
     # An error in it shows now, rather than as a failure of each controller.

@@ -3,7 +3,6 @@
 The learning problem is the same in all of them.
 """
 
-import importlib
 from functools import partial
 from typing import Any
 
@@ -80,7 +79,7 @@ def make_environments(
         else:
             # A worker process could not say that PyBullet is missing.
             if config.task:
-                importlib.import_module("sb3_quad.base.bullet")
+                from sb3_quad.base import bullet  # noqa: F401
             phases = n_envs if staggered else 1
             env = SINGLE[config.vec_env](
                 [partial(_make_row, config, row, phases) for row in range(n_envs)]

@@ -24,8 +24,6 @@ agent (vehicle, task and observation) hold for all, unless you give --env,
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-import io
-import itertools
 import sys
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Sequence
@@ -33,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.files import refuse_existing, write_bytes
+from sb3_quad.base.files import refuse_existing, replacing
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     OVERWRITE,
@@ -159,9 +157,9 @@ def run(options: Namespace) -> int:
     size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
         if _is_picture(file):
-            picture = io.BytesIO()
-            Image.fromarray(sequence(episodes[0], *size)).save(picture, format="png", optimize=True)
-            write_bytes(file, picture.getvalue())
+            picture = Image.fromarray(sequence(episodes[0], *size))
+            with replacing(file) as stream:
+                picture.save(stream, format="png", optimize=True)
             print(f"saved {file}")
         else:
             _write_film(file, episodes, size, options)
@@ -295,10 +293,12 @@ def _write_film(
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
 
     def frames() -> Iterator[Any]:
-        films = (film_frames(episode, *size, options.speed) for episode in episodes)
-        for done, frame in enumerate(itertools.chain.from_iterable(films), 1):
-            yield frame
-            show(done, total, "frames")
+        done = 0
+        for episode in episodes:
+            for frame in film_frames(episode, *size, options.speed):
+                yield frame
+                done += 1
+                show(done, total, "frames")
 
     with progress_bar(options.progress) as show:
         write_film(Path(file), frames())
