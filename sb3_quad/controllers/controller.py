@@ -1,7 +1,7 @@
 """One way to ask a controller for actions, whatever it is: an expert, an SB3 model, a function."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -248,7 +248,7 @@ def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     # The batched environment has the state of all rows; others have one for each environment.
     base: Any = env.unwrapped
     if hasattr(base, "true_state"):
-        return cast(Callable[[], QuadcopterState], base.true_state)
+        return base.true_state  # type: ignore[no-any-return]
     if env.has_attr("true_state"):
         return lambda: QuadcopterState.concatenate(env.env_method("true_state"))
     return None

@@ -80,8 +80,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
             entry["vehicle"] = str(folder / vehicle)
         # A cell of a grid is a scenario like any other.
-        for cell in grid(entry, place):
-            scenarios.append(validate(Scenario, cell, place))
+        scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)
 
 
