@@ -2,7 +2,7 @@
 difference.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -92,16 +92,9 @@ class Reference:
         return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
 
 
-class Comparison(NamedTuple):
-    """How much a file differs from its policy."""
-
-    error: float
-    """the largest difference of any rotor, N or rad/s"""
-    n: int
-    """how many observations the file has seen"""
-
-
-def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) -> Comparison:
+def compare(
+    reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS
+) -> tuple[float, int]:
     """Compare a file with the policy that it came from, in the policy's flights.
 
     The flights start at any attitude, up to 30 m from the target, with velocities of N(0, 4 m/s)
@@ -112,6 +105,8 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
 
     :param by: the program that runs the file, for the message.
     :param n: observations, at most: a flight may end early.
+    :return: the largest difference of any rotor, N or rad/s, and how many observations the file
+        has seen.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
     """
@@ -170,4 +165,4 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
             f"the exported policy differs from the trained one by {error:.3g}, "
             f"{allowed:.3g} is allowed ({by}); nothing was written"
         )
-    return Comparison(error, count)
+    return error, count

@@ -99,13 +99,13 @@ def export_policy(
         warnings.simplefilter("ignore", DeprecationWarning)
         # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata), network.state_size)
-        checked = compare(reference, call, by, n_observations)
+        error, n_compared = compare(reference, call, by, n_observations)
         metadata["check"] = (
-            f"largest error {checked.error:.2g} {network.unit} "
-            f"in {checked.n} observations of flights ({by})"
+            f"largest error {error:.2g} {network.unit} "
+            f"in {n_compared} observations of flights ({by})"
         )
         content = write(network, metadata)
-    return Export(content, metadata, checked.error, network.unit, source)
+    return Export(content, metadata, error, network.unit, source)
 
 
 def _describe(
