@@ -71,18 +71,9 @@ FLAGS: Flags = {
     "-f --folder --log-folder DIR": (str, "logs", "folder that holds the run folders (logs)"),
     "--exp-id N": (whole, 0, "number of the run (0: the latest one that has an agent)"),
     "agent": {
-        "--load-best": (
-            {"dest": "which", "action": "store_const", "const": "best"},
-            "fly the best agent of the evaluations",
-        ),
-        "--load-checkpoint N": (
-            {"dest": "which", "type": whole},
-            "fly the checkpoint after N timesteps",
-        ),
-        "--load-last-checkpoint": (
-            {"dest": "which", "action": "store_const", "const": "last"},
-            "fly the last checkpoint",
-        ),
+        "--load-best": (SWITCH, "fly the best agent of the evaluations"),
+        "--load-checkpoint N": (whole, "fly the checkpoint after N timesteps"),
+        "--load-last-checkpoint": (SWITCH, "fly the last checkpoint"),
     },
     "episode": {
         "--env": f"environment id ({DEFAULT_ENV})",
@@ -270,12 +261,12 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
         # Raises if there is no such algorithm.
         get_algorithm(options.algo)
     run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
-    if options.which == "last":
+    if options.load_last_checkpoint:
         path = run.latest_checkpoint()
-    elif options.which == "best":
+    elif options.load_best:
         path = run.best_model
-    elif options.which is not None:
-        path = run.checkpoint(options.which)
+    elif options.load_checkpoint is not None:
+        path = run.checkpoint(options.load_checkpoint)
     else:
         path = run.result
     if not path.is_file():
