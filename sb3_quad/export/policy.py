@@ -78,7 +78,6 @@ def export_policy(
     refuse_unknown("format", [file_format], formats)
     write, read = formats[file_format]
     # The zip says how its agent flies, unless another vehicle is given.
-    algorithm = saved_algorithm(path)
     model = load_model(path)
     settings, source = agent_settings(path)
     given = settings
@@ -92,7 +91,7 @@ def export_policy(
     flown = first_vehicle(given.vehicle)
     reference = Reference(model, settings, flown, output)
     network = build_network(reference, f"model {path}")
-    metadata = _describe(Path(path), algorithm, network, reference, flown)
+    metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.

@@ -88,7 +88,7 @@ class Status(Pipeline):
 
     job: StrDict
     """options of every job"""
-    runs: list[str] = []
+    runs: list[str]
     """the run folders of the stages that have begun"""
 
 
@@ -167,7 +167,7 @@ def run_pipeline(
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was
         missed.
     """
-    status = Status(stages=pipeline.stages, job=dict(job))
+    status = Status(stages=pipeline.stages, job=dict(job), runs=[])
     jobs = stage_jobs(pipeline, job)
     folder = claim_folder(Path(jobs[0].log_folder) / name, name)
     # The stages are written, too, since the settings file may change before a resume.

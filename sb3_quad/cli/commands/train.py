@@ -130,8 +130,9 @@ def run(options: Namespace) -> int:
             "{} goes with a single run (--algo, --env); "
             f"a pipeline's stages have their own in {options.conf_file}",
         )
-        stages = pipeline.load_pipeline(options.conf_file)
-        stages = pipeline.with_settings(stages, changed_settings(options))
+        stages = pipeline.with_settings(
+            pipeline.load_pipeline(options.conf_file), changed_settings(options)
+        )
         result = pipeline.run_pipeline(stages, job, Path(options.conf_file).stem)
     else:
         checked = validate(TrainingJob, {"config": make_config(options), **job}, "command line")
