@@ -49,6 +49,7 @@ from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
+VecEnvKind = Literal["batch", "dummy", "subproc"]
 NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 # For dummy and subproc. PyBullet allows about as many in a process.
 MAX_SINGLE = 1000
@@ -84,7 +85,7 @@ class TrainingConfig(Frozen):
     """timesteps to train on, over all environments; -n on the command line"""
     n_envs: Whole = 1
     """number of parallel environments"""
-    vec_env: Literal["batch", "dummy", "subproc"]
+    vec_env: VecEnvKind
     """batch by default for this package's environments, dummy for others"""
     env_kwargs: Keywords = {}
     """keywords of the environment's constructor"""
