@@ -81,10 +81,10 @@ class GeometricExpert(Expert):
         """Return the external wrench less a part of the vehicles' own drag."""
         if state.vehicles is None or not state.vehicles[P.drag_x : P.drag_z + 1].any():
             return wrench
-        # Drag against the air at rest is that of the vehicle's own motion.
-        at_rest = np.zeros((3, 1))
+        # Drag against air that moves as the reference does is that of errors of the velocity.
+        air = state.target_velocity.T
         wrench = wrench.copy()
-        wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, at_rest)
+        wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, air)
         return wrench
 
 
