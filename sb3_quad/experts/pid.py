@@ -18,6 +18,8 @@ ANGLE_FACTOR = 0.25
 class PIDExpert(Expert):
     """Position PID around an attitude PD controller, on the true state (thesis 2.1.2 and 3.2.1).
 
+    Of a reference that moves it follows velocity, acceleration and heading, which the thesis's has
+    not.
     It is made for small angles: from a random attitude it recovers less than a third of the time.
     The attitude gains are I ωn² and 2 ξ ωn I (Eq. 3.15), so they fit any vehicle. With ITM's
     inertia they are those of Table A.1.
