@@ -258,8 +258,9 @@ def _tracks(table: FloatArray, length: int, loops: bool, dt: float) -> Tracks:
     """Return tables whose accelerations ahead are written, in place."""
     pieces = table.reshape(-1, length, REFERENCE_SIZE)
     later = np.arange(length) + round(AHEAD / dt)
-    end = "wrap" if loops else "clip"
-    pieces[..., -3:] = pieces[..., _ACCELERATION].take(later, axis=1, mode=end)
+    pieces[..., -3:] = pieces[..., _ACCELERATION].take(
+        later, axis=1, mode="wrap" if loops else "clip"
+    )
     return Tracks(table, length, loops)
 
 

@@ -64,8 +64,8 @@ STATE_SIZE = sum(STATE.values())
 POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = [*row_slices(STATE).values()][:6]
 
 X = first_rows(STATE)
-# The rows that say where the vehicle should be: position, velocity, acceleration, heading, its rate,
-# and the acceleration ahead
+# The rows that say where the vehicle should be: position, velocity, acceleration, heading, its
+# rate, and the acceleration ahead
 REFERENCE = slice(X.target, STATE_SIZE)
 
 WRENCH = {"force_world": 3, "force_body": 3, "torque_world": 3, "torque_body": 3}
