@@ -134,11 +134,12 @@ class QuadcopterBatch:
         tracks = (
             NO_TRACKS if settings.reference is None else settings.reference.tracks(control_step)
         )
-        self.moves = settings.reference is not None
+        self.previews = np.array(self.observation.preview or (), dtype=np.int64)
+        # A preview reads what the rows of the target say of its motion.
+        self.moves = settings.reference is not None or self.previews.size > 0
         self.tracks = tracks.table
         self.track_numbers = tracks.numbers()
-        self.course = np.zeros((COURSE_SIZE, n * self.moves))
-        self.previews = np.array(self.observation.preview or (), dtype=np.int64)
+        self.course = np.zeros((COURSE_SIZE, n * (len(tracks.table) > 0)))
 
         tasks = resolve_tasks(settings.task, settings.task_kwargs)
         self.task_parameters, self.task_weights = tasks
