@@ -209,7 +209,7 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
 def table_of(metrics, name, beside):
     scenario = load_suite("thesis").scenario(name)
     rows = metric_rows(
-        scenario, [metric_cells(metrics)], [scenario.reference[each] for each in beside]
+        scenario, [metric_cells(metrics)], [scenario.published[each] for each in beside]
     )
     return Table([Column("agent"), *(Column(each, source="thesis") for each in beside)], rows)
 

@@ -10,6 +10,7 @@ import numpy as np
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
 from sb3_quad.envs.rendering.models import rotor_turning
+from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.results import COLOURS
@@ -20,6 +21,7 @@ from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
+TARGET = "#1ab847"  # that of the hoops
 WRENCH_SECONDS = 0.4  # a wrench is shown for that long, so that a short blow can be seen
 
 
@@ -54,6 +56,19 @@ class Recording:
         # The first target counts as a change, from NaN.
         target = self.state.target
         return target[np.diff(target, axis=0, prepend=np.nan).any(axis=1)]
+
+    @property
+    def follows(self) -> bool:
+        """Whether the target moves along a path."""
+        return bool(self.state.target_velocity.any())
+
+    def trails(self, step: int) -> list[Trail]:
+        """The path flown until ``step``, and the whole path of a target that moves."""
+        # Every second step makes it smooth enough.
+        trails = [Trail(self.state.position[: step + 1 : 2], self.colour)]
+        if self.follows:
+            trails.insert(0, Trail(self.state.target[::2], TARGET))
+        return trails
 
     @property
     def disturbances(self) -> list[int]:

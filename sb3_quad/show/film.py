@@ -19,7 +19,6 @@ from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
-from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.episodes import Recording, landmarks
@@ -142,10 +141,8 @@ def _panel(
         cameras = following_cameras([recording], times, scene.scale, forward, lens)
         for seconds, camera in zip(times, cameras, strict=True):
             step = recording.at(seconds)
-            # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
-            flown = recording.state.position[: step + 1 : 2]
-            picture = Pillow.fromarray(scene.picture(camera, [Trail(flown, recording.colour)]))
+            picture = Pillow.fromarray(scene.picture(camera, recording.trails(step)))
             yield with_header(picture, recording, [_caption(recording, step)], font_size)
 
 
