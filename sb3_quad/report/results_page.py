@@ -35,7 +35,7 @@ from sb3_quad.report.scenario_plots import (
 from sb3_quad.simulation.settings import in_words
 
 OVERVIEW = (
-    "Success: the flight ends within 0.1 m of its target, or, where it starts at its target and that"
+    "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, which"
     " rests, within 0.25 m and tilted by at most 10°. Survival: it neither touches the ground nor"
     " leaves the range. Where a scenario is varied, you see the least and the greatest share."
 )

@@ -274,8 +274,8 @@ class Scenario(Frozen):
             return
         if self.target.waypoints or self.reference.function is not None:
             raise ValueError(
-                "reference: must be a curve or file, no function, and not together with waypoints of"
-                " the target; the curve polynomial has waypoints of its own"
+                "reference: must be a curve or file, no function, and goes with no waypoints of the"
+                " target; the curve polynomial has waypoints of its own"
             )
         lowest = before[2] + self.reference.tracks(vehicle.control_step).table[:, 2].min()
         if lowest <= least:
