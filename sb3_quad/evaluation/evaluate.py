@@ -364,7 +364,7 @@ def _digest(jobs: Sequence[Job], records: Mapping[ControllerSpec, ControllerReco
         inputs = job, records[job.spec], job.spec.own, _vehicle(job.spec, job.scenario)
         digest.update(repr(inputs).encode())
         reference = job.scenario.reference
-        if reference is not None and reference.file is not None:
+        if reference and reference.file:
             digest.update(Path(reference.file).read_bytes())
     return digest.hexdigest()
 

@@ -36,8 +36,9 @@ class Following:
         velocity = state.target_velocity
         speed = np.linalg.norm(velocity, axis=1)
         cosine, sine = state.target_heading.T
-        asked = np.hypot(cosine, sine) > 0.0
-        self.moves |= (speed > 0.0) | asked
+        # One where a heading is asked for, zero where none is.
+        asked = np.hypot(cosine, sine)
+        self.moves |= speed + asked > 0.0
         if step < self._first:
             return
         error = state.position - state.target

@@ -153,8 +153,8 @@ def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Tab
             row, [_share(row, results, label, scenarios) for label in results.colours]
         )
         # A scenario may lack the published metrics of another one.
-        published = [scenarios[0].published.get(name, Published()) for name in others]
-        cells += cells_of(row, map(published_cells, published))
+        printed = [scenarios[0].published.get(name, Published()) for name in others]
+        cells += cells_of(row, map(published_cells, printed))
         rows.append(Row(heading, "", cells))
     return Table(_columns(results, others), rows, corner)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
+from sb3_quad.envs.rendering.camera import DOWN, ON_PATH, broadside
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Pose
@@ -104,6 +105,13 @@ def landmarks(recordings: Iterable[Recording]) -> FloatArray:
     for recording in recordings:
         points += [recording.state.position, recording.targets]
     return np.concatenate(points)
+
+
+def outlook(recordings: Sequence[Recording]) -> FloatArray:
+    """Return the direction in which cameras look at flights, (3,), from higher up at paths that
+    targets move along.
+    """
+    return broadside(landmarks(recordings), ON_PATH if recordings[0].follows else DOWN)
 
 
 class Setting(NamedTuple):

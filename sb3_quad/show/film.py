@@ -18,10 +18,10 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
-from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
+from sb3_quad.envs.rendering.camera import Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
-from sb3_quad.show.episodes import Recording, landmarks
+from sb3_quad.show.episodes import Recording, outlook
 from sb3_quad.show.labels import side_by_side, with_header
 
 FPS = 25
@@ -93,7 +93,7 @@ def film_frames(
     """
     times = frame_times(recordings, speed)
     # One direction for all panels, so that their flights can be compared.
-    forward = broadside(landmarks(recordings))
+    forward = outlook(recordings)
     lens = Lens(width, height)
     panels = [_panel(recording, times, forward, lens) for recording in recordings]
     # Frame by frame, because a film does not fit into memory.
@@ -185,9 +185,7 @@ def show_in_window(
 
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
-    cameras = following_cameras(
-        recordings, times, scene.scale, broadside(landmarks(recordings)), lens
-    )
+    cameras = following_cameras(recordings, times, scene.scale, outlook(recordings), lens)
     begun = time.perf_counter()
     for number, (seconds, camera) in enumerate(zip(times, cameras, strict=True)):
         # The frames follow the clock, so that flights are shown in real time: each waits for its

@@ -12,10 +12,10 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from sb3_quad.base.types import FloatArray, Image
-from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
+from sb3_quad.envs.rendering.camera import Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.models import span
 from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.show.episodes import Recording, landmarks
+from sb3_quad.show.episodes import Recording, landmarks, outlook
 from sb3_quad.show.labels import INK, PLATE, font, side_by_side, with_header
 from sb3_quad.simulation.state import QuadcopterState
 
@@ -70,7 +70,7 @@ def until_settled(recording: Recording) -> Recording:
 def view_of(recordings: Sequence[Recording], lens: Lens) -> View:
     """Return the view that has all flights in its picture."""
     points = landmarks(recordings)
-    forward = broadside(points)
+    forward = outlook(recordings)
     breadth = 2.0 * span(recordings[0].vehicle)
     size = 1.0
     # A larger vehicle needs a camera farther away, from which it must be drawn larger.

@@ -100,7 +100,8 @@ class Reference(Frozen):
     """at the start, rad; path: along the velocity; random: of each piece of random_smooth its own,
     with a rate up to heading_rate; None: nothing is asked of it"""
     heading_rate: float = Field(default=0.0, ge=-20, le=20)
-    """rad/s, for a heading that is a number; so that curves can loop, within 0.3 °/s"""
+    """rad/s, for a heading that is a number; so that curves loop, rounded to whole turns in 600 s,
+    or in 10 s of random_smooth"""
     waypoints: tuple[Point, ...] | None = None
     """polynomial: two or more points, relative to the start, which is added if they do not begin
     there"""
@@ -132,9 +133,8 @@ class Reference(Frozen):
                 raise ValueError(f"curve {curve}: needs {argument}")
         if self.heading == "random" and self.curve != "random_smooth":
             raise ValueError("heading 'random': only with curve random_smooth")
-        is_number = isinstance(self.heading, float) and self.curve != "random_smooth"
-        if self.heading_rate and not is_number and self.heading != "random":
-            raise ValueError("heading_rate: needs a number as heading, of random_smooth 'random'")
+        if self.heading_rate and self.heading in (None, "path"):
+            raise ValueError("heading_rate: needs a heading that is a number or 'random'")
         return self
 
     def tracks(self, dt: float) -> Tracks:

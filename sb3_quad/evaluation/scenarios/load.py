@@ -82,8 +82,8 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
             entry["vehicle"] = str(folder / vehicle)
         reference = entry.get("reference")
         if str(reference).endswith(".csv"):
-            entry["reference"] = str(folder / str(reference))
-        elif isinstance(reference, dict) and "file" in reference:
+            reference = {"curve": "file", "file": reference}
+        if isinstance(reference, dict) and "file" in reference:
             entry["reference"] = {**reference, "file": folder / str(reference["file"])}
         # A cell of a grid is a scenario like any other.
         for cell in grid(entry, place):
