@@ -164,10 +164,10 @@ def _task_table(
     for label, how in settings.items():
         vehicles[label] = first_vehicle(how.vehicle)
         true_state &= not how.noise
+        reference = how.reference
     first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
     scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
-    reference = next(iter(settings.values())).reference
     if reference is not None:
         # Nothing is published of targets that move.
         scenario = scenario.model_copy(update={"reference": reference, "published": {}})

@@ -248,9 +248,8 @@ class Scenario(Frozen):
         random: list[Any] = [vector.std or vector.magnitude for vector in vectors]
         attitude = self.start.attitude
         random += [attitude.distribution, attitude.tilt, self.target.distance]
-        if self.reference is not None:
-            random.append(self.reference.curve == "random_smooth")
-        return not any([*random, self.randomize, self.vehicles])
+        smooth = self.reference and self.reference.curve == "random_smooth"
+        return not any([*random, self.randomize, self.vehicles, smooth])
 
     def _check_way(self, vehicle: Vehicle) -> None:
         """Check that start and targets lie above ground, within ``max_distance`` of each other."""
