@@ -14,6 +14,7 @@ from stable_baselines3 import PPO
 
 # Scale of the features if the zip gives none.
 STD = np.repeat([10 / np.sqrt(3), np.sqrt(3), 5.0, 5.0], [3, 9, 3, 3])
+ACCELERATION_STD = 5.0  # m/s², scale of what is seen of a reference's future
 
 
 class Observation:
@@ -31,23 +32,45 @@ class Observation:
         self.ages = settings.get("history") or [0]
         self.last_action = settings.get("last_action", False)
         self.rule = settings.get("position_integral")
+        # Control steps ahead in which the agent sees the acceleration of its reference.
+        self.preview = settings.get("preview") or []
         self.control_step = settings["vehicle"]["control_step"]
         self.frames = []  # the latest frame first
         self.integral = np.zeros(3)
 
-    def __call__(self, position, rotation, velocity, body_rates, action):
+    def __call__(
+        self,
+        position,
+        rotation,
+        velocity,
+        body_rates,
+        action,
+        heading=0.0,
+        heading_rate=0.0,
+        accelerations=None,
+    ):
         """Return the observation, float32 of shape (18,) or longer.
 
         It holds the scaled features of the current and of earlier control steps, each with the
         action before it.
 
-        :param position: relative to the target, world frame, z up, m.
+        :param position: relative to the target or reference, world frame, z up, m.
         :param rotation: matrix (3, 3), body to world.
-        :param velocity: world frame, m/s.
+        :param velocity: relative to the reference's, world frame, m/s.
         :param body_rates: body frame, rad/s.
         :param action: the agent's last action, (4,); zeros at the start.
+        :param heading: that the body's x axis should have, rad; 0 if nothing is asked of it.
+        :param heading_rate: of that heading, rad/s.
+        :param accelerations: of the reference in each control step of ``preview``, (previews, 3),
+            world frame, m/s²; None: it rests.
         """
+        # All is relative to the reference, and the world is turned to its heading.
+        c, s = np.cos(heading), np.sin(heading)
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         velocity = rotation.T @ velocity
+        body_rates = body_rates - heading_rate * rotation[2]
+        position = turn @ position
+        rotation = turn @ rotation
         # The integral grows near the target alone, so that it removes a constant offset there.
         rule = self.rule
         if rule and self.frames:
@@ -67,6 +90,10 @@ class Observation:
         observed = []
         for age in self.ages:
             observed.append(self.frames[age] if age < len(self.frames) else np.zeros_like(frame))
+        if accelerations is None:
+            accelerations = np.zeros((len(self.preview), 3))
+        for acceleration in accelerations:
+            observed.append(turn @ acceleration / ACCELERATION_STD)
         return np.concatenate(observed).astype(np.float32)
 
 
@@ -155,3 +182,28 @@ if __name__ == "__main__":
             action, _state = model.predict(observed, deterministic=True)
             quadcopter.step(action)
         print(f"{path}: {np.linalg.norm(quadcopter.position):.3f} m from the target after 15 s")
+
+        # Then it follows a circle of 2 m at 2 m/s, and turns once in each.
+        dt = settings["vehicle"]["control_step"]
+        rate = 1.0
+        errors = []
+        for step in range(round(4.0 * np.pi / rate / dt)):
+            angle = rate * dt * step
+            reference = 2.0 * np.array([np.cos(angle) - 1.0, np.sin(angle), 0.0])
+            speed = 2.0 * rate * np.array([-np.sin(angle), np.cos(angle), 0.0])
+            later = angle + rate * dt * np.array(observation.preview)
+            curving = -2.0 * rate**2 * np.stack([np.cos(later), np.sin(later), 0.0 * later], axis=1)
+            observed = observation(
+                quadcopter.position - reference,
+                quadcopter.rotation,
+                quadcopter.velocity - speed,
+                quadcopter.body_rates,
+                action,
+                heading=angle,
+                heading_rate=rate,
+                accelerations=curving,
+            )
+            action, _state = model.predict(observed, deterministic=True)
+            quadcopter.step(action)
+            errors.append(np.linalg.norm(quadcopter.position - reference))
+        print(f"{path}: at most {max(errors[len(errors) // 2 :]):.3f} m off a circle at 2 m/s")

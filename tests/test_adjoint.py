@@ -17,7 +17,7 @@ from torch import nn
 
 from sb3_quad.algorithms.apg import APG
 from sb3_quad.algorithms.flight_cost import FlownStates, flight_cost
-from sb3_quad.algorithms.networks.gradients import Perceptrons, Pullback, network_of
+from sb3_quad.algorithms.networks.gradients import Passes, Perceptrons, network_of
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.simulation.adjoint import MOVING
 from sb3_quad.simulation.batch import QuadcopterBatch
@@ -384,15 +384,18 @@ def test_a_gradient_goes_through_a_policy_as_by_autograd(
     is_compiled = isinstance(network_of(policy), Perceptrons)
     assert is_compiled == (activation is not nn.ELU or not widths)
     twin = deepcopy(policy)
-    pullback = Pullback(policy, rows)
-    for _ in range(calls):
-        x, by_actions = th.randn(rows, inputs), th.randn(rows, outputs).double()
-        ours = pullback(x.numpy(), by_actions.numpy())
-        free = x.clone().requires_grad_()
-        twin.get_distribution(free).mode().backward(by_actions.float())
+    passes = Passes(policy, calls, rows)
+    observed, given = th.randn(calls, rows, inputs), th.randn(calls, rows, outputs).double()
+    for step in range(calls):
+        actions = passes.forward(step, observed[step].numpy())
+        means = twin.get_distribution(observed[step]).mode()
+        np.testing.assert_allclose(actions, means.detach(), rtol=1e-4, atol=2e-6)
+    for step in reversed(range(calls)):
+        ours = passes.backward(step, given[step].numpy())
+        free = observed[step].clone().requires_grad_()
+        twin.get_distribution(free).mode().backward(given[step].float())
         assert ours.dtype == np.float32
         assert_close(ours, free.grad.numpy(), 1e-5, None)
-    pullback.set_gradients()
     for (name, one), other in zip(policy.named_parameters(), twin.parameters(), strict=True):
         assert (one.grad is None) == (other.grad is None), name
         if one.grad is not None:

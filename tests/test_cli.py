@@ -29,7 +29,7 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.training.config import TrainingJob, as_agent, build_config
+from sb3_quad.training.config import TrainingJob, as_agent, build_config, load_config
 from sb3_quad.training.trainer import resume, train
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -452,6 +452,16 @@ def test_an_agent_that_goes_on_with_another_vehicle_is_said(agent, other, capsys
     assert (
         "was trained on the vehicle crazyflie and flies itm" in capsys.readouterr().err
     ) == other
+
+
+def test_an_agent_that_goes_on_with_a_vehicle_of_another_layout_knows_its_rotors():
+    path = agent_path("any-quadcopter")
+    changes = {"env_kwargs": {"vehicle": "crazyflie"}}
+    config = load_config("apg", ENV, overrides=changes)
+    config = load_config("apg", ENV, overrides=as_agent(path, config, changes))
+    assert config.flight_settings.rotor_layout.name == "itm"
+    # The expert of the closing table flies it in this layout, too.
+    config.make_expert()
 
 
 def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):

@@ -34,6 +34,7 @@ from sb3_quad.show.demo.page import (
     make_page,
     script,
 )
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
@@ -64,6 +65,14 @@ if (job.observations) {
 const flight = new Flight(job.vehicle, agent);
 if (job.world) flight.setWorld(job.world, 0);
 flight.begin(job.start);
+if (job.drawn) {
+  const course = new Course(job.drawn, job.start.target, job.limits);
+  const rows = Array.from({ length: job.steps }, (_, k) => course.at(k * job.limits.dt));
+  await new Promise((done) => process.stdout.write(JSON.stringify(rows), done));
+  process.exit();
+}
+const dt = job.vehicle.control_step;
+if (job.rows) flight.follow({ at: (time) => job.rows[Math.round(time / dt)] });
 const path = [];
 for (let k = 0; k < job.steps; k++) {
   flight.step({ ...NO_WRENCH, ...job.wrench }, job.actions ? job.actions[k] : flight.act());
@@ -235,6 +244,91 @@ def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path, monkeyp
     assert np.linalg.norm(flight[-1, :3] - flight[-1, 17:20]) < 0.1
 
 
+def previewing(tmp_path):
+    """An agent that previews its reference, and hovers by the weights of one of the package."""
+    model = PPO(
+        "MlpPolicy",
+        QuadcopterVecEnv(1, reference="figure_eight", preview=[0, 5]),
+        policy_kwargs={"net_arch": [64, 64]},
+        device="cpu",
+        seed=0,
+    )
+    known = PPO.load(pretrained("itm-recovery"), device="cpu").policy
+    with torch.no_grad():
+        for new, old in zip(model.policy.parameters(), known.parameters(), strict=True):
+            if new.shape == old.shape:
+                new.copy_(old)
+            elif new.dim() == 2:
+                new.normal_(std=0.05)[:, :18] = old
+    FlightSettings(preview=[0, 5]).write_into(model)
+    model.save(tmp_path / "previewing.zip")
+    return str(tmp_path / "previewing.zip")
+
+
+@node
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["described", "zip"])
+@pytest.mark.parametrize("name", ["itm-robust", "previewing"])
+def test_the_agents_follow_a_reference_as_in_python(name, how, tmp_path, monkeypatch):
+    """A figure eight with a heading that turns: the frame of the observation turns with it."""
+    monkeypatch.setattr(page_module, "EXACT", 10**6)
+    zip_file = previewing(tmp_path) if name == "previewing" else str(pretrained(name))
+    (spec,) = parse_controllers([zip_file])
+    model = PPO.load(zip_file, device="cpu")
+    curve = {"curve": "figure_eight", "speed": 1.5, "heading": 0.3, "heading_rate": 0.4}
+    env = Env(
+        **{**env_kwargs(zip_file), "task": "target_tracking", "noise": 0.0, "reference": curve}
+    )
+    start = start_of(env)
+    table = env.batch.tracks.copy()
+    table[:, :3] += start["target"]
+    rows = [table[k % len(table)].tolist() for k in range(STEPS + 20)]
+    source = {"zip": zip_file} if how == "zip" else {"agent": {"label": name, **describe(spec)}}
+    path = in_node(
+        tmp_path,
+        vehicle=load_vehicle("itm").model_dump(mode="json"),
+        **source,
+        start=start,
+        rows=rows,
+        steps=STEPS,
+    )
+    flight = fly(env, lambda observation, _: model.predict(observation, deterministic=True)[0])
+    assert apart(path, flight) <= 1e-3
+    np.testing.assert_allclose(np.array(path)[:, 17:], flight[:, 17:], atol=1e-12)
+    assert np.linalg.norm(flight[-1, :3] - flight[-1, 17:20]) < (0.1 if name == "itm-robust" else 2)
+
+
+@node
+@pytest.mark.parametrize("loops", [False, True])
+def test_a_drawn_path_becomes_smooth_and_keeps_its_limits(loops, tmp_path):
+    """A zigzag that a hand draws, or a rectangle: corners are rounded and taken slowly."""
+    corners = [[3, 0], [3, 4], [-3, 4], [-3, -2]]
+    if loops:
+        corners += [[3, -2], [3, -0.2]]
+    drawn = [[x, y, 10.0] for x, y in corners]
+    start = {"position": [0, 0, 10], "quaternion": [1, 0, 0, 0], "target": [0, 0, 10]}
+    start |= {"velocity": [0, 0, 0], "body_rates": [0, 0, 0]}
+    limits = {"speed": 2.5, "acceleration": 4.0, "dt": 0.01}
+    vehicle = load_vehicle("itm").model_dump(mode="json")
+    job = {"vehicle": vehicle, "start": start, "drawn": drawn, "limits": limits, "steps": 4000}
+    rows = np.array(in_node(tmp_path, **job))
+    position, velocity, acceleration = rows[:, :3], rows[:, 3:6], rows[:, 6:9]
+    np.testing.assert_allclose(position[0], [0, 0, 10], atol=1e-9)
+    np.testing.assert_allclose(velocity[0], 0, atol=1e-9)
+    assert 2.0 < np.linalg.norm(velocity, axis=1).max() <= 2.5 * 1.01
+    assert 2.0 < np.linalg.norm(acceleration, axis=1).max() <= 4.0 * 1.05
+    # What follows is the derivative of what is before it, also where it loops.
+    np.testing.assert_allclose(np.gradient(position, 0.01, axis=0)[2:-2], velocity[2:-2], atol=0.05)
+    jerk = np.diff(acceleration, axis=0) / 0.01
+    assert np.abs(jerk).max() < 60.0
+    for x, y in corners:
+        assert np.linalg.norm(position[:, :2] - [x, y], axis=1).min() < 0.5
+    at_rest = np.linalg.norm(velocity[-1]) < 1e-9
+    assert at_rest != loops
+    if not loops:
+        np.testing.assert_allclose(position[-1], drawn[-1], atol=1e-6)
+
+
 KINDS = {
     "ppo": (PPO, {}),
     "relu": (PPO, {"policy_kwargs": {"net_arch": [33, 16, 8], "activation_fn": torch.nn.ReLU}}),
@@ -365,8 +459,8 @@ def test_names_are_no_html():
 @pytest.mark.slow
 def test_the_default_page_is_small():
     page, _, rounded = default_page()
-    assert len(page.encode()) <= 500_000
-    assert set(rounded) == {"any-quadcopter"}
+    assert len(page.encode()) <= 620_000
+    assert set(rounded) == {"any-quadcopter", "itm-robust"}
     assert f"Weights of {' and '.join(rounded)} are rounded" in page
 
 
@@ -549,6 +643,41 @@ def test_a_throw_comes_back_and_a_push_disturbs(browser, page):
     browser.value("demo.fleet.vehicle.time_optimal = { 10: 1.5 }")
     browser.value("demo.player.start('10 m away')")
     browser.wait_for("document.getElementById('limit').innerText.includes('1.50 s')")
+    assert not browser.errors
+
+
+@chromium
+@pytest.mark.slow
+def test_they_follow_what_is_drawn_and_a_throw_comes_back_to_it(browser, page):
+    browser.open(page, 1280, 800)
+    browser.value("document.getElementById('tool-draw').click()")
+    assert browser.value("demo.camera.pitch") > 1.4 and not browser.value("demo.player.apart")
+    browser.value("demo.player.start('10 m away')")
+    browser.wait_for("demo.fleet.entries[1].flight.distance < 0.1")
+    middle = browser.value("demo.camera.project(demo.fleet.target).slice(0, 2)")
+    pixels = browser.value("demo.camera.pixels(demo.camera.distance)")
+    turns = np.linspace(0.0, 2.0 * np.pi, 60)
+    circle = np.stack([np.cos(turns) - 1, np.sin(turns)], axis=1) * 2.0 * pixels + middle
+    for k, (x, y) in enumerate(circle):
+        kind = "mouseMoved" if k else "mousePressed"
+        how = {"button": "left", "buttons": 1, "clickCount": 1}
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **how)
+    x, y = circle[-1]
+    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x, y=y, button="left")
+    assert browser.value("demo.fleet.path.course.loops")
+    robust = "demo.fleet.entries[2].flight"
+    browser.wait_for(f"demo.fleet.path.time > 10 && {robust}.distance < 0.15")
+    browser.wait_for("document.getElementById('reference-speed').textContent === '2.0 m/s'")
+    off = browser.value("document.querySelector('#score tr:nth-child(3) td:last-child').innerText")
+    assert re.fullmatch(r"0\.\d{3}", off)
+
+    browser.value("document.getElementById('tool-throw').click()")
+    x, y = browser.value("demo.camera.project(demo.player.bodies()[2].position).slice(0, 2)")
+    browser.drag((x, y), (x + 60, y - 40))
+    browser.wait_for(f"demo.fleet.path && {robust}.time > 4 && {robust}.distance < 0.15")
+    browser.value("dispatchEvent(new KeyboardEvent('keydown', { key: 'u' }))")
+    assert browser.value("demo.fleet.path") is None
+    browser.wait_for("document.getElementById('reference').hidden")
     assert not browser.errors
 
 

@@ -112,7 +112,7 @@ def folder(tmp_path_factory, trained_runs):
             place / "logs/ppo_bc", place / algo / "ppo_bc" if algo == "ppo" else place / algo
         )
     shutil.copytree(ROOT / "examples", place / "examples")
-    for name in ("my.yaml", "my_vehicle.yaml", "mine_tuned.yaml"):
+    for name in ("my.yaml", "my_vehicle.yaml", "mine.yaml", "mine_tuned.yaml"):
         shutil.copy(ROOT / "examples/my_quadcopter.yaml", place / name)
     shutil.copy(ROOT / "zoo_configs/search_spaces/dagger.yml", place / "my_space.yml")
     best = place / "logs/tune/dagger/QuadTargetTracking-v0_1/best.yml"

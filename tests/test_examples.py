@@ -13,6 +13,9 @@ from PIL import Image
 from stable_baselines3 import PPO
 
 from sb3_quad.cli import main
+from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -112,6 +115,16 @@ def test_own_experts_and_vehicles_recover(run, name):
     found = shares(output)
     teacher = found["own expert" if name == "own_expert.py" else "geometric"]
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
+
+
+@pytest.mark.slow
+def test_learning_speed(run, tmp_path):
+    method = "model's gradient from the clone"
+    run("learning_speed.py", "rows.csv", "a.png", "--cpu-seconds", "1", "--methods", method)
+    rows = (tmp_path / "rows.csv").read_text()
+    assert "clone of the PID,0," in rows and f"{method},0," in rows
+    run("learning_speed.py", "rows.csv", "b.png", "--draw")
+    assert Image.open(tmp_path / "b.png").size[0] > 500
 
 
 def test_cloning_plot(run, tmp_path):
@@ -274,3 +287,57 @@ def test_a_gradient_of_ones_own_leads_to_the_mark(run):
     output = run("gradient_of_your_environment.py", "--updates", "20")
     before, after = map(float, re.findall(r"([\d.]+) m from the mark", output))
     assert after < 0.5 * before
+
+
+def imported(name):
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_an_agent_follows_a_stick():
+    """Without a window, from a stick that a test moves: forward, turning, then at rest."""
+    joystick = imported("joystick")  # "joystick.py"
+    moves = [*400 * [(1.0, 0.0, 0.2, 0.5)], *400 * [(0.0, 0.0, 0.0, 0.0)]]
+    asked, off, jumps = iter(moves), [], []
+    for env, guide in joystick.fly("itm-robust", lambda: next(asked, None), render_mode=None):
+        off.append(np.linalg.norm(env.true_state().position[0] - guide.position))
+        jumps.append(np.linalg.norm(guide.acceleration))
+    assert len(off) == 800 and max(off) < 0.5 and off[-1] < 0.1
+    assert max(jumps) < 6.0 and abs(guide.heading - 0.75 * 4.0) < 0.3
+    forward = env.true_state().rotation[0, :2, 0]
+    # It has not been trained to turn.
+    turned = np.arctan2(forward[1], forward[0]) - guide.heading
+    assert abs(np.arcsin(np.sin(turned))) < np.radians(25.0)
+
+
+def test_the_observation_in_plain_sb3_is_that_of_the_environment():
+    """Along a figure eight with a heading that turns, of an agent with frames and a preview."""
+    sees = {"history": [0, 2], "last_action": True, "preview": [0, 5]}
+    sees["position_integral"] = PositionIntegral().model_dump()
+    curve = {"curve": "figure_eight", "speed": 1.0, "heading": 0.3, "heading_rate": 0.5}
+    env = QuadcopterVecEnv(
+        1, task_kwargs={"target_distance": 0.5}, noise=0.0, reference=curve, **sees
+    )
+    settings = {**sees, "vehicle": load_vehicle("itm").model_dump(mode="json")}
+    observation = imported("load_in_plain_sb3").Observation(settings)
+    expert = resolve_expert("geometric", load_vehicle("itm"))
+    table = env.batch.tracks
+    seen = env.reset()[0]
+    action = np.zeros(4)
+    for step in range(60):
+        state = env.true_state()
+        ours = observation(
+            (state.position - state.target)[0],
+            state.rotation[0],
+            (state.velocity - state.target_velocity)[0],
+            state.body_rates[0],
+            action,
+            heading=0.3 + 0.5 * 0.01 * step,
+            heading_rate=0.5,
+            accelerations=table[[step, step + 5], 6:9],
+        )
+        np.testing.assert_allclose(ours, seen, atol=1e-5, err_msg=f"step {step}")
+        action = expert.actions(state)[0]
+        seen = env.step(action[None])[0][0]

@@ -261,6 +261,85 @@ def test_speeds_give_the_thrusts_and_a_rotor_may_stand_still(zips, flight, file_
     np.testing.assert_allclose(vehicle.thrust_coefficient * speeds**2, thrusts, atol=1e-5)
 
 
+LOOKS = {"present": {}, "history": {"history": [0, 2], "last_action": True}}
+FOLLOWS = {
+    "task": "target_tracking",
+    "noise": 0.0,
+    "preview": [0, 5],
+    "reference": {"curve": "figure_eight", "heading": 0.4, "heading_rate": 1.5},
+}
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("file_format", ["torchscript", "onnx", pytest.param("c", marks=compiled)])
+@pytest.mark.parametrize("looks", LOOKS)
+def test_it_follows_a_reference_that_it_previews(tmp_path, file_format, looks):
+    """The C header makes its observations from the true state, by ``NAME_relate``."""
+    env = QuadcopterVecEnv(20, **{**FOLLOWS, **LOOKS[looks]}, seed=3)
+    model = untrained("tanh", env)
+    FlightSettings(**{**FOLLOWS, **LOOKS[looks]}).write_into(model)
+    model.save(tmp_path / "agent.zip")
+    exported = export_policy(tmp_path / "agent.zip", file_format, n_observations=400)
+    assert (
+        "21-23 acceleration of the reference in 5 control steps" in exported.metadata["observation"]
+    )
+    file, state, seen = load(file_format, exported, "agent"), None, env.reset()
+    for step in range(30):
+        truth = env.true_state()
+        speed, (c, s) = truth.target_velocity, truth.target_heading.T
+        features, ahead = physical_features(truth), world_preview(env, step)
+        if file_format == "c":
+            angle, rate = np.arctan2(s, c), np.full(len(c), 1.5)
+            inputs = np.hstack([features, ahead]).astype(np.float32)
+            references = np.ascontiguousarray(np.column_stack([speed, angle, rate]), np.float32)
+            result, state = file(inputs, state, references)
+        else:
+            related = np.hstack(
+                [relate(*row) for row in zip(features, ahead, speed, c, s, strict=True)]
+            )
+            result, state = file(related.reshape(len(c), -1), state)
+        actions = model.predict(seen, deterministic=True)[0]
+        np.testing.assert_allclose(result, ITM.action_to_thrust(actions), atol=2e-4)
+        seen = env.step(actions)[0]
+    assert np.abs(speed).max() > 0.5
+
+
+def world_preview(env, step):
+    """Accelerations of the reference now and in 5 control steps, (n, 6), m/s², world frame."""
+    table = env.batch.tracks
+    now = [table[(step + ahead) % len(table), 6:9] for ahead in (0, 5)]
+    return np.tile(np.concatenate(now), (env.num_envs, 1))
+
+
+def relate(features, ahead, speed, c, s, rate=1.5):
+    """The relative observation, written out otherwise than in the header, float32."""
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    to_body = features[3:12].reshape(3, 3)
+    return np.concatenate(
+        [
+            turn @ features[:3],
+            (to_body @ turn.T).ravel(),
+            features[12:15] - to_body @ speed,
+            features[15:18] - rate * to_body[:, 2],
+            *(turn @ ahead.reshape(2, 3).T).T,
+        ]
+    ).astype(np.float32)
+
+
+@needs_compiler
+@pytest.mark.parametrize("wrong", ["x - s * y", "observation[12 + i] += ", "15 + i] += "])
+def test_a_header_that_relates_otherwise_is_refused(zips, monkeypatch, wrong):
+    write = c_header.render
+
+    def render(*arguments, **words):
+        text = write(*arguments, **words)
+        return text.replace(wrong.replace("-", "+").replace("+=", "-="), wrong)
+
+    monkeypatch.setattr(c_header, "render", render)
+    with pytest.raises(ExportError, match="differs from the trained one"):
+        export_policy(zips / "tanh.zip", "c", n_observations=200)
+
+
 def test_the_run_folder_gives_vehicle_and_scaling(zips, tmp_path):
     run_folder = tmp_path / "run"
     (run_folder / "Env-v0").mkdir(parents=True)
@@ -489,18 +568,19 @@ def test_bad_input_is_one_line(zips, tmp_path, capsys, monkeypatch, arguments, m
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("stateful", [False, True])
-def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, capsys, stateful):
+@pytest.mark.parametrize("section", ["Python", "A policy with a state", "A reference that moves"])
+def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, capsys, section):
     pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
+    stateful = section == "A policy with a state"
     path = extended / "all.zip" if stateful else zips / "tanh.zip"
     for file_format, file in (("onnx", "agent.onnx"), ("c", "agent.h")):
         assert main(["export", str(path), "--format", file_format, "-o", file]) == 0
     printed = capsys.readouterr().out
     assert ("state: zeros begin" in printed) == stateful
-    section, scope = DOCS.split("## A policy with a state" if stateful else "## Python")[1], {}
-    exec(section.split("```python")[1].split("```")[0], scope)
-    (tmp_path / "main.c").write_text(section.split("```c\n")[1].split("```")[0])
+    text, scope = DOCS.split(f"## {section}")[1], {}
+    exec(text.split("```python")[1].split("```")[0], scope)
+    (tmp_path / "main.c").write_text(text.split("```c\n")[1].split("```")[0])
     subprocess.run([COMPILER, *FLAGS, "main.c", "-lm", "-o", "main"], check=True)
     done = subprocess.run(["./main"], check=True, capture_output=True, text=True).stdout.split()
     np.testing.assert_allclose(

@@ -20,7 +20,7 @@ from typing_extensions import Self
 
 from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
 from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost
-from sb3_quad.algorithms.networks.gradients import Pullback, mean_actions, network_of
+from sb3_quad.algorithms.networks.gradients import Passes
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.simulation.tape import FlightCost
@@ -104,7 +104,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
-    _unsaved = ("cost", "_tape", "_observations")
+    _unsaved = ("cost", "_tape", "_passes")
     _tape: Tape
 
     def __init__(
@@ -189,6 +189,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
             )
         self._tape = env.record(self.n_steps, self.substeps)
+        self._passes = Passes(self.policy, self.n_steps, self.n_envs)
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
@@ -202,20 +203,18 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     ) -> bool:
         """Fly ``n_rollout_steps`` steps by the mean action of the policy, and record them."""
         self.policy.set_training_mode(False)
-        network = network_of(self.policy)
-        tape = self._tape
         callback.on_rollout_start()
-        observations = tape.reset(self.carry_on)
-        self._observations = []
+        observations = self._tape.reset(self.carry_on)
         infos: list[StrDict] = [{} for _ in range(env.num_envs)]
         for step in range(n_rollout_steps):
-            self._observations.append(observations)
-            observations = tape.step(mean_actions(network, observations))
+            observations = self._tape.step(self._passes.forward(step, observations))
             self.num_timesteps += env.num_envs
             # Callbacks find every flight to end with the recording.
             dones = np.full(env.num_envs, step == n_rollout_steps - 1)
             if dones.all():
-                for info, reward, length, is_lost in zip(infos, *tape.episodes(), strict=True):
+                for info, reward, length, is_lost in zip(
+                    infos, *self._tape.episodes(), strict=True
+                ):
                     info["episode"] = {"r": float(reward), "l": int(length), "t": 0.0}
                     info["is_success"] = not is_lost
                 self._update_info_buffer(infos, dones)
@@ -233,19 +232,16 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         # Layers such as dropout act as they did in the recorded flight.
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
-        tape = self._tape
-        cost = tape.begin(partial(cost_and_gradients, self.cost))
+        cost = self._tape.begin(partial(cost_and_gradients, self.cost))
 
         # What the critic or an earlier update has left; autograd adds to it.
         self.policy.optimizer.zero_grad()
         # The observation after the last step leads to no action.
-        network = Pullback(self.policy, self.n_envs)
-        by_observations = np.zeros_like(self._observations[0])
+        by_observations = np.zeros_like(self._last_obs)
         for step in reversed(range(self.n_steps)):
-            by_actions = self._limited(tape.backward(step, by_observations))
-            by_observations = network(self._observations[step], by_actions)
+            by_actions = self._limited(self._tape.backward(step, by_observations))
+            by_observations = self._passes.backward(step, by_actions)
 
-        network.set_gradients()
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         if not (np.isfinite(cost) and th.isfinite(norm)):
             self.policy.optimizer.zero_grad()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
-from sb3_quad.simulation.state import STATE, row_slices
+from sb3_quad.simulation.state import STATE
 
 # Distances, m, at which half of the coarse and of the fine part of the position's cost is due.
 COARSE, FINE = 0.5, 0.05
@@ -68,7 +68,8 @@ def cost_and_gradients(
     """Evaluate a cost as :data:`~sb3_quad.simulation.tape.FlightCost` says, by autograd."""
     by_states = th.from_numpy(states).requires_grad_()
     by_actions = th.from_numpy(actions).double().requires_grad_()
-    parts = [by_states[:, rows].transpose(1, 2) for rows in row_slices(STATE).values()]
+    # One split: the gradients of slices would be added up in an array of all states each.
+    parts = [part.transpose(1, 2) for part in th.split(by_states, [*STATE.values()], dim=1)]
     each = cost(FlownStates._make([*parts, by_actions]))
     mean = th.where(th.from_numpy(counts), each, 0.0).mean()
     gradients = th.autograd.grad(

@@ -17,7 +17,7 @@ from sb3_quad.cli import commands
 from sb3_quad.cli.parser import TRACEBACK, Parser, add_flags
 
 EPILOG = """examples:
-  # imitation, then PPO, with domain randomization
+  # imitation, then the model's gradient, with domain randomization
   sb3-quad train
   # a single training
   sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6

@@ -22,7 +22,8 @@ def c_name(text: str) -> str:
 
 def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     """Return the header, with ``static inline void NAME_policy(const float observation[18], float
-    thrust[4])``.
+    thrust[4])``, and ``NAME_relate``, which makes an observation relative to a reference that
+    moves.
 
     For a policy with a state the function takes a ``NAME_state *`` before these, which
     ``NAME_reset`` lets begin a flight.

@@ -18,7 +18,9 @@ from sb3_quad.simulation.observation import (
     turn_features,
 )
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
+from sb3_quad.simulation.state import X
 from sb3_quad.simulation.tasks import Task
+from sb3_quad.simulation.tracks import ACCELERATION_STD
 from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -30,6 +32,14 @@ TOLERANCE = 1e-4
 WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "body_rates_std": 8.0}
 # Here the position integral is at work from the first step on.
 NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
+# References that files are checked with, slow enough to be followed for long.
+MOVING = {
+    "curve": "random_smooth",
+    "speed": 1.5,
+    "acceleration": 3.0,
+    "heading": "random",
+    "heading_rate": 1.0,
+}
 ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
 
 
@@ -70,7 +80,7 @@ class Reference:
         self.clip = 0.0
         statistics = statistics_of(model)
         if statistics is not None:
-            if self.observation.is_extended:
+            if self.observation.size != OBSERVATION_SIZE:
                 raise ConfigError("VecNormalize with more than the present features has no export")
             self.clip = float(statistics.clip_obs)
             self.mean = self.mean + self.std * statistics.obs_rms.mean
@@ -101,25 +111,32 @@ class Comparison(NamedTuple):
     """how many observations the file has seen"""
 
 
-def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) -> Comparison:
+def compare(
+    reference: Reference,
+    call: Call,
+    by: str,
+    n: int = N_OBSERVATIONS,
+    relates: bool = False,
+) -> Comparison:
     """Compare a file with the policy that it came from, in the policy's flights.
 
-    The flights start at any attitude, up to 30 m from the target, with velocities of N(0, 4 m/s)
-    and body rates of N(0, 8 rad/s) per axis, twice what an episode starts with. A policy of the
-    present features flies two steps each time, so that half of the observations are such starts,
-    and both see noise. The flights of a policy with a state are longer, without noise, and half of
-    them start within 1 m.
+    The flights start at any attitude, up to 30 m from references that move and turn, with
+    velocities of N(0, 4 m/s) and body rates of N(0, 8 rad/s) per axis, twice what an episode starts
+    with. A policy of the present features flies two steps each time, so that half of the
+    observations are such starts. The flights of a policy with a state are longer, and half of them
+    start within 1 m.
 
     :param by: the program that runs the file, for the message.
     :param n: observations, at most: a flight may end early.
+    :param relates: whether the file also makes observations relative to references.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
     """
     # Far and fast starts, or long flights for a policy with a state.
-    changes: StrDict = {"task": "recovery_and_tracking", "task_kwargs": WIDE, "noise": 0.05}
+    changes: StrDict = {"task": "recovery_and_tracking", "task_kwargs": WIDE}
     steps = SHORT
     if reference.observation.is_extended:
-        changes = {"task": {"recovery_and_tracking": 1.0, NEAR: 1.0}, "noise": 0.0}
+        changes = {"task": {"recovery_and_tracking": 1.0, NEAR: 1.0}}
         steps = LONG
     settings = FlightSettings().with_changes(
         **changes,
@@ -128,31 +145,46 @@ def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) 
         observation_std=reference.std,
         vehicle=reference.vehicle,
         max_episode_steps=ENDLESS,
+        noise=0.0,
+        reference=MOVING,
     )
     batch = QuadcopterBatch(max(n // steps, 1), settings, seed=0, autoreset=False)
+    # What a file sees of the same states: the present features, without the position integral.
+    present = settings.with_changes(history=None, last_action=False, position_integral=None)
+    shown = QuadcopterBatch(batch.n, present)
+    ahead = np.zeros(3 * len(batch.previews))
+    mean = np.append(reference.mean, ahead)
+    std = np.append(reference.std, ahead + ACCELERATION_STD)
     observation = batch.reset()
     flying = np.ones(batch.n, bool)
     compared = flying.copy()
     # The file flies the vehicle in its own axes and order of rotors.
-    turned = turn_features(reference.turn).astype(np.float32)
+    turned = turn_features(reference.turn)
     integral = reference.observation.position_integral
     file_state = None
     error = 0.0
     count = 0
     for _ in range(steps):
-        # The present frame comes first in an observation. Unscaled, it is the file's input.
-        scaled = observation[:, :OBSERVATION_SIZE]
-        features = (scaled * reference.std + reference.mean).astype(np.float32)
         compared &= flying
+        for name in ("state", "course", "streams"):
+            getattr(shown, name)[...] = getattr(batch, name)
+        features = shown.observe() * std + mean
         if integral is not None:
-            # The position integral is a part of the observed position, and the file has its own.
-            state = batch.true_state()
-            features[:, GROUPS["position"]] = state.position - state.target
             # So close to a limit, rounding may begin to integrate one step earlier or later.
             for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
                 norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
                 compared &= np.abs(norm / limit - 1.0) > ROUNDING
-        results, file_state = call(features @ turned, file_state)
+        references = []
+        if relates:
+            # The same as if the target rested, and apart from it what it does.
+            moving = batch.state[X.target_velocity :]
+            heading = np.arctan2(moving[7], moving[6])
+            numbers = np.stack([*moving[:3], heading, moving[8]], axis=1)
+            references = [numbers.astype(np.float32, order="C")]
+            shown.state[X.target_velocity :] = 0.0
+            features = shown.observe() * std + mean
+        features[:, :OBSERVATION_SIZE] = features[:, :OBSERVATION_SIZE] @ turned
+        results, file_state = call(features.astype(np.float32), file_state, *references)
         if reference.clip:
             observation = observation.clip(-reference.clip, reference.clip)
         actions, _ = reference.model.predict(observation, deterministic=True)

@@ -16,14 +16,14 @@ from sb3_quad.base.errors import ConfigError, ExportError, raised_as
 from sb3_quad.base.imports import require
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import Float32Array
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 N_ROTORS = 4
 COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 Call = Callable[..., tuple[Float32Array, Any]]
-"""From observations in physical units, (n, OBSERVATION_SIZE), and states to results, (n, 4), and
-the next states. The state None begins flights.
+"""From observations in physical units, (n, numbers), and states to results, (n, 4), and the next
+states. The state None begins flights. That of a header also takes references, (n, 5): velocity,
+heading and heading rate.
 """
 
 
@@ -90,7 +90,6 @@ def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
         "run.c.j2",
         name=name,
         stateful=state_size > 0,
-        features=OBSERVATION_SIZE,
         rotors=N_ROTORS,
     )
     with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
@@ -105,13 +104,15 @@ def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
                 raise ExportError(f"{failed}: {compiler} failed ({reason})")
             library = ctypes.CDLL(f"{folder}/run.so")
 
-    def call(rows: Float32Array, state: Any = None) -> Any:
+    def call(rows: Float32Array, state: Any = None, references: Any = None) -> Any:
+        if references is None:
+            references = np.zeros((len(rows), 5), dtype=np.float32)
         begins = state is None
         if begins:
             # A new struct holds anything before its reset.
             state = np.full((len(rows), library.size()), 0xFF, dtype=np.uint8)
         results = np.empty((len(rows), N_ROTORS), dtype=np.float32)
-        arrays = map(np.ctypeslib.as_ctypes, (rows, results, state))
+        arrays = map(np.ctypeslib.as_ctypes, (rows, references, results, state))
         library.run(*arrays, begins, ctypes.c_long(len(rows)))
         return results, state
 

@@ -21,6 +21,7 @@ from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
+from sb3_quad.simulation.tracks import ACCELERATION_STD
 
 ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
@@ -41,6 +42,9 @@ class Network(th.nn.Module):
     zeros as a flight begins. It holds as much of these as the policy sees: the last action (4); the
     integral s (3), m, with a 1 once a flight has begun; the earlier frames, scaled, the latest
     first.
+
+    A policy that previews its reference takes the accelerations behind the features of
+    ``observation``, m/s²: (batch, OBSERVATION_SIZE + 3 * previews).
 
     :param layers: linear layers, each with the activation that follows it, if any; they are copied.
     :param reference: its scaling, vehicle, output and ``observation``; features and rotors are
@@ -64,9 +68,11 @@ class Network(th.nn.Module):
         limits = np.array(vehicle.thrust_range)
         if self.output == "speeds":
             limits /= vehicle.thrust_coefficient
+        # The previewed accelerations follow the features.
+        ahead = np.zeros(3 * len(observation.preview or ()))
         buffers = {
-            "mean": reference.own_mean,
-            "inverse_std": 1.0 / reference.std,
+            "mean": np.append(reference.own_mean, ahead),
+            "inverse_std": 1.0 / np.append(reference.std, ahead + ACCELERATION_STD),
             "middle": limits.mean(),
             "half_range": np.ptp(limits) / 2,
         }
@@ -81,22 +87,21 @@ class Network(th.nn.Module):
         self.newest = self.actions + 4 * bool(integral)
         self.state_size = self.newest + observation.ages[-1] * observation.frame_size
         # From the integral to what it adds to the scaled features.
-        self.shift = th.diag(self.inverse_std)[GROUPS["position"]]
+        self.shift = th.diag(self.inverse_std[:OBSERVATION_SIZE])[GROUPS["position"]]
         # An example of what the files take.
-        self.examples = [th.zeros(2, OBSERVATION_SIZE)]
+        self.examples = [th.zeros(2, len(self.mean))]
         if observation.is_extended:
             self.examples.append(th.zeros(2, self.state_size))
         self.eval()
 
     def forward(self, observation: th.Tensor, state: th.Tensor | None = None) -> Any:
-        """Rotor thrusts or speeds, (batch, 4), of observations, (batch, OBSERVATION_SIZE); with a
-        state also the next one.
-        """
-        frame = (observation - self.mean) * self.inverse_std
+        """Rotor thrusts or speeds, (batch, 4), of observations; with a state also the next one."""
+        scaled = (observation - self.mean) * self.inverse_std
         if self.clip:
-            frame = frame.clamp(-self.clip, self.clip)
+            scaled = scaled.clamp(-self.clip, self.clip)
         if state is None:
-            return self.command(self.layers(frame).clamp(-1.0, 1.0))
+            return self.command(self.layers(scaled).clamp(-1.0, 1.0))
+        frame = scaled[:, :OBSERVATION_SIZE]
         following = []
         if self.integral:
             gain, distance2, speed2, limit = self.integral
@@ -115,6 +120,7 @@ class Network(th.nn.Module):
         size = self.observation.frame_size
         ages = self.observation.ages
         seen = frames.view(-1, ages[-1] + 1, size)[:, ages].flatten(1)
+        seen = th.cat([seen, scaled[:, OBSERVATION_SIZE:]], dim=1)
         action = self.layers(seen).clamp(-1.0, 1.0)
         following = [action[:, : self.actions], *following, frames[:, : ages[-1] * size]]
         return self.command(action), th.cat(following, dim=1)
@@ -192,8 +198,9 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     if observation.last_action:
         frame[OBSERVATION_SIZE:, OBSERVATION_SIZE:] = np.eye(4)[[*turn.order]]
     # Every observed frame is turned alike; the weights absorb it, so that files stay as fast.
-    frames = np.kron(np.eye(len(observation.ages)), frame)
-    linear[0].weight.copy_(linear[0].weight @ th.from_numpy(frames))
+    frames = th.from_numpy(np.kron(np.eye(len(observation.ages)), frame))
+    seen = linear[0].weight[:, : len(frames)]
+    seen.copy_(seen @ frames)
     linear[-1].weight.copy_(linear[-1].weight[turn.own])
     linear[-1].bias.copy_(linear[-1].bias[turn.own])
     return layers
@@ -251,8 +258,8 @@ def write_torchscript(network: Network, metadata: StrDict) -> bytes:
 
 
 def write_onnx(network: Network, metadata: StrDict) -> bytes:
-    """Return the model: ``observation`` float32 (batch, OBSERVATION_SIZE) to ``thrust`` or
-    ``rotor_speed``, float32 (batch, 4).
+    """Return the model: ``observation`` float32 (batch, numbers) to ``thrust`` or ``rotor_speed``,
+    float32 (batch, 4).
 
     Of a policy with a state also ``state`` to ``next_state``, float32 (batch, state_size).
 

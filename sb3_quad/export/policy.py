@@ -46,11 +46,12 @@ def export_policy(
     """Make a file that flies by itself of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC;
     ``MlpPolicy``).
 
-    It takes the features of an observation in physical units, see ``metadata["observation"]``. It
-    gives the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
-    Earlier frames that the policy sees are in a state, ``metadata["state"]``. A vehicle that is not
-    given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it, or
-    else ``itm`` and Table A.2.
+    It takes the features of an observation in physical units, see ``metadata["observation"]``,
+    relative to a reference that moves, see ``metadata["reference"]``. It gives the four rotors'
+    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the
+    policy sees are in a state, ``metadata["state"]``. A vehicle that is not given, and the scaling,
+    are those that :func:`agent_settings` finds in the zip or next to it, or else ``itm`` and Table
+    A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: in whose body frame and order of the rotors the file speaks; its thrust limits,
@@ -100,7 +101,7 @@ def export_policy(
         warnings.simplefilter("ignore", DeprecationWarning)
         # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata), network.state_size)
-        checked = compare(reference, call, by, n_observations)
+        checked = compare(reference, call, by, n_observations, relates=file_format == "c")
         metadata["check"] = (
             f"largest error {checked.error:.2g} {network.unit} "
             f"in {checked.n} observations of flights ({by})"
@@ -125,7 +126,7 @@ def _describe(
         features=FEATURES,
         places=GROUPS,
         n_parameters=parameters_to_vector(network.parameters()).numel(),
-        needs=network.observation.model_dump(mode="json"),
+        needs=network.observation.model_dump(mode="json", exclude={"preview"}),
     )
     # The name of a file may hold anything, also the end of a line.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()

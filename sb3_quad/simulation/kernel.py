@@ -249,7 +249,7 @@ def step(
                 b, first, count, False, scaling, vehicles, task_index, task_parameters,
                 physics_step,
             )  # fmt: skip
-            if moves:
+            if moves and tracks.shape[0] == 0:
                 load_rows(state, first, count, b.state)
             else:
                 load_rows(state, first, count, b.resting)

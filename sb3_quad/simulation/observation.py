@@ -115,8 +115,7 @@ def heading_of(b, lane):
     asked for.
     """
     cosine, sine = b.target_heading[0, lane], b.target_heading[1, lane]
-    is_free = cosine * cosine + sine * sine == 0.0
-    return cosine + is_free, sine
+    return (cosine if cosine * cosine + sine * sine > 0.0 else 1.0), sine
 
 
 @fast
@@ -129,14 +128,17 @@ def _relate(b):
         c, s = heading_of(b, lane)
         cosine, sine = float32(c), float32(s)
         rate = float32(b.target_heading_rate[0, lane])
-        ux, uy, uz = vector(b.target_velocity, lane)
+        ux = float32(b.target_velocity[0, lane])
+        uy = float32(b.target_velocity[1, lane])
+        uz = float32(b.target_velocity[2, lane])
         for row in range(3):
-            k = F.rotation + 3 * row
-            x, y, z = vector(out[k:], lane)
-            out[F.velocity + row, lane] -= float32(ux) * x + float32(uy) * y + float32(uz) * z
+            x = out[F.rotation + 3 * row, lane]
+            y = out[F.rotation + 3 * row + 1, lane]
+            z = out[F.rotation + 3 * row + 2, lane]
+            out[F.velocity + row, lane] -= ux * x + uy * y + uz * z
             out[F.body_rates + row, lane] -= rate * z
-            out[k, lane] = cosine * x + sine * y
-            out[k + 1, lane] = cosine * y - sine * x
+            out[F.rotation + 3 * row, lane] = cosine * x + sine * y
+            out[F.rotation + 3 * row + 1, lane] = cosine * y - sine * x
         x, y = out[F.position, lane], out[F.position + 1, lane]
         out[F.position, lane] = cosine * x + sine * y
         out[F.position + 1, lane] = cosine * y - sine * x

@@ -128,7 +128,9 @@ class FlightTape:
         batch = self.batch
         self._by_states = by_states
         self._by_actions = by_actions
-        self._gradient = np.zeros((MOVING, batch.n))
+        # The gradient by the state before the step that backward() was last called for, without
+        # what comes through the observation of that state.
+        self.by_start = np.zeros((MOVING, batch.n))
         self._by_frames = np.zeros((batch.ages[-1] + 1, batch.n, batch.observation.frame_size))
         self._by_integral = np.zeros_like(batch.integral)
         return value
@@ -140,7 +142,7 @@ class FlightTape:
             comes from the later actions.
         """
         batch = self.batch
-        self._gradient += self._by_states[step, :MOVING]
+        self.by_start += self._by_states[step, :MOVING]
         share_out(
             undo,
             batch.helpers,
@@ -161,20 +163,13 @@ class FlightTape:
             by_observation,
             self._by_frames,
             self._by_integral,
-            self._gradient,
+            self.by_start,
             self._by_actions,
             self.physics_step,
             self.substeps,
         )
         result: FloatArray = self._by_actions[step]
         return result
-
-    @property
-    def by_start(self) -> FloatArray:
-        """The gradient by the state before the step that :meth:`backward` was last called for,
-        (MOVING, n); without what comes through the observation of that state.
-        """
-        return self._gradient
 
 
 @compiled

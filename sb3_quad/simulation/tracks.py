@@ -7,9 +7,9 @@ reference moves, and the first row of its piece in the table, below zero for a t
 """
 
 import numpy as np
-from numba import float32
+from numba import float32, uint32
 
-from sb3_quad.simulation.compiled import compiled, inlined
+from sb3_quad.simulation.compiled import LANES, compiled, inlined
 from sb3_quad.simulation.observation import heading_of
 from sb3_quad.simulation.random import REFERENCE, STEP, uniforms
 from sb3_quad.simulation.state import STATE_SIZE, X, first_rows
@@ -25,8 +25,10 @@ ACCELERATION_STD = 5.0
 def _row_at(begin, step, numbers):
     """Return the row of the table at a control step of an episode."""
     length = numbers[0]
-    at = step % length if numbers[1] != 0 else min(step, length - 1)
-    return np.int64(begin) + at
+    if numbers[1] == 0:
+        return np.int64(begin) + min(step, length - 1)
+    # A division of 32 bits takes a fraction of one of 64.
+    return np.int64(begin) + np.int64(uint32(step) % uint32(length))
 
 
 @compiled
@@ -52,17 +54,23 @@ def deepest(i, streams, table, numbers):
 @compiled
 def follow(b, first, count, state, streams, course, table, numbers):
     """Move the targets of a block to where their references are after this control step."""
-    for lane in range(count):
-        i = first + lane
-        if course[C.begin, i] < 0.0:
+    for lane in range(LANES):
+        i = b.row[lane]
+        begin = course[C.begin, i]
+        if begin < 0.0:
+            for k in range(X.target, STATE_SIZE):
+                b.state[k, lane] = state[k, i]
             continue
-        row = table[_row_at(course[C.begin, i], np.int64(streams[STEP, i]) + 1, numbers)]
+        # Without a sign, numba does not look whether an index counts from the end.
+        row = np.uint64(_row_at(begin, np.int64(streams[STEP, i]) + 1, numbers))
         for k in range(STATE_SIZE - X.target):
-            value = row[k]
-            if k < 3:
-                value += course[C.anchor + k, i]
-            state[X.target + k, i] = value
-            b.state[X.target + k, lane] = value
+            b.state[X.target + k, lane] = table[row, np.uint64(k)]
+        for axis in range(3):
+            b.state[X.target + axis, lane] += course[C.anchor + axis, i]
+    # Quantity by quantity: neighbours in memory are written together.
+    for k in range(X.target, STATE_SIZE):
+        for lane in range(count):
+            state[k, first + lane] = b.state[k, lane]
 
 
 @compiled

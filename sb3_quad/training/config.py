@@ -140,7 +140,7 @@ class TrainingConfig(Frozen):
         return resolve_expert(
             DEFAULT_EXPERT if self.expert is None else self.expert,
             self.env_kwargs.get("vehicle", "itm"),
-            layout=self.env_kwargs.get("rotor_layout"),
+            layout=self.task and self.flight_settings.rotor_layout,
         )
 
     def keyword(self, name: str) -> Any:
@@ -450,7 +450,6 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
     observed = own.observed
-    del observed["rotor_layout"]
     integral = observed.pop("position_integral")
     adopted = {
         **changes,

@@ -157,34 +157,54 @@ def act(network: Perceptrons, observations: th.Tensor) -> tuple[th.Tensor, th.Te
     return actions, values, -losses.gaussian_nll(mean, log_std, actions)
 
 
-class Pullback:
-    """Carries gradients by a policy's mean actions back to observations, and adds up those by its
-    parameters.
+class Passes:
+    """Computes a policy's mean actions step by step, and carries gradients by them back to the
+    observations and to the policy's parameters.
 
-    :param n: rows of each call.
+    Compiled perceptrons keep what their layers gave in each step: to compute it again would take
+    a third of the way back.
+
+    :param n_steps: of a flight.
+    :param n: rows of each step.
     """
 
-    def __init__(self, policy: ActorCriticPolicy, n: int) -> None:
-        self._network = network_of(policy)
+    def __init__(self, policy: ActorCriticPolicy, n_steps: int, n: int) -> None:
+        network = network_of(policy)
         self._policy = policy
-        if isinstance(self._network, Perceptrons):
-            self._sums = self._network.actor.new_sums(n)
+        self._actor = network.actor if isinstance(network, Perceptrons) else None
+        # What the way back needs of each step: what the layers gave, or the observations.
+        self._passed: Any = {}
+        if self._actor:
+            self._passed, self._sums = self._actor.room(n_steps, n)
 
-    def __call__(self, observations: AnyArray, by_actions: FloatArray) -> Float32Array:
-        """Return the gradient by observations (n, ...), given that by the mean actions (n, a)."""
+    def forward(self, step: int, observations: AnyArray) -> Float32Array:
+        """Return the mean actions (n, a) for the observations (n, ...) of a step.
+
+        Step 0 begins a flight, with the parameters as they are then.
+        """
+        if self._actor:
+            if step == 0:
+                self._actor.pack()
+                self._sums.fill(0.0)
+            return self._actor(_flat(observations), self._passed[step])
+        self._passed[step] = observations
+        return mean_actions(self._policy, observations)
+
+    def backward(self, step: int, by_actions: FloatArray) -> Float32Array:
+        """Return the gradient by the observations of a step, given that by its actions (n, a).
+
+        The last step comes first. After step 0, the actor's parameters have their ``.grad``.
+        """
         given = by_actions.astype(np.float32)
-        if isinstance(self._network, Perceptrons):
-            return self._network.actor.pullback(_flat(observations), given, self._sums)
-        inputs = th.as_tensor(observations, device=self._policy.device).requires_grad_()
+        if self._actor:
+            by_observations = self._actor.pullback(self._passed[step], given, self._sums)
+            if step == 0:
+                self._actor.set_gradients(self._sums)
+            return by_observations
+        inputs: Any = th.as_tensor(self._passed[step], device=self._policy.device).requires_grad_()
         means = self._policy.get_distribution(inputs).mode()
         means.backward(th.as_tensor(given, device=means.device))  # type: ignore[no-untyped-call]
-        assert inputs.grad is not None
         return np.asarray(inputs.grad.cpu().numpy())
-
-    def set_gradients(self) -> None:
-        """Set ``.grad`` of the actor's parameters; of other policies autograd has done so."""
-        if isinstance(self._network, Perceptrons):
-            self._network.actor.set_gradients(self._sums)
 
 
 def _add(parameter: th.nn.Parameter, gradient: th.Tensor) -> None:

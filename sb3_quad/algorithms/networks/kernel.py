@@ -203,11 +203,11 @@ def _forward(scratch, x, index, first, count, layers):
 
 
 @compiled
-def _backward(scratch, at, layers, sums, last_layer):
+def _backward(passed, scratch, layers, sums, last_layer):
     """Add the gradient of a block by the parameters to ``sums``.
 
-    The block's outputs begin at ``at``, and their gradient lies behind the layers. From there on,
-    two layers' gradients take turns.
+    The block's layers lie in ``passed``. The gradient by the outputs lies in ``scratch``, behind
+    room for the layers. From there on, two layers' gradients take turns.
 
     :param last_layer: 1: stop at the parameters of the first layer; 0: go on to the inputs.
     :return: where the gradient of that layer begins.
@@ -215,17 +215,18 @@ def _backward(scratch, at, layers, sums, last_layer):
     widths, kinds, _, transposed = layers
     here = widths.sum() * ROWS
     there = here + widths.max() * ROWS
+    at = here - widths[-1] * ROWS
     place = len(sums)
     for layer in range(len(widths) - 1, 0, -1):
         rows = widths[layer]
         columns = widths[layer - 1]
         g = _layer(scratch, here, rows)
-        h = _layer(scratch, at, rows)
+        h = _layer(passed, at, rows)
         at -= columns * ROWS
         place -= rows * (columns + 1)
         middle = place + rows * columns
         _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows])
-        _add_products(g, _layer(scratch, at, columns), sums[place:middle].reshape(rows, columns))
+        _add_products(g, _layer(passed, at, columns), sums[place:middle].reshape(rows, columns))
         if layer > last_layer:
             _multiply(
                 transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns)
@@ -235,7 +236,7 @@ def _backward(scratch, at, layers, sums, last_layer):
 
 
 @compiled
-def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
+def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, passed):
     """Write the outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs) into ``out``.
 
     It does so for the chunks from ``first_chunk`` to ``last_chunk`` of all ``chunks``.
@@ -243,14 +244,17 @@ def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
     :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each unit of
         all layers, and twice for the widest layer's gradients.
     :param layers: :class:`Layers`.
+    :param passed: (blocks, ``ROWS`` numbers for each unit), is written for :func:`pullback`; or
+        (0, any).
     """
     n = len(index)
     blocks = (n + ROWS - 1) // ROWS
     for block in range(first_chunk * blocks // chunks, last_chunk * blocks // chunks):
         first = block * ROWS
         count = min(ROWS, n - first)
-        at = _forward(scratch, x, index, first, count, layers)
-        h = _layer(scratch, at, layers.widths[-1])
+        own = passed[block] if len(passed) else scratch
+        at = _forward(own, x, index, first, count, layers)
+        h = _layer(own, at, layers.widths[-1])
         for i in range(count):
             for j in range(out.shape[1]):
                 out[first + i, j] = h[j, i]
@@ -294,18 +298,19 @@ def gradient(
                 )
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
-            _backward(scratch, at, layers, sums[chunk, :size], 1)
+            _backward(scratch, scratch, layers, sums[chunk, :size], 1)
 
 
 @compiled
 def pullback(
-    first_chunk, last_chunk, chunks, scratch, layers, x, index, by_outputs, by_inputs, sums
+    first_chunk, last_chunk, chunks, scratch, layers, passed, index, by_outputs, by_inputs, sums
 ):
     """Carry a gradient by the outputs back to the inputs, and add that by all parameters.
 
     Arguments are as for :func:`forward`, and:
 
-    :param by_outputs: (m, outputs), of the same rows as x.
+    :param passed: what :func:`forward` has written for the same rows.
+    :param by_outputs: (m, outputs).
     :param by_inputs: float32 (m, inputs), is written.
     :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
     """
@@ -315,10 +320,9 @@ def pullback(
         for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
             first = block * ROWS
             count = min(ROWS, len(index) - first)
-            at = _forward(scratch, x, index, first, count, layers)
             g = _layer(scratch, behind, layers.widths[-1])
             _load(by_outputs, index, first, count, g)
-            here = _backward(scratch, at, layers, sums[chunk], 0)
+            here = _backward(passed[block], scratch, layers, sums[chunk], 0)
             g = _layer(scratch, here, layers.widths[0])
             for i in range(count):
                 for k in range(by_inputs.shape[1]):

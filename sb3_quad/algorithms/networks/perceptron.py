@@ -35,6 +35,7 @@ _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
 # Types of the loss's fields; numba would compile again for an int where it had a float.
 _TYPES = tuple(Loss.__annotations__.values())
 _NONE = np.empty(0)
+_NOT_KEPT = np.empty((0, 0), np.float32)
 
 
 class Perceptron:
@@ -56,7 +57,7 @@ class Perceptron:
         self._scratch_size = int(room) * ROWS
         # Parameters with the weights as they are, and with the weights transposed
         self._packed = np.zeros((2, self._size), np.float32)
-        # Views of those and of PyTorch's memory, which is copied into them before each call
+        # Views of those and of PyTorch's memory, which :meth:`pack` copies into them
         self._copies: list[tuple[Float32Array, Float32Array]] = []
         own = [parameter.detach().numpy() for parameter in self.parameters()]
         for packed, transposed in zip(self._packed, (False, True), strict=True):
@@ -101,10 +102,21 @@ class Perceptron:
                 return False
         return len(modules) % 2 == 1
 
-    def __call__(self, x: Float32Array) -> Float32Array:
-        """Return the outputs (n, outputs) for x (n, inputs)."""
+    def pack(self) -> None:
+        """Take the parameters as they are now, for calls that keep what the layers give."""
+        for packed, parameter in self._copies:
+            packed[...] = parameter
+
+    def __call__(self, x: Float32Array, passed: Float32Array = _NOT_KEPT) -> Float32Array:
+        """Return the outputs (n, outputs) for x (n, inputs).
+
+        :param passed: of :meth:`room`, is written for :meth:`pullback`. The parameters are then
+            those of the last :meth:`pack`, else those of now.
+        """
+        if passed is _NOT_KEPT:
+            self.pack()
         out = np.empty((len(x), self._layers[-1].out_features), np.float32)
-        self._compute(forward, len(x), x, np.arange(len(x)), out)
+        self._compute(forward, len(x), x, np.arange(len(x)), out, passed)
         return out
 
     def gradient(
@@ -121,6 +133,7 @@ class Perceptron:
         :param log_std: of an actor, (a,); its gradient is set, too.
         :return: the terms of the loss, sums over the rows.
         """
+        self.pack()
         stds = _NONE if log_std is None else log_std.detach().double().numpy()
         chunks = _chunks(len(index))
         sums = np.empty((chunks, self._size + len(stds)), np.float32)
@@ -133,21 +146,28 @@ class Perceptron:
         result: FloatArray = terms.sum(axis=0)
         return result
 
-    def new_sums(self, n: int) -> Float32Array:
-        """Return zeros that :meth:`pullback` of n rows adds the parameters' gradients to."""
-        return np.zeros((_chunks(n), self._size), np.float32)
+    def room(self, calls: int, n: int) -> tuple[Float32Array, Float32Array]:
+        """Return room for what :meth:`pullback` needs of some calls with n rows each.
+
+        :return: for what the layers give, (calls, ...), and for the sums of all calls.
+        """
+        blocks = -(-n // ROWS)
+        size = int(self._widths.sum()) * ROWS
+        passed = _aligned(calls * blocks * size).reshape(calls, blocks, size)
+        return passed, np.empty((_chunks(n), self._size), np.float32)
 
     def pullback(
-        self, x: Float32Array, by_outputs: Float32Array, sums: Float32Array
+        self, passed: Float32Array, by_outputs: Float32Array, sums: Float32Array
     ) -> Float32Array:
         """Carry a gradient by the outputs (n, outputs) back to the inputs.
 
-        :param x: (n, inputs).
-        :param sums: :meth:`new_sums`, the gradient by the parameters is added to it.
-        :return: the gradient by x, (n, inputs).
+        :param passed: what a call has written.
+        :param sums: the gradient by the parameters is added to it.
+        :return: the gradient by the inputs, (n, inputs).
         """
-        by_inputs = np.empty_like(x)
-        self._compute(pullback, len(x), x, np.arange(len(x)), by_outputs, by_inputs, sums)
+        n = len(by_outputs)
+        by_inputs = np.empty((n, self._layers[0].in_features), np.float32)
+        self._compute(pullback, n, passed, np.arange(n), by_outputs, by_inputs, sums)
         return by_inputs
 
     def set_gradients(self, sums: Float32Array) -> th.Tensor:
@@ -166,8 +186,6 @@ class Perceptron:
 
         Where that is worthwhile, several threads share them.
         """
-        for packed, parameter in self._copies:
-            packed[...] = parameter
         layers = Layers(self._widths, self._kinds, *self._packed)
         chunks = _chunks(n)
         threads = _threads if n > (WORTHWHILE - 1) * ROWS else 1

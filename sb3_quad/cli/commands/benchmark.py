@@ -1,6 +1,8 @@
 """Measure control steps per second of environments and training loops.
 
-The environments are PyBullet's, alone and vectorised, and the compiled batch.
+The environments are PyBullet's, alone and vectorised, and the compiled batch. A
+training loop is a rollout with its update; APG's includes the way back through
+the recorded flights.
 
 examples:
   # everything, about a minute
@@ -9,7 +11,7 @@ examples:
   sb3-quad benchmark --sizes 240 4096 --no-training
   # rollouts with their updates of training loops only
   sb3-quad benchmark --training
-  sb3-quad benchmark --algo ppo_bc --conf-file robust/ppo_bc.yml
+  sb3-quad benchmark --algo apg --conf-file robust/apg.yml
 """
 
 import itertools
@@ -55,7 +57,11 @@ FLAGS: Flags = {
     ),
     "--n-envs N": (positive, 8, "environments of DummyVecEnv and SubprocVecEnv (8)"),
     "--seconds S": (above_zero, 3.0, "duration of each measurement (3)"),
-    "--algo": (SEVERAL, ["dagger", "ppo_bc"], "algorithms of the training loops (dagger ppo_bc)"),
+    "--algo": (
+        SEVERAL,
+        ["dagger", "ppo_bc", "apg"],
+        "algorithms of the training loops (dagger ppo_bc apg)",
+    ),
     "-conf --conf-file FILE": "settings of the training loops (ALGO.yml)",
     "--training": (YES_OR_NO, None, "measure only, or no, training loops (both)"),
 }

@@ -1,7 +1,7 @@
-r"""Train an agent: DAgger, then PPO with cloning, unless you name others.
+r"""Train an agent: DAgger, then the model's gradient, unless you name others.
 
-Without arguments, both stages train with domain randomization and a privileged
-expert.
+Without arguments, both stages train with domain randomization, the first one by
+a privileged expert.
 
 examples:
   # both stages with domain randomization
@@ -22,6 +22,8 @@ examples:
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 \
     "policy_kwargs:dict(net_arch=[32, 32])"
   sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
+  # a minute of the model's gradient, from an agent for any quadcopter to yours
+  sb3-quad train -i any-quadcopter --algo apg --env-kwargs vehicle:mine.yaml
   # the RL stage alone, from an imitation agent
   sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i thesis-imitation
   # continue an interrupted run

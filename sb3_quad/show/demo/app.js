@@ -11,6 +11,7 @@ import { unpackLayers } from "./weights.js";
 const SKY = ["zenith", "haze", "ground", "grid", "gridFar", "shadow"];
 const COLOURS = [...SKY, "target", "frame", "lost", "blade", "force", "rule", "quiet"]; // of style.css
 const SHOWN = { wide: 4, narrow: 3 }; // controllers that fly at first
+const SHEET = 5; // where there is no path yet, to draw one, m
 const MARGIN = 1.5; // around what the camera follows, m
 
 const data = JSON.parse($("data").textContent ?? "");
@@ -50,8 +51,9 @@ function resize() {
 function draw(seconds) {
   const bodies = player.bodies();
   const seen = [...bodies.filter((body) => !body.lost).map((body) => body.position), ...bodies.map((body) => body.target)];
-  if (!hand.isHolding()) camera.follow(seen, MARGIN, seconds);
-  scene.draw(bodies, fleet.vehicle, player.trails);
+  const line = player.line, draws = player.tool === "draw" && !line.length;
+  if (!hand.isHolding()) camera.follow([...seen, ...line], draws ? SHEET : MARGIN, seconds);
+  scene.draw(bodies, fleet.vehicle, player.trails, line);
   if (frames % 4 === 0) board.plot(scene.palette);
   if (frames % 6 === 0) board.show();
 }

@@ -13,11 +13,18 @@ export const $ = (id) => /** @type {T} */ (document.getElementById(id));
 /** @param {number | undefined} time */
 const inSeconds = (time) => (time !== undefined && time >= 0 ? `${time.toFixed(2)} s` : "–");
 
-/** What the columns say of a controller. @param {Entry} entry */
-function cellsOf({ flight, attempts, survived, active }) {
+/** @param {number} metres */
+const inMetres = (metres) => metres.toFixed(metres < 10 ? 3 : 1);
+
+/** What the columns say of a controller. @param {Entry} entry @param {boolean} follows whether there is a path */
+function cellsOf({ flight, attempts, survived, active, log }, follows) {
   if (!flight) return ["cannot fly it", "–", "–"];
   const score = attempts ? `${survived} of ${attempts}` : "–";
   if (!active) return [score, "–", "–"];
+  if (follows && !flight.lost && log.length) {
+    const square = log.reduce((sum, [, distance]) => sum + distance ** 2, 0) / log.length;
+    return [score, inMetres(Math.sqrt(square)), inMetres(flight.distance)];
+  }
   return flight.lost ? [score, "lost", "–"] : [score, inSeconds(flight.arrival), inSeconds(flight.settled)];
 }
 
@@ -56,9 +63,14 @@ export class Board {
   }
 
   show() {
+    const { path } = this.fleet;
+    $("column-2").textContent = path ? "RMS, m" : "To 0.1\u00a0m";
+    $("column-3").textContent = path ? "Now, m" : "Stays";
+    $("reference").hidden = !path;
+    $("reference-speed").textContent = path ? `${Math.hypot(...path.course.at(path.time).slice(3, 6)).toFixed(1)} m/s` : "";
     this.fleet.entries.forEach((entry, k) => {
       const row = $("score").children[k], cells = row.querySelectorAll("td");
-      cellsOf(entry).forEach((text, j) => {
+      cellsOf(entry, Boolean(path)).forEach((text, j) => {
         if (cells[j].textContent !== text) cells[j].textContent = text;
       });
       cells[0].title = entry.why;

@@ -1,6 +1,7 @@
 /** A camera that turns about a point and keeps what matters in its picture. */
 
 const SLOPE = Math.tan((40 * Math.PI) / 360); // half of the field of view
+export const STEEPEST = 1.45; // rad, downwards
 const LAG = 0.35; // s, after which it has followed to 1/e
 
 export class Camera {
@@ -75,6 +76,20 @@ export class Camera {
     const { right, up } = this.axes;
     const size = this.pixels(depth);
     return [0, 1, 2].map((k) => (right[k] * dx - up[k] * dy) / size);
+  }
+
+  /** The point at a height that is seen at a place of the picture, m; null: there is none. @param {number} x @param {number} y @param {number} z */
+  pointAt(x, y, z) {
+    const { right, up, forward } = this.axes;
+    const [a, b] = [(x - this.middle[0]) / this.scale, (this.middle[1] - y) / this.scale];
+    const ray = [0, 1, 2].map((k) => forward[k] + a * right[k] + b * up[k]);
+    const away = (z - this.eye[2]) / ray[2];
+    return away > 0 && away < 1000 ? this.eye.map((each, k) => each + away * ray[k]) : null;
+  }
+
+  /** Look from above, the world's x upwards. */
+  lookDown() {
+    [this.yaw, this.pitch, this.zoom] = [0, STEEPEST, 1];
   }
 
   /**

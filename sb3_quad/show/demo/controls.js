@@ -10,7 +10,7 @@ import { STARTS } from "./fleet.js";
 import { readAgent } from "./weights.js";
 
 const SPEEDS = [1, 0.25, 0.1];
-const TOOLS = /** @type {const} */ (["throw", "push"]);
+const TOOLS = /** @type {const} */ (["throw", "push", "draw"]);
 const SWITCHES = /** @type {const} */ (["auto", "apart", "trails", "paused"]);
 /** @type {Object<string, string>} */
 const TITLES = {
@@ -52,6 +52,7 @@ export class Controls {
     for (const each of TOOLS) press($(`tool-${each}`), player.tool === each);
     for (const button of $("starts").children) press(button, button.id === `start-${player.startName}`);
     document.body.classList.toggle("touched", player.touched);
+    if (player.tool === "draw" && !this.fleet.path) say("Draw a path in the picture, and they follow it.");
   }
 
   /** Begin a start that somebody asked for. @param {string} name */
@@ -95,6 +96,7 @@ export class Controls {
       ["force", "Steady force", 0, 0.6, 0.01, newtons],
       ["gusts", "Gusts", 0, 0.4, 0.01, newtons],
       ["noise", "Sensor noise", 0, 0.25, 0.01, percent],
+      ["pace", "Path speed", 0.5, 6, 0.1, (x) => `${x.toFixed(1)} m/s`],
     ];
   }
 
@@ -129,7 +131,7 @@ export class Controls {
     for (const each of TOOLS) $(`tool-${each}`).addEventListener("click", () => player.set({ tool: each }));
     $("ask").addEventListener("click", () => /** @type {HTMLDialogElement} */ ($("help")).showModal());
     $("calm").addEventListener("click", () => {
-      fleet.set({ mass: 1, motors: 1, battery: 1, delay: fleet.vehicle.delay, force: 0, gusts: 0, noise: 0 });
+      fleet.set({ mass: 1, motors: 1, battery: 1, delay: fleet.vehicle.delay, force: 0, gusts: 0, noise: 0, pace: 2 });
       this.#buildSliders();
     });
     $("vehicle").addEventListener("change", (event) => {
@@ -196,6 +198,7 @@ export class Controls {
       },
       t: () => player.set({ tool: "throw" }),
       p: () => player.set({ tool: "push" }),
+      d: () => player.set({ tool: "draw" }),
       k: () => player.kick(),
       l: () => player.set({ trails: !player.trails }),
       o: () => player.set({ apart: !player.apart }),

@@ -2,7 +2,7 @@
  * The two experts on the true state, as sb3_quad/experts/{pid,geometric}.py have them. docs/research/experts.md explains their laws.
  *
  * @typedef {import("./vehicle.js").Vehicle} Vehicle
- * @typedef {(state: Float64Array, actions: Float32Array) => void} Law writes the four actions for a state
+ * @typedef {(state: Float64Array, actions: Float32Array, ahead?: import("./observation.js").Ahead) => void} Law writes the four actions for a state
  */
 import { errorOf, rotation } from "./dynamics.js";
 import { part } from "./tables.js";
@@ -25,6 +25,12 @@ export function mixerInverse(v) {
 /** @param {number} value */
 const clipped = (value) => min(1, max(-1, value));
 
+/** The velocity relative to the reference, m/s. @param {Float64Array} s */
+function velocityOf(s) {
+  const target = part(s, "target_velocity");
+  return [...part(s, "velocity")].map((v, k) => v - target[k]);
+}
+
 /** The thesis's PID controller (Table A.1). @param {Vehicle} v @returns {Law} */
 export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) {
   const mixer = mixerInverse(v);
@@ -37,15 +43,15 @@ export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) 
     const [ex, ey, ez] = errorOf(s);
     const r = rotation(s);
     const roll = atan2(r[7], r[8]), pitch = Math.asin(clipped(-r[6])), yaw = atan2(r[3], r[0]);
-    const [vx, vy, vz] = part(s, "velocity");
+    const [vx, vy, vz] = velocityOf(s), [rx, ry, rz] = part(s, "target_acceleration");
     const rates = part(s, "body_rates");
     const ax = kp * ex - kd * (r[0] * vx + r[3] * vy + r[6] * vz);
     const ay = kp * ey - kd * (r[1] * vx + r[4] * vy + r[7] * vz);
     const az = kp * ez - kd * (r[2] * vx + r[5] * vy + r[8] * vz);
-    const rollDes = (0.25 * (ax * sin(yaw) - ay * cos(yaw))) / g;
-    const pitchDes = (0.25 * (ax * cos(yaw) + ay * sin(yaw))) / g;
+    const rollDes = (0.25 * (ax * sin(yaw) - ay * cos(yaw)) + rx * sin(yaw) - ry * cos(yaw)) / g;
+    const pitchDes = (0.25 * (ax * cos(yaw) + ay * sin(yaw)) + rx * cos(yaw) + ry * sin(yaw)) / g;
     const u = [
-      mass * (g + az + kiDt * ez),
+      mass * (g + az + rz + kiDt * ez),
       stiff[0] * (rollDes - roll) - damp[0] * rates[0],
       stiff[1] * (pitchDes - pitch) - damp[1] * rates[1],
       -stiff[2] * yaw - damp[2] * rates[2],
@@ -99,10 +105,12 @@ export function geometric(v) {
   const [low, high] = thrustRange(v);
   const [ixx, iyy, izz] = v.inertia;
   const lag = commandLag(v);
-  return (s, actions) => {
+  // So many control steps from now it has turned to what is asked for.
+  const steps = Math.round((lag + 1 / gains.attitude) / v.control_step);
+  return (s, actions, ahead = () => part(s, "target_acceleration")) => {
     const r = rotation(s);
     const [p, q, w] = part(s, "body_rates");
-    const [fx, fy, fz] = desiredForce([...errorOf(s)], [...part(s, "velocity")], gains, v.gravity);
+    const [fx, fy, fz] = desiredForce([...errorOf(s)], velocityOf(s), ahead(steps), gains, v.gravity);
     const size = sqrt(fx * fx + fy * fy + fz * fz);
     const body = [0, 1, 2].map((k) => (r[k] * fx + r[3 + k] * fy + r[6 + k] * fz) / size);
     const [b1, b2, b3] = rotated(body, p, q, w, lag);
@@ -117,18 +125,25 @@ export function geometric(v) {
  * Desired force of the rotors per mass, world frame, m/s².
  * @param {number[]} e
  * @param {number[]} v
+ * @param {ArrayLike<number>} a acceleration of the reference
  * @param {any} gains
  * @param {number} g
  */
-function desiredForce([ex, ey, ez], [vx, vy, vz], gains, g) {
-  const heightBrake = ez > 0 ? gains.height_deceleration : gains.descent_deceleration;
-  const way = sqrt((ex * ex + ey * ey) / gains.deceleration ** 2 + (ez / heightBrake) ** 2);
+function desiredForce([ex, ey, ez], [vx, vy, vz], a, gains, g) {
+  // Seen from the reference, its acceleration acts on the vehicle the other way round.
+  const [ax, ay, az] = [0, 1, 2].map((k) => -a[k]), across = sqrt(ex * ex + ey * ey);
+  const left = (/** @type {number} */ brake, /** @type {number} */ along) => max(0.1 * brake, brake - max(0, along));
+  const brake = left(gains.deceleration, across > 0 ? (ax * ex + ay * ey) / across : 0);
+  const heightBrake = ez > 0 ? left(gains.height_deceleration, az) : left(gains.descent_deceleration, -az);
+  const way = sqrt((across / brake) ** 2 + (ez / heightBrake) ** 2);
   const speed = brakingProfile(gains.position, way);
   const fx = gains.velocity * (speed * ex - vx), fy = gains.velocity * (speed * ey - vy);
   const climb = max(-gains.descent, gains.height_velocity * (brakingProfile(gains.height_position, way) * ez - vz));
-  const square = fx * fx + fy * fy + climb * climb, across = climb * g, room = (g * gains.tilt) ** 2;
-  const scale = square + 2 * across > room ? max(0, sqrt(across * across + square * room) - across) / square : 1;
-  return [scale * fx, scale * fy, max(0.1 * g, g + scale * climb)];
+  const weight = g - az, square = fx * fx + fy * fy + climb * climb, along = climb * weight - fx * ax - fy * ay;
+  const room = g * g * (1 + gains.tilt ** 2) - (weight * weight + ax * ax + ay * ay);
+  const root = sqrt(max(0, along * along + square * max(0, room)));
+  const scale = square + 2 * along > room ? max(0, root - along) / square : 1;
+  return [scale * fx - ax, scale * fy - ay, max(0.1 * g, weight + scale * climb)];
 }
 
 /**

@@ -26,7 +26,9 @@
  * @property {number} gusts standard deviation, weights
  * @property {number} noise relative
  * @property {number} battery factor of the thrust
+ * @property {number} pace greatest speed of a path, m/s
  */
+import { Course } from "./course.js";
 import { Flight, normals, NO_WRENCH, uniforms } from "./flight.js";
 import { part, STATE_SIZE } from "./tables.js";
 import { thrustRange } from "./vehicle.js";
@@ -37,6 +39,7 @@ const GUST_SECONDS = 1; // time constant
 const CALM_SECONDS = 2; // within 0.1 m for so long: the attempt is over
 const EPISODE_SECONDS = 15;
 const HOME = [0, 0, 15];
+const PATH_ACCELERATION = 4; // m/s², at most
 
 /** @param {number[]} q */
 const unit = (q) => q.map((each) => each / Math.hypot(...q));
@@ -86,7 +89,7 @@ export class Fleet {
    */
   constructor(agents, colours, vehicle, seed = 1) {
     /** @type {Settings} */
-    this.settings = { mass: 1, motors: 1, delay: vehicle.delay, force: 0, gusts: 0, noise: 0, battery: 1 };
+    this.settings = { mass: 1, motors: 1, delay: vehicle.delay, force: 0, gusts: 0, noise: 0, battery: 1, pace: 2 };
     this.uniform = uniforms(seed);
     this.normal = normals(seed + 1);
     /** @type {Entry[]} */
@@ -96,6 +99,8 @@ export class Fleet {
     this.gust = [0, 0, 0];
     this.push = [0, 0, 0]; // by hand, N
     this.rounds = 0; // attempts begun
+    /** @type {{points: number[][], course: Course, time: number} | null} */
+    this.path = null; // that all follow
     this.start = STARTS["upside down"](this.uniform);
     agents.forEach((agent, k) => this.add(agent, colours[k % colours.length]));
   }
@@ -147,12 +152,14 @@ export class Fleet {
     const entry = this.entries[k];
     Object.assign(entry, { active: !entry.active, log: [], trail: [], judged: true });
     entry.flight?.begin(this.start);
+    if (this.path) entry.flight?.follow(this.path.course, this.path.time);
     if (entry.flight) entry.before.set(entry.flight.state);
   }
 
   /** @param {Partial<Settings>} changes */
   set(changes) {
     Object.assign(this.settings, changes);
+    if (changes.pace && this.path) this.follow(this.path.points);
     for (const { flight } of this.flying) this.#apply(flight);
   }
 
@@ -176,8 +183,27 @@ export class Fleet {
     return this.flying.every((entry) => entry.judged);
   }
 
-  /** All begin an attempt. @param {Start} start */
-  begin(start) {
+  /** Where the reference is now, m. */
+  get target() {
+    const flight = this.flying.find((entry) => !entry.flight.lost)?.flight;
+    return flight ? [...part(flight.state, "target")] : this.start.target;
+  }
+
+  /** All follow a path from where the reference is; what is lost begins again there. @param {number[][]} points m */
+  follow(points) {
+    const from = this.target, { pace: speed } = this.settings;
+    const course = new Course(points, from, { speed, acceleration: PATH_ACCELERATION, dt: this.vehicle.control_step });
+    this.path = { points, course, time: 0 };
+    this.start = { position: from, quaternion: [1, 0, 0, 0], velocity: [0, 0, 0], body_rates: [0, 0, 0], target: from };
+    for (const { flight } of this.entries) {
+      if (flight?.lost) flight.begin(this.start);
+      flight?.follow(course);
+    }
+  }
+
+  /** All begin an attempt. @param {Start} start @param {boolean} [stays] whether they still follow the path */
+  begin(start, stays = false) {
+    if (!stays) this.path = null;
     this.start = start;
     this.held = false;
     this.rounds += 1;
@@ -186,6 +212,7 @@ export class Fleet {
     this.gust = this.gust.map(() => std * this.normal());
     for (const entry of this.entries) {
       entry.flight?.begin(start);
+      if (this.path) entry.flight?.follow(this.path.course, this.path.time);
       entry.judged = !entry.active;
       entry.log = [];
       entry.trail = [];
@@ -206,6 +233,7 @@ export class Fleet {
 
   /** @param {number[]} target m */
   setTarget(target) {
+    this.path = null;
     this.start = { ...this.start, target };
     for (const { flight } of this.entries) flight?.setTarget(target);
   }
@@ -223,6 +251,7 @@ export class Fleet {
     const adds = this.settings.gusts * this.weight * Math.sqrt(1 - keeps * keeps);
     this.gust = this.gust.map((each) => keeps * each + adds * this.normal());
     const wrench = { ...NO_WRENCH, force: this.force };
+    if (this.path) this.path.time += this.vehicle.control_step;
     for (const entry of this.flying) {
       if (entry.flight.lost) continue;
       entry.before.set(entry.flight.state);

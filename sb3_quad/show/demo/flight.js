@@ -7,6 +7,7 @@
  * @typedef {import("./dynamics.js").Wrench} Wrench
  * @typedef {import("./observation.js").ObservationSettings} ObservationSettings
  * @typedef {import("./network.js").Layer} Layer
+ * @typedef {import("./course.js").Motion} Motion
  *
  * @typedef {object} Agent
  * @property {string} label
@@ -54,6 +55,9 @@ export class Flight {
     this.actions = new Float32Array(4); // in the vehicle's own order of the rotors
     /** @type {number[][]} */
     this.queue = []; // rotor speeds that have been commanded and are not due yet
+    /** @type {Motion | null} */
+    this.course = null; // that the target follows; null: it rests
+    this.courseTime = 0; // s
     this.noise = 0;
     this.time = 0; // s
     this.lost = ""; // collision, out of range, or not
@@ -85,6 +89,8 @@ export class Flight {
   begin(start) {
     const { hoverSpeed, delay } = this.parameters;
     const hover = Array(4).fill(hoverSpeed);
+    this.state.fill(0);
+    this.course = null;
     for (const name of STARTED) this.state.set(start[name], X[name]);
     this.state.set(hover, X.rotor_speeds);
     this.queue = Array.from({ length: delay }, () => [...hover]);
@@ -100,13 +106,30 @@ export class Flight {
 
   /** @param {number[]} target m; arrival counts again from now on */
   setTarget(target) {
+    this.course = null;
+    this.state.fill(0, X.target);
     this.state.set(target, X.target);
     this.arrival = this.settled = NaN;
   }
 
+  /** Let the target follow a course from one of its times on. @param {Motion} course @param {number} time s */
+  follow(course, time = 0) {
+    this.course = course;
+    this.courseTime = time;
+    this.state.set(course.at(time), X.target);
+    this.arrival = this.settled = NaN;
+    if (this.observer && this.time === 0) this.observation = this.observer.begin(this.state, this.#ahead);
+  }
+
+  /** The reference's acceleration in some control steps, m/s². @param {number} steps @returns {ArrayLike<number>} */
+  #ahead = (steps) => {
+    if (!this.course) return part(this.state, "target_acceleration");
+    return Array.from(this.course.at(this.courseTime + steps * this.vehicle.control_step)).slice(6, 9);
+  };
+
   /** The controller's actions for the present state, in the vehicle's order of the rotors. */
   act() {
-    if (this.law) this.law(this.state, this.actions);
+    if (this.law) this.law(this.state, this.actions, this.#ahead);
     else if (this.observation && this.agent.layers && this.turn) {
       const known = forward(this.agent.layers, this.observation);
       this.turn.order.forEach((own, k) => (this.actions[own] = Math.min(1, Math.max(-1, known[k]))));
@@ -121,9 +144,13 @@ export class Flight {
     const wanted = this.queue.shift() ?? [];
     for (let k = 0; k < p.substeps; k++) physicsStep(this.state, wanted, p, wrench);
     this.time += this.vehicle.control_step;
+    if (this.course) {
+      this.courseTime += this.vehicle.control_step;
+      this.state.set(this.course.at(this.courseTime), X.target);
+    }
     if (this.observer && this.turn) {
       this.observer.noise = this.noise;
-      this.observation = this.observer.next(this.state, this.turn.order.map((own) => actions[own]));
+      this.observation = this.observer.next(this.state, this.turn.order.map((own) => actions[own]), this.#ahead);
     }
     this.#judge();
   }

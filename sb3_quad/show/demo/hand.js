@@ -1,5 +1,5 @@
 /**
- * Gestures of a pointer: throw or push vehicles, drag the target, turn the camera, zoom.
+ * Gestures of a pointer: throw or push vehicles, draw a path, drag the target, turn the camera, zoom.
  *
  * @typedef {import("./camera.js").Camera} Camera
  *
@@ -10,13 +10,17 @@
  *
  * @typedef {object} Gestures
  * @property {() => Holdable[]} things
- * @property {"throw" | "push"} tool what dragging a vehicle does
+ * @property {"throw" | "push" | "draw"} tool what dragging a vehicle does, or anywhere draws
  * @property {(index: number) => void} grab
  * @property {(way: number[], velocity: number[]) => void} carry way from where it was grabbed, m; m/s
  * @property {(velocity: number[]) => void} release
  * @property {(way: number[] | null) => void} push an arrow from the vehicle, m; null: no longer
+ * @property {(x: number, y: number, begins: boolean) => void} draw a place in the picture, pixels
+ * @property {() => void} drawn the path ends
  * @property {(way: number[] | null) => void} target way from where it was, m; null: the drag begins
  */
+
+import { STEEPEST } from "./camera.js";
 
 const REACH = { mouse: 34, touch: 46 }; // pixels
 const FLICK = 0.09; // s before the release that make the velocity
@@ -66,11 +70,12 @@ export function listen(canvas, camera, gestures) {
     }
     const thing = find(at, event.pointerType === "mouse" ? REACH.mouse : REACH.touch);
     const isPush = gestures.tool === "push" || event.button === 2 || event.shiftKey;
-    const kind = !thing ? "camera" : thing.kind === "target" ? "target" : isPush ? "push" : "throw";
+    const kind = gestures.tool === "draw" ? "draw" : !thing ? "camera" : thing.kind === "target" ? "target" : isPush ? "push" : "throw";
     const { index, depth } = thing ?? { index: 0, depth: 1 };
     held = { kind, index, depth, ...at, samples: [[event.timeStamp / 1000, at.x, at.y]] };
     if (kind === "throw") gestures.grab(held.index);
     if (kind === "target") gestures.target(null);
+    if (kind === "draw") gestures.draw(at.x, at.y, true);
     canvas.dataset.hand = kind;
   });
 
@@ -97,17 +102,19 @@ export function listen(canvas, camera, gestures) {
     if (held.samples.length > 60) held.samples.shift();
     const way = camera.way(at.x - held.x, at.y - held.y, held.depth);
     if (held.kind === "throw") gestures.carry(way, velocity(event));
+    else if (held.kind === "draw") gestures.draw(at.x, at.y, false);
     else if (held.kind === "push") gestures.push(way);
     else if (held.kind === "target") gestures.target(way);
     else {
       camera.yaw -= (at.x - before.x) * 0.006;
-      camera.pitch = Math.min(1.45, Math.max(-0.2, camera.pitch + (at.y - before.y) * 0.005));
+      camera.pitch = Math.min(STEEPEST, Math.max(-0.2, camera.pitch + (at.y - before.y) * 0.005));
     }
   });
 
   const finish = (/** @type {PointerEvent} */ event) => {
     if (held?.kind === "throw") gestures.release(velocity(event));
     if (held?.kind === "push") gestures.push(null);
+    if (held?.kind === "draw") gestures.drawn();
     held = null;
     canvas.dataset.hand = "";
   };

@@ -1,6 +1,7 @@
 /**
  * The observation of a policy, as sb3_quad/simulation/{observation,frames}.py have it, in float32 where they are: features
- * (thesis 3.3.1) with their noise and scaling (Eq. 3.16), last action, earlier frames and the integral of the position error.
+ * (thesis 3.3.1), relative to a reference that moves, with their noise and scaling (Eq. 3.16), last action, earlier frames, the
+ * integral of the position error, and what is seen of the reference's future.
  *
  * @typedef {import("./vehicle.js").Turn} Turn
  *
@@ -8,9 +9,12 @@
  * @property {boolean} last_action
  * @property {number[] | null} history ages of the observed frames, control steps
  * @property {{gain: number, distance: number, speed: number, limit: number} | null} position_integral
+ * @property {number[] | null} [preview] control steps ahead, whose acceleration of the reference is seen
+ *
+ * @typedef {(steps: number) => ArrayLike<number>} Ahead the reference's acceleration in so many control steps, m/s²
  */
 import { errorOf, rotation } from "./dynamics.js";
-import { DEFAULT_STD, F, OBSERVATION_SIZE, part } from "./tables.js";
+import { DEFAULT_STD, F, OBSERVATION_SIZE, part, X } from "./tables.js";
 
 const NO_TURN = { angle: 0, order: [0, 1, 2, 3] };
 const f32 = Math.fround;
@@ -36,6 +40,29 @@ export function features(s, turn, out) {
   for (let k = 0; k < 3; k++) turned(r.slice(3 * k, 3 * k + 3), F.rotation + k, 3);
   turned([0, 1, 2].map((k) => r[k] * velocity[0] + r[3 + k] * velocity[1] + r[6 + k] * velocity[2]), F.velocity);
   turned(part(s, "body_rates"), F.body_rates);
+  relate(s, out);
+}
+
+const ACCELERATION_STD = 5; // m/s², of the preview
+
+/** Cosine and sine of the heading whose frame is observed; the world's if none is asked for. @param {Float64Array} s */
+function headingOf(s) {
+  const [cosine, sine] = part(s, "target_heading");
+  return cosine || sine ? [f32(cosine), f32(sine)] : [1, 0];
+}
+
+/** Make features relative to the reference, in place: its velocity, its heading and the rate of that. @param {Float64Array} s @param {Float32Array} out */
+function relate(s, out) {
+  const [c, d] = headingOf(s);
+  const [ux, uy, uz] = part(s, "target_velocity").map(f32), rate = f32(s[X.target_heading_rate]);
+  const toHeading = (/** @type {number} */ k) => ([out[k], out[k + 1]] = [c * out[k] + d * out[k + 1], c * out[k + 1] - d * out[k]]);
+  for (let row = 0; row < 3; row++) {
+    const k = F.rotation + 3 * row;
+    out[F.velocity + row] -= ux * out[k] + uy * out[k + 1] + uz * out[k + 2];
+    out[F.body_rates + row] -= rate * out[k + 2];
+    toHeading(k);
+  }
+  toHeading(F.position);
 }
 
 /** Observations of one flight, with what they remember. */
@@ -55,6 +82,7 @@ export class Observer {
     this.size = OBSERVATION_SIZE + (settings.last_action ? 4 : 0);
     this.depth = this.ages[this.ages.length - 1] + 1;
     this.integral = settings.position_integral;
+    this.preview = settings.preview ?? [];
     this.controlStep = controlStep;
     this.mean = Float32Array.from(mean);
     this.inverse = Float32Array.from(std, (each) => 1 / f32(each));
@@ -65,25 +93,26 @@ export class Observer {
     this.feature = new Float32Array(OBSERVATION_SIZE);
     this.sum = [0, 0, 0]; // of the position integral, m
     this.frames = new Float32Array(this.depth * this.size);
-    this.out = new Float32Array(this.ages.length * this.size);
+    this.out = new Float32Array(this.ages.length * this.size + 3 * this.preview.length);
     this.step = 0;
   }
 
-  /** The observation as an episode begins. @param {Float64Array} s */
-  begin(s) {
+  /** The observation as an episode begins. @param {Float64Array} s @param {Ahead} [ahead] */
+  begin(s, ahead) {
     this.step = 0;
     this.frames.fill(0);
     this.sum = [0, 0, 0];
     this.#look(s);
-    return this.#observe();
+    return this.#observe(s, ahead);
   }
 
   /**
    * The observation one control step later.
    * @param {Float64Array} s
    * @param {ArrayLike<number>} action that led there, in the layout's order
+   * @param {Ahead} [ahead]
    */
-  next(s, action) {
+  next(s, action, ahead) {
     this.step += 1;
     const at = (this.step % this.depth) * this.size;
     for (let k = OBSERVATION_SIZE; k < this.size; k++) {
@@ -91,7 +120,7 @@ export class Observer {
     }
     this.#look(s);
     if (this.integral) this.#integrate(this.integral);
-    return this.#observe();
+    return this.#observe(s, ahead);
   }
 
   /** @param {Float64Array} s */
@@ -113,7 +142,8 @@ export class Observer {
     this.sum = this.sum.map((s, k) => Math.min(Math.max(s + gain * this.controlStep * value(F.position + k), -limit), limit));
   }
 
-  #observe() {
+  /** @param {Float64Array} s @param {Ahead} [ahead] */
+  #observe(s, ahead = () => part(s, "target_acceleration")) {
     const { step, depth, size, frames, out } = this;
     const now = (step % depth) * size;
     frames.set(this.feature, now);
@@ -125,6 +155,11 @@ export class Observer {
       const then = ((step - age + depth * 2) % depth) * size;
       if (age <= step) out.set(frames.subarray(then, then + size), k * size);
       else out.fill(0, k * size, (k + 1) * size);
+    });
+    const [c, d] = headingOf(s);
+    this.preview.forEach((steps, k) => {
+      const [x, y, z] = Array.from(ahead(steps));
+      out.set([c * x + d * y, c * y - d * x, z].map((each) => each / ACCELERATION_STD), this.ages.length * size + 3 * k);
     });
     return out;
   }

@@ -32,13 +32,24 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_veh
 DEFAULT_AGENTS = (
     "pid",
     "geometric",
+    "itm-robust",
     "RL agent=itm-recovery",
     "any-quadcopter",
     "imitation agent=itm-imitation",
 )
 EXACT = 50_000  # numbers of a network, above which they are rounded to half precision
 # The modules of the page in the order of their imports: those that need no browser, and the others.
-MODEL = ["tables", "vehicle", "dynamics", "observation", "network", "experts", "flight", "weights"]
+MODEL = [
+    "tables",
+    "vehicle",
+    "dynamics",
+    "observation",
+    "network",
+    "experts",
+    "course",
+    "flight",
+    "weights",
+]
 VIEW = [
     "fleet",
     "camera",

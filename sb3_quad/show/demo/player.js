@@ -1,11 +1,12 @@
 /**
- * The clock of the flights, and what the visitor does: throw, push, move the target.
+ * The clock of the flights, and what the visitor does: throw, push, draw a path, move the target.
  *
  * @typedef {import("./fleet.js").Entry} Entry
  * @typedef {import("./camera.js").Camera} Camera
  * @typedef {import("./scene.js").Body} Body
  * @typedef {import("./flight.js").Start} Start
  */
+import { lengthOf } from "./course.js";
 import { rotation, turnBody } from "./dynamics.js";
 import { Fleet, STARTS } from "./fleet.js";
 import { part, STATE_SIZE, X } from "./tables.js";
@@ -15,6 +16,8 @@ const FASTEST = 14; // m/s of a throw
 const TUMBLE = 1.1; // rad/s of a throw, per m/s
 const SPIN = 12; // rad/s at which a dragged vehicle turns at most
 const STRONGEST = 1.2; // of a push, weights
+const FARTHEST = 20; // m of a path from the reference
+const SHORTEST = 1; // m, below which a path is a slip of the hand
 const KICK_SECONDS = 0.15;
 const PAUSE = 1.4; // s between attempts of the automatic flight
 const CYCLE = ["random", "10 m away", "upside down, at rest", "random", "tumbling", "upside down"];
@@ -31,8 +34,10 @@ export class Player {
     this.trails = true;
     this.touched = false;
     this.startName = "upside down"; // of the present attempt; empty after a throw
-    /** @type {"throw" | "push"} */
+    /** @type {"throw" | "push" | "draw"} */
     this.tool = "throw";
+    /** @type {number[][]} */
+    this.drawing = []; // the path under the hand, m
     this.carried = 0; // s of flight that are due
     this.idle = 0; // s since all were done
     this.round = 0;
@@ -48,6 +53,12 @@ export class Player {
 
   /** @param {Partial<Pick<Player, "paused" | "speed" | "auto" | "apart" | "trails" | "tool">>} changes */
   set(changes) {
+    if (changes.tool && (changes.tool === "draw") !== (this.tool === "draw")) {
+      // A path is drawn from above, and all follow it in one place.
+      if (changes.tool === "draw") this.camera.lookDown();
+      else this.camera.reset();
+      Object.assign(this, { apart: changes.tool !== "draw", auto: false, touched: true });
+    }
     Object.assign(this, changes);
     this.onChange();
   }
@@ -60,12 +71,12 @@ export class Player {
 
   /** The same start again. */
   again() {
-    this.#begin(this.fleet.start);
+    this.#begin(this.fleet.start, true);
   }
 
-  /** @param {Start} start */
-  #begin(start) {
-    this.fleet.begin(start);
+  /** @param {Start} start @param {boolean} [stays] whether they still follow the path */
+  #begin(start, stays = false) {
+    this.fleet.begin(start, stays);
     this.carried = this.idle = 0;
     this.set({ paused: false });
   }
@@ -163,7 +174,7 @@ export class Player {
   /** @param {number[]} velocity m/s */
   release(velocity) {
     const { position } = this.fleet.start;
-    this.#begin({ ...this.#inHand([0, 0, 0], velocity), position });
+    this.#begin({ ...this.#inHand([0, 0, 0], velocity), position }, true);
   }
 
   /** @param {number[] | null} way an arrow, m; null: no longer */
@@ -172,6 +183,30 @@ export class Player {
     const size = Math.max(Math.hypot(...(way ?? [0])), 1e-9);
     const force = (Math.min(size / 2, STRONGEST) * this.fleet.weight) / size;
     this.fleet.push = (way ?? [0, 0, 0]).map((each) => each * force);
+  }
+
+  /** @param {number} x @param {number} y pixels @param {boolean} begins */
+  draw(x, y, begins) {
+    if (begins) this.drawing = [];
+    const point = this.camera.pointAt(x, y, this.fleet.target[2]);
+    if (point && Math.hypot(...point.map((each, k) => each - this.fleet.target[k])) < FARTHEST) this.drawing.push(point);
+  }
+
+  /** The path has been drawn: all follow it. */
+  drawn() {
+    const points = this.drawing;
+    this.drawing = [];
+    if (lengthOf(points) < SHORTEST) return;
+    this.takeOver();
+    this.startName = "";
+    this.idle = 0;
+    this.fleet.follow(points);
+    this.set({ paused: false });
+  }
+
+  /** The path that is drawn or followed, m. @returns {number[][]} */
+  get line() {
+    return this.drawing.length ? this.drawing : this.fleet.path?.course.lap ?? [];
   }
 
   /** A blow to the right. */
@@ -185,7 +220,7 @@ export class Player {
     if (way) this.moveTarget(this.dragged, way);
     else {
       this.takeOver();
-      this.dragged = [...this.fleet.start.target];
+      this.dragged = this.fleet.target;
     }
   }
 
@@ -199,7 +234,7 @@ export class Player {
   nudge(x, y) {
     this.takeOver();
     const { right, up } = this.camera.axes;
-    this.moveTarget(this.fleet.start.target, right.map((each, k) => x * each + y * up[k]));
+    this.moveTarget(this.fleet.target, right.map((each, k) => x * each + y * up[k]));
   }
 
   /** The spin of something thrown, body frame, rad/s. @param {number[]} velocity */

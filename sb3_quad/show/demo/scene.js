@@ -34,13 +34,21 @@ export class Scene {
     this.palette = {};
   }
 
-  /** @param {Body[]} bodies @param {Vehicle} vehicle @param {boolean} trails whether they are drawn */
-  draw(bodies, vehicle, trails) {
+  /**
+   * @param {Body[]} bodies
+   * @param {Vehicle} vehicle
+   * @param {boolean} trails whether they are drawn
+   * @param {number[][]} path that is followed, m
+   */
+  draw(bodies, vehicle, trails, path) {
     this.camera.prepare();
     this.#ground();
     const lanes = new Map(bodies.map((body) => [body.lane.join(), body]));
     for (const body of bodies) this.#shadow(body);
-    for (const body of lanes.values()) this.#target(body);
+    for (const body of lanes.values()) {
+      this.#path(path, body.lane);
+      this.#target(body);
+    }
     if (trails) for (const body of bodies) this.#trail(body);
     const far = (/** @type {Body} */ body) => this.camera.project(body.position)[2];
     for (const body of [...bodies].sort((a, b) => far(b) - far(a))) {
@@ -137,6 +145,17 @@ export class Scene {
     g.beginPath();
     g.arc(x, y, 2, 0, 2 * Math.PI);
     g.fill();
+  }
+
+  /** @param {number[][]} path @param {number[]} lane */
+  #path(path, lane) {
+    if (path.length < 2) return;
+    trace(this.g, this.camera, path.map((p) => p.map((each, k) => each + lane[k])));
+    this.g.strokeStyle = faded(this.palette.target, 0.7);
+    this.g.lineWidth = 2;
+    this.g.setLineDash([7, 5]);
+    this.g.stroke();
+    this.g.setLineDash([]);
   }
 
   /** @param {Body} body */

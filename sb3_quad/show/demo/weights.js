@@ -189,8 +189,8 @@ export async function readAgent(label, content) {
   }
   if (data.vec_normalize?.norm_obs) throw new Error("it was trained with VecNormalize; sb3-quad demo makes a page of it");
   const settings = data.flight_settings ?? {};
-  const { last_action = false, history = null, position_integral = null } = settings;
-  const size = (history ?? [0]).length * (OBSERVATION_SIZE + (last_action ? 4 : 0));
+  const { last_action = false, history = null, position_integral = null, preview = null } = settings;
+  const size = (history ?? [0]).length * (OBSERVATION_SIZE + (last_action ? 4 : 0)) + 3 * (preview ?? []).length;
   if (!layers.length || layers[0].inputs !== size || layers[layers.length - 1].outputs !== 4) {
     const actual = layers.length ? `${layers[0].inputs} numbers and gives ${layers[layers.length - 1].outputs}` : "nothing";
     throw new Error(`its network takes ${actual}; by its settings it takes ${size}, and a quadcopter takes 4`);
@@ -202,7 +202,7 @@ export async function readAgent(label, content) {
       kind: "network",
       vehicle: settings.vehicles ? "" : settings.vehicle?.name,
       layout: settings.rotor_layout ?? settings.vehicle,
-      observation: { last_action, history, position_integral },
+      observation: { last_action, history, position_integral, preview },
       mean: row(settings.observation_mean),
       std: row(settings.observation_std),
       layers,
