@@ -35,6 +35,7 @@ class FlownStates(NamedTuple):
     target_acceleration: th.Tensor  # (..., 3), m/s²
     target_heading: th.Tensor  # (..., 2), cosine and sine; zeros where none is asked for
     target_heading_rate: th.Tensor  # (..., 1), rad/s
+    target_ahead: th.Tensor  # (..., 3), m/s², the acceleration in AHEAD seconds
     actions: th.Tensor  # (..., 4), before they are clipped to [-1, 1]
 
     @property

@@ -7,7 +7,7 @@ import pkgutil
 import sys
 import traceback
 from argparse import Namespace
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_quad.base import __version__
@@ -56,15 +56,13 @@ def make_parser() -> Parser:
     parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"sb3_quad {__version__}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
-    siblings: dict[str, Container[str]] = {}
     for name, command in COMMANDS.items():
         text, heading, rest = str(command.__doc__).partition("examples:\n")
         subparser = subparsers.add_parser(
             name, help=text.partition("\n\n")[0], description=text, epilog=heading + rest
         )
         add_flags(subparser, {**command.FLAGS, **TRACEBACK})
-        subparser.siblings = siblings
-        siblings[name] = subparser._option_string_actions
+        subparser.siblings[name] = subparser._option_string_actions
     return parser
 
 

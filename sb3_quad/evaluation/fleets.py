@@ -58,8 +58,12 @@ class PyBulletFleet(Fleet):
         self._seeds = seeds
         # Flights end by their plan; -1 is Gymnasium's word for an environment that truncates none.
         # The batch moves the targets, so that no environment needs tables of its own.
-        changes = {"max_episode_steps": -1, "reference": None, "disable_env_checker": True}
-        keywords = {**dict(settings), **changes}
+        keywords = {
+            **dict(settings),
+            "max_episode_steps": -1,
+            "reference": None,
+            "disable_env_checker": True,
+        }
         # By its id, since PyBullet may be missing, which matters here only.
         self._envs: list[Any] = [gymnasium.make(ENV_ID, **keywords).unwrapped for _ in seeds]
 

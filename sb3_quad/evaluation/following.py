@@ -6,7 +6,7 @@ from sb3_quad.base.types import BoolArray, FloatArray
 from sb3_quad.simulation.state import QuadcopterState
 
 SETTLED = 2.0  # s after which the errors count
-FOLLOWED = ("rms_error", "greatest_error", "path_error", "lag", "heading_error")
+FOLLOWED = ("rms_error", "greatest_error", "path_error", "heading_error", "lag")
 
 
 class Following:
@@ -66,7 +66,7 @@ class Following:
                 np.sqrt(squares / steps),
                 self._greatest,
                 np.sqrt(np.maximum(across, 0.0) / steps),
-                -along / speeds,
                 np.degrees(np.sqrt(turns / asked)),
+                -along / speeds,
             )
         return dict(zip(FOLLOWED, np.where(survival & self.moves, errors, np.nan), strict=True))

@@ -1,9 +1,7 @@
 """Tables of metrics: a column for each controller, then columns of others' metrics."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import groupby
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -36,8 +34,8 @@ FOLLOWING = (
     Row("position error, rms", "m", decimals=3),
     Row("position error, greatest", "m", decimals=3),
     Row("cross-track error, rms", "m", decimals=3),
-    Row("lag", "s", decimals=3),
     Row("heading error, rms", "°", decimals=1),
+    Row("lag", "s", decimals=3),
 )
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
@@ -79,13 +77,12 @@ def settling_row(tolerance: float) -> Row:
     return Row(f"settling time ({tolerance:g} m)", "s", verb="settle")
 
 
-def estimate_cell(
-    estimate: Estimate | None, factor: float = 1.0, decimals: int = 2, none: str = "–"
-) -> Cell:
-    """Return an estimate with its interval, both times ``factor``; the words ``none`` for None."""
+def estimate_cell(row: Row, estimate: Estimate | None, none: str = "–") -> Cell:
+    """Return the cell of an estimate with its interval in a row; the words ``none`` for None."""
     if estimate is None:
         return Cell(words=none)
-    return Cell(factor * estimate.value, (factor * estimate.low, factor * estimate.high), decimals)
+    ends = (row.factor * estimate.low, row.factor * estimate.high)
+    return Cell(row.factor * estimate.value, ends, row.decimals)
 
 
 def metric_cells(metrics: Metrics) -> Cells:
@@ -93,8 +90,8 @@ def metric_cells(metrics: Metrics) -> Cells:
 
     What does not exist of these flights, such as the error of survivors without any, has no cell.
     """
-    values: dict[Row, Any] = {row: getattr(metrics, name) for name, row in ROWS.items()}
-    near = arrival_tolerance(map(attrgetter("tolerance"), metrics.arrivals))
+    values = {row: getattr(metrics, name) for name, row in ROWS.items()}
+    near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
     for arrival in metrics.arrivals:
         values[time_row(arrival.tolerance)] = arrival
         # Settling and overshoot are shown of one tolerance only.
@@ -115,13 +112,13 @@ def _measured(row: Row, value: Any) -> Cell:
     if not isinstance(value, Moment):
         # A share has as many digits as a single flight takes to show.
         if row.unit == "%":
-            return estimate_cell(value, 100.0, decimals=len(str(value.n // 200)))
-        return estimate_cell(value, decimals=row.decimals)
+            row = row._replace(decimals=len(str(value.n // 200)))
+        return estimate_cell(row, value)
     # A mean time says how many flights it is of, unless it is all or none.
     note = ""
     if 0.0 < value.share.value < 1.0:
         note = f"{100 * value.share.value:.3g} % {row.verb}"
-    return replace(estimate_cell(value.time, none="never"), note=note)
+    return estimate_cell(row, value.time, none="never")._replace(note=note)
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
@@ -138,12 +135,13 @@ def published_cells(published: Published) -> Cells:
     for name, row in {**ROWS, "final_error": MEDIAN}.items():
         number = getattr(published, name, None)
         if number is not None:
-            cells[row] = _printed(number, 100.0 if row.unit == "%" else 1.0)
-    for row in {SUCCESS, SURVIVAL} & {*cells}:
-        cells[row] = replace(cells[row], note=published.note)
+            cells[row] = _printed(row, number)
+            if row in (SUCCESS, SURVIVAL):
+                cells[row] = cells[row]._replace(note=published.note)
     # Here None has a meaning: never within the tolerance.
     for tolerance, time in published.time_to.items():
-        cells[time_row(tolerance)] = _printed(time)
+        row = time_row(tolerance)
+        cells[row] = _printed(row, time)
     return cells
 
 
@@ -166,7 +164,7 @@ def metric_rows(
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        rows.append(replace(row, cells=[*own, *cells_of(row, others)]))
+        rows.append(row._replace(cells=[*own, *cells_of(row, others)]))
     return rows
 
 
@@ -179,7 +177,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a row, the best marked if its interval is apart from all others'."""
     if row in HIGHER_IS_BETTER:
         sign = 1.0
-    elif row.verb or row in FOLLOWING:
+    elif row.verb or row in FOLLOWING[:-1]:
         sign = -1.0
     else:
         return list(cells)
@@ -190,7 +188,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     for number, cell in enumerate(cells):
         others = np.fmax.reduce(np.delete(high, number), initial=-np.inf)
         # A cell that is alone is not the best.
-        marked.append(replace(cell, best=bool(low[number] > others > -np.inf)))
+        marked.append(cell._replace(best=bool(low[number] > others > -np.inf)))
     return marked
 
 
@@ -223,7 +221,7 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
         words = []
         for who, cell in zip(scenario.published, row.cells[len(controllers) :], strict=True):
             if cell != NOTHING:
-                words.append(f"{who} {replace(cell, note='').text}")
+                words.append(f"{who} {cell._replace(note='').text}")
         if words:
             cells.append(Cell(words="; ".join(words)))
         section.append(Row(f"  {', '.join(names)}", row.unit, cells))
@@ -279,11 +277,12 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
-def _printed(value: Printed, factor: float = 1.0) -> Cell:
+def _printed(row: Row, value: Printed) -> Cell:
     """A number as its source prints it; a pair is a range, None a time that never came."""
     if value is None:
         return Cell(words="never")
     if isinstance(value, tuple):
         # Tables have a proper minus sign.
-        return Cell(words=" to ".join(f"{factor * end:g}" for end in value).replace("-", "−"))
-    return Cell(factor * value, decimals=len(f"{factor * value:g}".partition(".")[2]))
+        return Cell(words=" to ".join(f"{row.factor * end:g}" for end in value).replace("-", "−"))
+    value *= row.factor
+    return Cell(value, decimals=len(f"{value:g}".partition(".")[2]))

@@ -11,7 +11,6 @@ A number that does not exist is None, never NaN.
 import re
 from collections.abc import Iterable, Sequence
 from itertools import cycle
-from operator import attrgetter
 from pathlib import Path
 from typing import Literal
 
@@ -125,7 +124,7 @@ class Results(Frozen):
     @property
     def colours(self) -> dict[str, str]:
         """The colours of the controllers in plots, ``#rrggbb``, by label."""
-        return colours_of([*map(attrgetter("label"), self.controllers)])
+        return colours_of([record.label for record in self.controllers])
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """Return the entry of a controller's label and a scenario's name; None if it failed."""

@@ -75,23 +75,21 @@ def sections(results: Results, folder: StrPath) -> list[Section]:
     parts = [Section("overview", "Success and survival", OVERVIEW, shares)]
     for heading, scenarios in groups:
         parts.append(_flights_section(results, heading, scenarios, Path(folder)))
-    rows = []
-    for record in results.controllers:
-        content = (record.content or "")[:12]
-        rows.append((record.label, record.spec, record.algorithm or "", content))
-    parts.append(
-        _words_section("Controllers", ("name", "controller", "algorithm", "SHA-256"), rows)
-    )
+    controllers = [
+        (record.label, record.spec, record.algorithm or "", (record.content or "")[:12])
+        for record in results.controllers
+    ]
+    heads = ("name", "controller", "algorithm", "SHA-256")
+    table = text_table("", heads, controllers, "left")
+    parts.append(Section("controllers", "Controllers", tables=[table]))
     if results.failures:
-        lines = []
-        for failure in results.failures:
-            lines.append((failure.controller, failure.scenario or "", failure.message))
-        parts.append(_words_section("Failures", ("controller", "scenario", "what happened"), lines))
+        failures = [
+            (failure.controller, failure.scenario or "", failure.message)
+            for failure in results.failures
+        ]
+        table = text_table("", ("controller", "scenario", "what happened"), failures, "left")
+        parts.append(Section("failures", "Failures", tables=[table]))
     return parts
-
-
-def _words_section(heading: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Section:
-    return Section(heading.lower(), heading, tables=[text_table("", heads, rows, align="left")])
 
 
 def _flights_section(
@@ -102,8 +100,8 @@ def _flights_section(
     flown = f"{first.episodes} flights of each controller"
     tables = []
     if first.group is None:
-        columns = _columns(results, first.published)
-        tables.append(Table(columns, scenario_rows(results, results.colours, first)))
+        rows = scenario_rows(results, results.colours, first)
+        tables.append(Table(_columns(results, first.published), rows))
         plots = _scenario_plots(results, first, folder)
     else:
         flown += f" in each of {len(scenarios)} cells"
@@ -115,11 +113,15 @@ def _flights_section(
                 _share_table(SUCCESS, results, cells, f"{axis_label(key, first)}: success (%)")
             )
         plots = group_plots(results, scenarios)
-    facts = (
+    return Section(
+        first.group or first.name,
+        heading,
+        first.description,
+        tables,
+        plots,
         f"{flown}, {first.duration:g} s; observation noise {in_words(first.noise)};"
-        f" seed {first.seed}."
+        f" seed {first.seed}.",
     )
-    return Section(first.group or first.name, heading, first.description, tables, plots, facts)
 
 
 def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[Plot]:
@@ -142,7 +144,7 @@ def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[
 
 def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Table:
     """Success or survival in each group of scenarios; of several, from the worst to the best."""
-    others: list[str] = []
+    others = []
     for _, scenarios in groups:
         for name, published in scenarios[0].published.items():
             if row in published_cells(published) and name not in others:
@@ -172,7 +174,5 @@ def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]
 
 
 def _columns(results: Results, others: Iterable[str]) -> list[Column]:
-    columns = [*map(Column, results.colours, results.colours.values())]
-    for name in others:
-        columns.append(Column(name, source=results.source))
-    return columns
+    own = map(Column, results.colours, results.colours.values())
+    return [*own, *(Column(name, source=results.source) for name in others)]

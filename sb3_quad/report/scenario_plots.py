@@ -142,8 +142,7 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
     """
     group = scenarios[0].group
     keys = [*scenarios[0].cell]
-    table = _cells(results, scenarios)
-    controllers = table.groupby("label", sort=False)
+    controllers = _cells(results, scenarios).groupby("label", sort=False)
     is_single = len(keys) == 1
     plots = []
     for number, key in enumerate(keys):
@@ -171,11 +170,14 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
         legend(figure)
-        caption = (
-            "Median final error of the flights that survive, unless these are fewer than half;"
-            " errors below 1 mm are drawn at 1 mm."
+        plots.append(
+            Plot(
+                f"{group}_error",
+                "Median final error of the flights that survive, unless these are fewer than half;"
+                " errors below 1 mm are drawn at 1 mm.",
+                figure,
+            )
         )
-        plots.append(Plot(f"{group}_error", caption, figure))
     return plots
 
 

@@ -56,8 +56,7 @@ def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
 
 def until_settled(recording: Recording) -> Recording:
     """Return a flight without what follows once the vehicle stays at its target."""
-    away = np.flatnonzero(recording.state.distance > SETTLED)
-    n = int(away.max(initial=-1)) + 2
+    n = int(np.flatnonzero(recording.state.distance > SETTLED).max(initial=-1)) + 2
     if recording.lost or recording.follows:
         return recording
     return replace(

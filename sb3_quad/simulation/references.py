@@ -18,7 +18,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
-from sb3_quad.simulation.state import STATE_SIZE, X
+from sb3_quad.simulation.state import AHEAD, STATE_SIZE, X
 
 Motion = Callable[[FloatArray], FloatArray]
 """The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
@@ -157,7 +157,7 @@ class Reference(Frozen):
             table = np.vstack([table, table[-1]])
             table[-1, _VELOCITY.start : _ACCELERATION.stop] = 0.0
             table[-1, _HEADING_RATE] = 0.0
-        return Tracks(table, len(table), loops)
+        return _tracks(table, len(table), loops, dt)
 
     def _motion(self, dt: float) -> tuple[Motion, float]:
         """Return a curve as a function of time, and how long it takes, s."""
@@ -260,7 +260,17 @@ class Reference(Frozen):
                 angle = start + turns * base * dt * np.arange(length, dtype=np.float64)
                 _set_heading(table, angle, dt)
             pieces.append(table)
-        return Tracks(np.concatenate(pieces), length, True)
+        return _tracks(np.concatenate(pieces), length, True, dt)
+
+
+def _tracks(table: FloatArray, length: int, loops: bool, dt: float) -> Tracks:
+    """Return tables whose accelerations ahead are written, in place."""
+    pieces = table.reshape(-1, length, REFERENCE_SIZE)
+    later = np.arange(length) + round(AHEAD / dt)
+    pieces[..., -3:] = pieces[..., _ACCELERATION].take(
+        later, axis=1, mode="wrap" if loops else "clip"
+    )
+    return Tracks(table, length, loops)
 
 
 def _sum_of_sines(

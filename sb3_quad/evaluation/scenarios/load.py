@@ -74,7 +74,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         raise ConfigError(
             f"{where}: must hold 'name' and a list 'scenarios', each with keys and values"
         )
-    scenarios: list[Scenario] = []
+    scenarios = []
     for number, entry in enumerate(entries):
         place = f"{where}: scenario {entry.get('name', number)}"
         vehicle = entry.get("vehicle")
@@ -86,8 +86,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         if isinstance(reference, dict) and "file" in reference:
             entry["reference"] = {**reference, "file": folder / str(reference["file"])}
         # A cell of a grid is a scenario like any other.
-        for cell in grid(entry, place):
-            scenarios.append(validate(Scenario, cell, place))
+        scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)
 
 

@@ -4,13 +4,19 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
-from operator import attrgetter
 from typing import Annotated, Any
 
-from pydantic import Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PositiveFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.errors import refuse_unknown
+from sb3_quad.base.seeds import Seed, row_seeds, seed_for
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
@@ -76,7 +82,7 @@ class Scenario(Frozen):
     """external forces and torques"""
     noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
     """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
-    duration: Annotated[float, Field(gt=0, le=600)] = 15.0
+    duration: float = Field(default=15.0, gt=0, le=600)
     """of an episode; the unit is s"""
     max_distance: PositiveFloat = 30.0
     """farther than this from the target ends an episode, m"""
@@ -88,11 +94,13 @@ class Scenario(Frozen):
     """each episode has one of these, unknown to the controller, such as {distribution: raptor}"""
     randomize: Randomization | None = None
     """what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"""
-    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 240
+    episodes: int = Field(default=240, ge=1, le=1_000_000)
     """number of episodes"""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    seed: Seed = 0
     """every episode derives its own from it"""
-    tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1)
+    tolerances: Annotated[
+        tuple[PositiveFloat, ...], AfterValidator(lambda values: tuple(sorted(set(values))))
+    ] = Field(default=TOLERANCES, min_length=1)
     """of arrival, |r - r_T|, m"""
     published: dict[str, Published] = {}
     """from a column's title to others' metrics"""
@@ -108,11 +116,6 @@ class Scenario(Frozen):
         if isinstance(value, str) and VEHICLES.is_path(value):
             return load_vehicle(value)
         return value
-
-    @field_validator("tolerances")
-    @classmethod
-    def _rising(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        return tuple(sorted(set(value)))
 
     @model_validator(mode="after")
     def _possible(self) -> "Scenario":
@@ -292,7 +295,7 @@ class Suite(Frozen):
     """its purpose"""
     source: str = "published"
     """where the published metrics come from; heads their column"""
-    scenarios: tuple[Scenario, ...] = Field(min_length=1)
+    scenarios: list[Scenario] = Field(min_length=1)
 
     def scenario(self, name: str) -> Scenario:
         """Return the scenario of a name.
@@ -300,8 +303,7 @@ class Suite(Frozen):
         :raises ConfigError: an unknown name.
         """
         scenarios = {scenario.name: scenario for scenario in self.scenarios}
-        if name not in scenarios:
-            raise ConfigError(unknown("scenario", name, scenarios))
+        refuse_unknown("scenario", [name], scenarios)
         return scenarios[name]
 
     def with_changes(
@@ -338,14 +340,12 @@ class Suite(Frozen):
                         f"scenario {scenario.name}{flown_by}",
                     )
                 )
-        for name in names:
-            if name not in known:
-                raise ConfigError(unknown("scenario", name, known))
-        return self.model_copy(update={"scenarios": tuple(changed)})
+        refuse_unknown("scenario", names, known)
+        return self.model_copy(update={"scenarios": changed})
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = Counter(map(attrgetter("name"), self.scenarios))
+        names = Counter(scenario.name for scenario in self.scenarios)
         for name, times in names.items():
             if times > 1:
                 raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
