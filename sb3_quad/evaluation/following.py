@@ -25,8 +25,7 @@ class Following:
     """
 
     def __init__(self, n: int, control_step: float) -> None:
-        # Half a step of tolerance, since times are multiples of steps only up to rounding.
-        self._first = SETTLED / control_step + 0.5
+        self._first = SETTLED / control_step
         self.moves = np.zeros(n, bool)
         self._greatest = np.full(n, np.nan)
         self._sums = np.zeros((7, n))
