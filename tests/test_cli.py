@@ -390,7 +390,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(
     output = capsys.readouterr()
     assert (
         run.path.name in output.out
-        and f"{run.path.name} flies heavy, the reference flies itm" in output.err
+        and f"{run.path.name} flies heavy, the published one flies itm" in output.err
     )
     assert publish.main([str(run.path), "--name", "mine", "--episodes", "2"]) == 0
     card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]

@@ -162,14 +162,18 @@ def _task_table(
     first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
     scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
+    reference = settings[next(iter(settings))].reference
+    if reference is not None:
+        # Nothing is published of targets that move.
+        scenario = scenario.model_copy(update={"reference": reference, "published": {}})
     columns = [*map(Column, metrics)]
-    references = []
+    published = []
     if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):
         for name in thesis_columns:
-            if name in scenario.reference:
+            if name in scenario.published:
                 columns.append(Column(name, source="thesis"))
-                references.append(scenario.reference[name])
-    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
+                published.append(scenario.published[name])
+    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], published)
 
     title = f"{task}: {n_flights} fresh episodes, the same for all"
     if not any(how.noise for how in settings.values()):

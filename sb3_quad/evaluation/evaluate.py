@@ -161,8 +161,8 @@ def _load_controllers(
         for scenario in suite.scenarios:
             if scenario.vehicle is None:
                 vehicles[spec.label] = _vehicle(spec, scenario).name
-    if any(scenario.reference and scenario.vehicle is None for scenario in suite.scenarios):
-        vehicles["the reference"] = DEFAULT_VEHICLE
+    if any(scenario.published and scenario.vehicle is None for scenario in suite.scenarios):
+        vehicles["the published one"] = DEFAULT_VEHICLE
     if len({*vehicles.values()}) > 1:
         flown = ", ".join(map(" flies ".join, vehicles.items()))
         report(f"not all fly the same vehicle: {flown}; --vehicle gives all of them one")
@@ -358,6 +358,9 @@ def _digest(jobs: Sequence[Job], records: Mapping[ControllerSpec, ControllerReco
     for job in jobs:
         inputs = job, records[job.spec], job.spec.own, _vehicle(job.spec, job.scenario)
         digest.update(repr(inputs).encode())
+        reference = job.scenario.reference
+        if reference and reference.file:
+            digest.update(Path(reference.file).read_bytes())
     return digest.hexdigest()
 
 

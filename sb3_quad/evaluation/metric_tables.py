@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from sb3_quad.evaluation.flights import arrival_tolerance
+from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_values
-from sb3_quad.evaluation.scenarios.scenario import Printed, Reference, Scenario
+from sb3_quad.evaluation.scenarios.scenario import Printed, Published, Scenario
 from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 
@@ -28,10 +29,18 @@ MEDIAN = Row("final error, median", "m", decimals=3)
 QUANTILE = Row("final error, 95 %", "m", decimals=3)
 RECOVERY_TIME = Row("recovery time", "s", verb="recover")
 CROSS_TRACK_ERROR = Row("cross-track error", "m")
+# Of targets that move, in the order of FOLLOWED
+FOLLOWING = (
+    Row("position error, rms", "m", decimals=3),
+    Row("position error, greatest", "m", decimals=3),
+    Row("cross-track error, rms", "m", decimals=3),
+    Row("heading error, rms", "°", decimals=1),
+    Row("lag", "s", decimals=3),
+)
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
 COURSE_TIME = Row("time of the course", "s", verb="complete")
-# The rows of fields of Metrics; those of Reference have the same names.
+# The rows of fields of Metrics; those of Published have the same names.
 ROWS = {
     "success": SUCCESS,
     "survival": SURVIVAL,
@@ -44,6 +53,7 @@ ROWS = {
     "final_error_median": MEDIAN,
     "final_error_95": QUANTILE,
     "recovery_time": RECOVERY_TIME,
+    **dict(zip(FOLLOWED, FOLLOWING, strict=True)),
 }
 # Flights that are lost end early, which makes other rows incomparable.
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}
@@ -119,32 +129,32 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
     return {**metric_cells(entry.metrics), LIMIT: Cell(entry.physical_limit)}
 
 
-def reference_cells(reference: Reference) -> Cells:
+def published_cells(published: Published) -> Cells:
     """Return others' metrics."""
     cells = {}
     for name, row in {**ROWS, "final_error": MEDIAN}.items():
-        number = getattr(reference, name, None)
+        number = getattr(published, name, None)
         if number is not None:
             cells[row] = _printed(row, number)
             if row in (SUCCESS, SURVIVAL):
-                cells[row] = cells[row]._replace(note=reference.note)
+                cells[row] = cells[row]._replace(note=published.note)
     # Here None has a meaning: never within the tolerance.
-    for tolerance, time in reference.time_to.items():
+    for tolerance, time in published.time_to.items():
         row = time_row(tolerance)
         cells[row] = _printed(row, time)
     return cells
 
 
 def metric_rows(
-    scenario: Scenario, measured: Sequence[Cells | None], references: Iterable[Reference] = ()
+    scenario: Scenario, measured: Sequence[Cells | None], published: Iterable[Published] = ()
 ) -> list[Row]:
-    """Return the rows of a scenario, the best of each marked: controllers first, then references.
+    """Return the rows of a scenario, the best of each marked: controllers first, then others.
 
     :param measured: of each controller; None: it failed.
     """
     # A controller that failed has one cell, which says so.
     ours = [cells or {SUCCESS: Cell(words="failed")} for cells in measured]
-    others = [*map(reference_cells, references)]
+    others = [*map(published_cells, published)]
     none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells)
     rows = []
     for row in _rows_of(scenario):
@@ -167,7 +177,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a row, the best marked if its interval is apart from all others'."""
     if row in HIGHER_IS_BETTER:
         sign = 1.0
-    elif row.verb:
+    elif row.verb or row in FOLLOWING[:-1]:
         sign = -1.0
     else:
         return list(cells)
@@ -183,13 +193,13 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
 
 
 def overview(results: Results, controllers: Sequence[str]) -> Table:
-    """Return all scenarios in one table: a section each, references in the last column.
+    """Return all scenarios in one table: a section each, published metrics in the last column.
 
     :param controllers: labels, in the order of their columns.
     """
     columns = [*map(Column, controllers)]
     rows = []
-    if any(scenario.reference for scenario in results.scenarios):
+    if any(scenario.published for scenario in results.scenarios):
         columns.append(Column(results.source, align="left"))
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
@@ -207,9 +217,9 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
         # The values of a cell are name enough for its only row.
         names = values if values and len(rows) == 1 else [*values, row.name]
         cells = [*row.cells[: len(controllers)]]
-        # All references share a column.
+        # All published metrics share a column.
         words = []
-        for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
+        for who, cell in zip(scenario.published, row.cells[len(controllers) :], strict=True):
             if cell != NOTHING:
                 words.append(f"{who} {cell._replace(note='').text}")
         if words:
@@ -219,11 +229,11 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
 
 
 def scenario_rows(results: Results, labels: Iterable[str], scenario: Scenario) -> list[Row]:
-    """Return the :func:`metric_rows` of a scenario: some controllers, then all references."""
+    """Return the :func:`metric_rows` of a scenario: some controllers, then what was published."""
     return metric_rows(
         scenario,
         [measured_cells(results, label, scenario) for label in labels],
-        scenario.reference.values(),
+        scenario.published.values(),
     )
 
 
@@ -246,6 +256,8 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         return [*shares, REACHED, COMPLETED, COURSE_TIME]
     if len(scenario.cell) > 1:
         return [SUCCESS]
+    if scenario.reference is not None:
+        return [*shares, REWARD, OWN_REWARD, *FOLLOWING]
     if scenario.group is not None:
         return [*shares, MEDIAN]
     rewards = [REWARD, OWN_REWARD]
@@ -255,10 +267,10 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         return [*shares, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = {*scenario.tolerances}
     if len(tolerances) > MOST_TOLERANCES:
-        # Only the main ones and those of references; a plot shows the others.
+        # Only the main ones and published ones; a plot shows the others.
         kept = {min(tolerances), *MAIN_TOLERANCES}
-        for reference in scenario.reference.values():
-            kept |= {*reference.time_to}
+        for published in scenario.published.values():
+            kept |= {*published.time_to}
         tolerances &= kept
     settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
     times = map(time_row, sorted(tolerances))

@@ -21,6 +21,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, read_record
+from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
@@ -30,7 +31,10 @@ FLIGHTS = "flights"
 # Files that are removed together with the results; a report writes the last two.
 WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
 # Columns of episodes.csv that are one array each, and those that are several numbers.
-_COLUMNS = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
+_COLUMNS = (
+    *("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error"),
+    *FOLLOWED,
+)
 _AXES = {
     "target": "x y z",
     "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",
@@ -100,11 +104,11 @@ class Failure(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[6] = 6
+    schema_version: Literal[7] = 7
     suite: str
     description: str
-    source: str = "reference"
-    """where the scenarios' reference comes from"""
+    source: str = "published"
+    """where the scenarios' published metrics come from"""
     reward: str = ""
     """your own reward, as given; empty: none"""
     package_version: str

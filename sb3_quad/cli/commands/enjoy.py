@@ -13,6 +13,8 @@ examples:
   # a scenario as poses in one picture, and another one in slow motion
   sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
   sb3-quad enjoy agent.zip --scenario thesis:side_hit -o hit.mp4 --speed 0.5
+  # along a curve, drawn in green
+  sb3-quad enjoy itm-robust --reference figure_eight -o eight.mp4
   # your own vehicle without noise, printed only
   sb3-quad enjoy geometric --vehicle my_vehicle.yaml --env-kwargs noise:0 \
     -n 3000 --no-render
@@ -32,6 +34,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, replacing
+from sb3_quad.base.literals import parse_value
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     OVERWRITE,
@@ -99,6 +102,11 @@ FLAGS: Flags = {
     "--target": (
         {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")},
         "target to fly to, m",
+    ),
+    "--reference X": (
+        parse_value,
+        "what the target does: a curve such as figure_eight, fields such as "
+        "dict(curve='circle',speed=3), or the path of a .csv file",
     ),
     "--no-render": (SWITCH, "only fly and print the results"),
     "-o --output FILE": (
@@ -211,8 +219,10 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
         setting = fixed_setting(_flight_settings(options, first), options.target)
-    elif options.env_kwargs or options.target:
-        raise ConfigError("--scenario describes a whole flight; remove --env-kwargs and --target")
+    elif options.env_kwargs or options.target or options.reference:
+        raise ConfigError(
+            "--scenario describes a whole flight; remove --env-kwargs, --target and --reference"
+        )
     else:
         setting = scenario_setting(options.scenario, first and first.vehicle, options.vehicle)
     controllers = {}
@@ -245,6 +255,8 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
         changes = {"task": task, "task_kwargs": None}
     if options.vehicle:
         changes["vehicle"] = options.vehicle
+    if options.reference:
+        changes["reference"] = options.reference
     return settings.with_changes(**changes | options.env_kwargs)
 
 

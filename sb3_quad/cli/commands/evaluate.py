@@ -59,7 +59,8 @@ FLAGS: Flags = {
     "--suite": (
         str,
         "thesis",
-        "suite of scenarios: thesis (default), robustness, wind, quadcopters, quick or a file",
+        "suite of scenarios: thesis (default), robustness, wind, quadcopters, trajectories, quick "
+        "or a file",
     ),
     "-o --output FOLDER": f"folder for the results ({DEFAULT_FOLDER}/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),

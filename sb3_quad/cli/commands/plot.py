@@ -86,8 +86,8 @@ def run(options: Namespace) -> int:
     lines = {}
     if options.thesis:  # its success is our survival
         scenario = load_suite("thesis").scenario(THESIS_SCENARIOS[options.thesis])
-        for name, reference in scenario.reference.items():
-            lines[f"thesis: {name}"] = reference.model_dump(
+        for name, published in scenario.published.items():
+            lines[f"thesis: {name}"] = published.model_dump(
                 include={"survival", "reward"}, exclude_none=True
             )
     show = options.show

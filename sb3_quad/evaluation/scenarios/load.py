@@ -38,6 +38,7 @@ UNITS = {
     "torque_to_inertia": "rad/s²",
     "motor_time_constant": "s",
     "noise": "relative std",
+    "speed": "m/s",
     "gusts": "std, N",
     "wind": "m/s",
     "wind_gusts": "std, m/s",
@@ -79,6 +80,11 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         vehicle = entry.get("vehicle")
         if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
             entry["vehicle"] = str(folder / vehicle)
+        reference = entry.get("reference")
+        if str(reference).endswith(".csv"):
+            reference = {"curve": "file", "file": reference}
+        if isinstance(reference, dict) and "file" in reference:
+            entry["reference"] = {**reference, "file": folder / str(reference["file"])}
         # A cell of a grid is a scenario like any other.
         scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)

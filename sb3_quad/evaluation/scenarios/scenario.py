@@ -21,6 +21,7 @@ from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.references import Reference
 from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
@@ -35,7 +36,7 @@ Printed = float | tuple[float, float] | None  # None: not known
 _by_name = cache(load_vehicle)
 
 
-class Reference(Frozen):
+class Published(Frozen):
     """Metrics that others measured, printed next to our own; a pair is a range."""
 
     success: Printed = None
@@ -74,6 +75,9 @@ class Scenario(Frozen):
     """where an episode starts; default: hovering at (0, 0, 15) m"""
     target: Target = Target(distance=0.0)
     """where to fly; default: to the start"""
+    reference: Reference | None = None
+    """what the target does from there on: a curve's name, the path of a CSV file (relative to the
+    suite's) or fields of Reference; default: it rests"""
     wrenches: tuple[Wrench, ...] = ()
     """external forces and torques"""
     noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
@@ -98,7 +102,7 @@ class Scenario(Frozen):
         tuple[PositiveFloat, ...], AfterValidator(lambda values: tuple(sorted(set(values))))
     ] = Field(default=TOLERANCES, min_length=1)
     """of arrival, |r - r_T|, m"""
-    reference: dict[str, Reference] = {}
+    published: dict[str, Published] = {}
     """from a column's title to others' metrics"""
     group: str | None = None
     """the scenario that this one is a cell of; set by vary"""
@@ -213,7 +217,7 @@ class Scenario(Frozen):
             velocity_std=start.velocity.std or 0.0,
             body_rates_std=start.body_rates.std or 0.0,
             max_distance=self.max_distance,
-            **({} if elsewhere else RECOVERED),
+            **({} if elsewhere or self.reference else RECOVERED),
         )
 
     @property
@@ -225,6 +229,7 @@ class Scenario(Frozen):
             noise=self.noise,
             vehicles=self.vehicles,
             randomize=self.randomize,
+            reference=self.reference,
             max_episode_steps=self.steps,
         )
 
@@ -233,7 +238,7 @@ class Scenario(Frozen):
         """The least possible mean settling time (0.1 m) of the vehicle, s; None: unknown."""
         # It is known of undisturbed flights from the tasks' own start.
         changed = self.start != Start() or self.wrenches or self.randomize or self.vehicles
-        if changed or 0.1 not in self.tolerances:
+        if changed or self.reference or 0.1 not in self.tolerances:
             return None
         return (self.flown_vehicle().time_optimal or {}).get(self.target.distance or 0.0)
 
@@ -246,7 +251,8 @@ class Scenario(Frozen):
         random: list[Any] = [vector.std or vector.magnitude for vector in vectors]
         attitude = self.start.attitude
         random += [attitude.distribution, attitude.tilt, self.target.distance]
-        return not any([*random, self.randomize, self.vehicles])
+        smooth = self.reference and self.reference.curve == "random_smooth"
+        return not any([*random, self.randomize, self.vehicles, smooth])
 
     def _check_way(self, vehicle: Vehicle) -> None:
         """Check that start and targets lie above ground, within ``max_distance`` of each other."""
@@ -266,6 +272,18 @@ class Scenario(Frozen):
                 f"target: {distance:.3g} m away, and an episode ends beyond max_distance"
                 f" {self.max_distance:g} m"
             )
+        if self.reference is None:
+            return
+        if self.target.waypoints or self.reference.function is not None:
+            raise ValueError(
+                "reference: must be a curve or file, no function, and goes with no waypoints of the"
+                " target; the curve polynomial has waypoints of its own"
+            )
+        lowest = before[2] + self.reference.tracks(vehicle.control_step).table[:, 2].min()
+        if lowest <= least:
+            raise ValueError(
+                f"reference: goes down to z = {lowest:.3g} m; it must stay above {least:g} m"
+            )
 
 
 class Suite(Frozen):
@@ -275,8 +293,8 @@ class Suite(Frozen):
     """letters, digits, _ . -"""
     description: str = ""
     """its purpose"""
-    source: str = "reference"
-    """where the reference comes from; heads its column"""
+    source: str = "published"
+    """where the published metrics come from; heads their column"""
     scenarios: list[Scenario] = Field(min_length=1)
 
     def scenario(self, name: str) -> Scenario:
@@ -299,14 +317,14 @@ class Suite(Frozen):
 
         :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
         :param vehicle: name, or path of a YAML file, that flies all scenarios. Forces and torques
-            stay the same, in N and N m; references, which are of another vehicle, are removed.
+            stay the same, in N and N m; published metrics, of another vehicle, are removed.
         :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible
             for the vehicle.
         """
         chosen: StrDict = {"episodes": episodes, "seed": seed, "vehicle": vehicle}
         flown_by = ""
         if vehicle is not None:
-            chosen["reference"] = {}
+            chosen["published"] = {}
             flown_by = f", flown by {vehicle}"
         changes = {key: value for key, value in chosen.items() if value is not None}
         known = set[str]()
