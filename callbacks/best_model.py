@@ -2,7 +2,8 @@
 
 import time
 from collections import ChainMap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -121,8 +122,6 @@ class BestModel(EveryTimesteps):
             self._evaluations[f"{name}: "] = _Evaluations(
                 other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}"
             )
-        self._start = 0.0
-        self._last = 0
         self.stopped = False  # by ``should_continue``
         self.best: Score = (-np.inf, -np.inf)
 
@@ -191,16 +190,16 @@ class BestModel(EveryTimesteps):
         self.stopped = not self._should_continue(*latest)
 
 
+@dataclass
 class _Evaluations:
-    """The evaluations in some environments: each a row of arrays by name, their file, and their
-    group in the log.
+    """The evaluations in some environments: their file, their group in the log, and each of them
+    as a row of arrays by name.
     """
 
-    def __init__(self, env: VecEnv, path: Path, group: str = "eval") -> None:
-        self.env = env
-        self.path = path
-        self.group = group
-        self.rows: list[StrDict] = []
+    env: VecEnv
+    path: Path
+    group: str = "eval"
+    rows: Sequence[StrDict] = ()
 
     def read(self, n_episodes: int) -> None:
         """Continue the file, if it exists.
@@ -229,7 +228,7 @@ class _Evaluations:
         NaN stands for what one of the evaluations does not have, such as losses before the first
         update.
         """
-        self.rows.append(row)
+        self.rows = [*self.rows, row]
         arrays: StrDict = {}
         # Of each array, an example.
         for name, value in ChainMap(*self.rows).items():
@@ -251,7 +250,7 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
 
     :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
-    ends: list[StrDict] = []
+    ends = []
 
     def note(local_variables: StrDict, global_variables: StrDict) -> None:
         if not local_variables["done"]:

@@ -150,6 +150,8 @@ class BatchEnv:
             np.zeros((2, n)),
             np.zeros((1, n)),
         ]
+        # Nobody knows its future, so the acceleration ahead is the present one.
+        parts.append(parts[2])
         if heading is not None:
             angle = per_row("heading", heading, n)[0]
             parts[3] = np.stack([np.cos(angle), np.sin(angle)])

@@ -14,13 +14,12 @@ from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.settings import ENDLESS, AsList
-from sb3_quad.simulation.state import STATE, P, row_slices
+from sb3_quad.simulation.state import P
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector = Annotated[tuple[float, float, float], AsList]
 Quaternion = Annotated[tuple[float, float, float, float], AsList]
-_ROWS = row_slices(STATE)
 
 
 class _Start(Frozen):
@@ -163,6 +162,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `position_integral` | `None` | fields of `PositionIntegral`; `{}`: its defaults |
     | `vehicles` | `None` | fields of `VehicleDistribution`: each episode has another vehicle |
     | `randomize` | `None` | fields of `Randomization`: what is sampled per episode |
+    | `reference` | `None` | a curve that the target flies, such as `"figure_eight"` |
+    | `preview` | `None` | control steps ahead whose acceleration of the reference is observed |
     | `render_mode` | `None` | `"human"` or `"rgb_array"` |
     | `render_width` | 640 | width of pictures and window, pixels |
     | `render_height` | 480 | height of pictures and window, pixels |
@@ -170,23 +171,27 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     If you give a `rotor_layout`, the body axes and rotors of `vehicle` are turned to it, so that an
     agent of one vehicle can fly another. `noise={"relative": 0.05, "additive": 0.02}` adds noise in
     units of std. `history=None` means the current frame alone. To sample vehicles from a named
-    distribution, give `vehicles={"distribution": "raptor"}`. Render mode `"human"` opens a
+    distribution, give `vehicles={"distribution": "raptor"}`. A `reference` is the name of a curve,
+    fields of `Reference`, the path of a CSV file or a function of time; it begins at the episode's
+    target. Render mode `"human"` opens a
     real-time window, one per process; `"rgb_array"` makes pictures and needs no display.
 
     The classes are :class:`~sb3_quad.simulation.tasks.Task`,
     :class:`~sb3_quad.vehicles.vehicle.Vehicle`, :class:`~sb3_quad.simulation.settings.Noise`,
     :class:`~sb3_quad.simulation.frames.PositionIntegral`,
-    :class:`~sb3_quad.simulation.vehicle_distribution.VehicleDistribution` and
-    :class:`~sb3_quad.simulation.randomization.Randomization`.
+    :class:`~sb3_quad.simulation.vehicle_distribution.VehicleDistribution`,
+    :class:`~sb3_quad.simulation.randomization.Randomization` and
+    :class:`~sb3_quad.simulation.references.Reference`.
 
     ## While Flying
 
-    Call these methods on `env.unwrapped`. A setting holds until you set it again, a target until
-    the next reset.
+    Call these methods on `env.unwrapped`. A setting holds until you set it again, a target or
+    reference until the next reset.
 
     | Method | Sets |
     |--------|------|
     | `set_target(position)` | r_T, (3,), world frame, m |
+    | `set_reference(position, …)` | r_T, its velocity and acceleration, and a heading, rad |
     | `set_wrench(force, torque, …)` | an external force, N, and torque, N m, at the mass centre |
     | `set_wind(velocity)` | the velocity of the air, (3,), world frame, m/s |
     | `set_noise(level)` | the relative standard deviation of the observation noise |
@@ -251,13 +256,13 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         """
         super().reset(seed=seed)
         # Check the options before anything changes.
-        fixed = _fixed_rows(options or {}, self.vehicle)
+        fixed = _fixed_parts(options or {}, self.vehicle)
         batch = self.batch
         if seed is not None:
             batch.seed([seed])
         batch.reset()
-        for rows, values in fixed:
-            batch.state[rows, 0] = values
+        for name, values in fixed:
+            batch.fix(name, values[:, None])
 
         # The simulation was closed, or the user has shut its window.
         if not self._body.connected:
@@ -340,8 +345,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         return np.asarray(super()._by_row(columns)[0])
 
 
-def _fixed_rows(options: StrMapping, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
-    """Return the rows of the state that the options of a reset fix, with their values."""
+def _fixed_parts(options: StrMapping, vehicle: Vehicle) -> list[tuple[str, FloatArray]]:
+    """Return the quantities of the state that the options of a reset fix, with their values."""
     given = validate(_ResetOptions, options, "options")
     fixed = []
     for name, value in [*(given.state or _Start()), ("target", given.target)]:
@@ -358,5 +363,5 @@ def _fixed_rows(options: StrMapping, vehicle: Vehicle) -> list[tuple[slice, Floa
             if norm < 1e-6:
                 raise ConfigError("options: quaternion: must not be zero")
             values = values / norm
-        fixed.append((_ROWS[name], values))
+        fixed.append((name, values))
     return fixed

@@ -19,7 +19,7 @@ from sb3_quad.simulation.tape import FlightTape
 from sb3_quad.simulation.tasks import TaskSpec
 
 _OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
-_METHODS = ("set_target", "set_wrench", "set_wind", "set_noise")
+_METHODS = ("set_target", "set_reference", "set_wrench", "set_wind", "set_noise")
 
 
 class RowSeeds(VecEnv):

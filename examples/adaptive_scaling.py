@@ -140,9 +140,9 @@ def main() -> None:
         )
     metrics = plain | adapted
     columns = [Column(label) for label in metrics]
-    columns += [Column(name, source="thesis") for name in scenario.reference]
+    columns += [Column(name, source="thesis") for name in scenario.published]
     cells = [metric_cells(measured) for measured in metrics.values()]
-    rows = metric_rows(scenario, cells, scenario.reference.values())
+    rows = metric_rows(scenario, cells, scenario.published.values())
     console().print(Table(columns, rows, title=scenario.heading, caption=CAPTION))
     if options.output:
         write_bytes(options.output, arrivals_plot(scenario, metrics, colours_of([*metrics])).png)

@@ -10,9 +10,9 @@ The card holds measured metrics, the command that trained the policy, seed and v
     python examples/publish.py itm-recovery --name itm-recovery --push somebody/itm-recovery
 
 The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 can
-read it, too. For the card the policy flies fresh episodes: 3,840 recoveries, and 960 targets at
-each of 10, 15 and 20 m. The run folder says how it was trained; what it does not say, the card
-calls "not recorded". The agents of the package were made in this way.
+read it, too. For the card the policy flies fresh episodes: 3,840 recoveries, 960 targets at each of
+10, 15 and 20 m, and 960 figures of eight. The run folder says how it was trained; what it does not
+say, the card calls "not recorded". The agents of the package were made in this way.
 
 With --hub you get a folder NAME in the layout of huggingface_sb3: the card as README.md with
 metadata, the zip and its content, config.json and results.json, whose rewards are those of the
@@ -48,6 +48,7 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metric_tables import (
+    FOLLOWING,
     LIMIT,
     MEDIAN,
     QUANTILE,
@@ -73,9 +74,11 @@ UNKNOWN = "not recorded"
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 RECOVERY = "state recovery"
+FIGURE_EIGHT = "figure eight, 2 m/s"
 TARGETS = {"targets 10 m away": 10.0, "targets 15 m away": 15.0, "targets 20 m away": 20.0}  # m
+RMS_ERROR = FOLLOWING[0]
 TIMES = (settling_row(0.1), LIMIT, time_row(0.1))
-SHOWN = (SUCCESS, SURVIVAL, REWARD, *TIMES, MEDIAN, QUANTILE)
+SHOWN = (SUCCESS, SURVIVAL, REWARD, *TIMES, MEDIAN, QUANTILE, RMS_ERROR)
 
 
 FLAGS: Flags = {
@@ -235,7 +238,7 @@ def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> byte
 
 
 def measure(policy: Any, n_flights: int, **settings: Any) -> dict[str, Flights]:
-    """Fly for the rows of the table: recoveries, then targets at each distance.
+    """Fly for the rows of the table: recoveries, targets at each distance, figures of eight.
 
     :param n_flights: episodes at each distance.
     :param settings: ``vehicle``, ``noise`` and ``observation_std``, as
@@ -251,6 +254,10 @@ def measure(policy: Any, n_flights: int, **settings: Any) -> dict[str, Flights]:
         task = {"target_distance": distance}
         seed = seed_for("card", int(1000 * distance))
         rows[name] = fly(policy, "target_tracking", n_flights, seed, task_kwargs=task, **settings)
+    # From a hover at its start.
+    task = {"target_distance": 0.0}
+    how = {**settings, "task_kwargs": task, "reference": {"curve": "figure_eight", "speed": 2.0}}
+    rows[FIGURE_EIGHT] = fly(policy, "target_tracking", n_flights, seed_for("card", 8), **how)
     return rows
 
 
@@ -321,8 +328,8 @@ def write_card(
         target = Target(distance=TARGETS.get(task, 0.0))
         scenario = Scenario(name="card", target=target, vehicle=vehicle, vehicles=vehicles)
         cells = {**metric_cells(metrics), LIMIT: Cell(scenario.physical_limit, words="–")}
-        # A recovery begins at its target, so times to it say nothing.
-        if task == RECOVERY:
+        # These begin at their targets, so times to them say nothing.
+        if task not in TARGETS:
             cells |= dict.fromkeys(TIMES, Cell(words="–"))
         rows.append(Row(task, "", [cells.get(row, Cell(words="–")) for row in SHOWN]))
     columns = [Column(row.heading) for row in SHOWN]

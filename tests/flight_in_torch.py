@@ -196,7 +196,7 @@ class Observer:
         rows = [th.stack([cosine, -sine, zero], 1), th.stack([sine, cosine, zero], 1)]
         up = th.stack([zero, zero, zero + 1.0], 1)
         self.from_heading = th.stack([*rows, up], 1)
-        self.turning = up * reference[:, 11:]
+        self.turning = up * reference[:, 11:12]
         size = len(self.settings.ages) * self.settings.frame_size
         self.preview = th.tensor(batch.observe()).double()[:, size:]
 

@@ -456,7 +456,7 @@ def test_apg_follows_the_gradient_of_the_flight_and_the_policy_together(activati
     parts = State.of(flight.states.movedim(2, 0).flatten(1))
     parts = [part.unflatten(0, (steps, n)) for part in parts]
     flight_cost(
-        FlownStates._make([*parts, *reference.split([3, 3, 3, 2, 1], 2), flight.actions])
+        FlownStates._make([*parts, *reference.split([3, 3, 3, 2, 1, 3], 2), flight.actions])
     ).mean().backward()
     beyond = (flight.actions.abs() > 1.0).double().mean()
     assert 0.02 < beyond < 0.7

@@ -27,6 +27,7 @@ from sb3_quad.cli import closing, main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.training.config import TrainingJob, as_agent, build_config, load_config
@@ -389,7 +390,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(
     output = capsys.readouterr()
     assert (
         run.path.name in output.out
-        and f"{run.path.name} flies heavy, the reference flies itm" in output.err
+        and f"{run.path.name} flies heavy, the published one flies itm" in output.err
     )
     assert publish.main([str(run.path), "--name", "mine", "--episodes", "2"]) == 0
     card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]
@@ -516,7 +517,7 @@ def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_w
     closing.agent_and_expert(job, agent)
     assert np.allclose(seen[0][:, 12:], -2.5)  # an episode begins at rest: (0 - 5) / 2
     seen.clear()
-    closing.print_tables({"agent": agent}, job.flight_settings.in_any_task(), 4, 0)
+    compare({"agent": agent}, n_flights=4, seed=0, **job.flight_settings.in_any_task())
     assert np.allclose(seen[0][:, 12:], -2.5)
 
 

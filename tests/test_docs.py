@@ -20,6 +20,7 @@ ELSEWHERE = {
     ("docs/export.md", 0): "tests/test_export.py",
     ("docs/export.md", 1): "tests/test_export.py",
     ("docs/export.md", 2): "tests/test_export.py",
+    ("docs/export.md", 3): "tests/test_export.py",
     ("docs/research/experts.md", 0): "flies 13,440 episodes",
     ("docs/research/experts.md", 1): "a module, flown below",
 }

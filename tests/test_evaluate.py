@@ -40,7 +40,7 @@ scenarios:
     duration: 2
     tolerances: [0.5, 1.0]
     episodes: 5
-    reference: {expert: {success: 0.5, time_to: {0.5: 1.25}, path: [2, 3]}}
+    published: {expert: {success: 0.5, time_to: {0.5: 1.25}, path: [2, 3]}}
   - name: course
     target: {waypoints: [[0, 0, 15.5], [0, 0.5, 15.5]], radius: 0.4}
     duration: 4

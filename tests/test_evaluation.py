@@ -17,6 +17,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation import statistics
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, Hook, fly, fly_settings
+from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
@@ -209,7 +210,7 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
 def table_of(metrics, name, beside):
     scenario = load_suite("thesis").scenario(name)
     rows = metric_rows(
-        scenario, [metric_cells(metrics)], [scenario.reference[each] for each in beside]
+        scenario, [metric_cells(metrics)], [scenario.published[each] for each in beside]
     )
     return Table([Column("agent"), *(Column(each, source="thesis") for each in beside)], rows)
 
@@ -232,6 +233,7 @@ def test_tables_say_how_many_arrived():
         final_offset=np.array([[0.1, 0, 0], [0.2, 0, 0], [np.nan] * 3, [0.3, 0, 0]]),
         recovery_time=np.array([1.0, 2.0, np.nan, 3.0]),
         cross_track_error=np.array([0.2, 0.4, 9.0, 0.6]),
+        **dict.fromkeys(FOLLOWED, np.full(n, np.nan)),
         waypoint_times=np.zeros((n, 0)),
         start=np.zeros((n, 13)),
         target=np.zeros((n, 3)),

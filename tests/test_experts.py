@@ -15,12 +15,19 @@ from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.imports import import_packages
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.geometric_gains import derived_gains
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
-from sb3_quad.simulation.state import BODY_RATES, QUATERNION, VELOCITY, QuadcopterState
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    QUATERNION,
+    STATE_SIZE,
+    VELOCITY,
+    QuadcopterState,
+    X,
+)
 from sb3_quad.training.algorithms import import_class
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -142,7 +149,7 @@ def test_predict_on_noise_free_observations_equals_actions_on_the_true_state(exp
 def test_actions_are_always_valid(expert, data):
     """Any state at all gives finite actions within [-1, 1]."""
     number = st.floats(-1e3, 1e3)
-    array = np.array(data.draw(st.lists(number, min_size=20, max_size=20)))[:, None]
+    array = np.array(data.draw(st.lists(number, min_size=STATE_SIZE, max_size=STATE_SIZE)))[:, None]
     norm = np.linalg.norm(array[QUATERNION])
     array[QUATERNION] = (
         array[QUATERNION] / norm if norm > 1e-3 else np.array([[1.0], [0], [0], [0]])
@@ -218,3 +225,103 @@ def test_the_readings_of_the_thesis_contain_ours_and_agree_near_level():
         np.testing.assert_allclose(
             PIDReading("itm", order, "world").actions(state), ours, atol=0.02
         )
+
+
+def some_states(n=64):
+    random = np.random.default_rng(2)
+    array = np.zeros((STATE_SIZE, n))
+    array[: X.target_heading] = random.normal(0.0, 2.0, (X.target_heading, n))
+    array[X.target_ahead :] = random.normal(0.0, 2.0, (3, n))
+    array[QUATERNION] /= np.linalg.norm(array[QUATERNION], axis=0)
+    return array
+
+
+@pytest.mark.parametrize("expert", [PIDExpert(), GeometricExpert()], ids=["pid", "geometric"])
+def test_a_heading_is_the_world_turned(expert):
+    """Whoever asks for another heading gets what they would get in a world that is turned so."""
+    array = some_states()
+    array[X.target_heading] = 1.0
+    turned = array.copy()
+    c, s = np.cos(2.0), np.sin(2.0)
+    vectors = ("position", "velocity", "target", "target_velocity", "target_acceleration")
+    for row in [getattr(X, name) for name in (*vectors, "target_ahead", "target_heading")]:
+        x, y = array[row], array[row + 1]
+        turned[row], turned[row + 1] = c * x - s * y, s * x + c * y
+    w, x, y, z = array[QUATERNION]
+    c, s = np.cos(1.0), np.sin(1.0)
+    turned[QUATERNION] = c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
+    actions = expert.actions(QuadcopterState(array))
+    np.testing.assert_allclose(expert.actions(QuadcopterState(turned)), actions, atol=1e-5)
+    if isinstance(expert, PIDExpert):
+        # The thesis's heading is 0.
+        array[X.target_heading] = 0.0
+        np.testing.assert_array_equal(expert.actions(QuadcopterState(array)), actions)
+
+
+PID_ACTIONS = [
+    [-0.869529, 1.0, -0.5264442, 0.7244197],
+    [-1.0, 0.98475254, -1.0, 1.0],
+    [0.8179944, 0.17098913, 1.0, -0.0236794],
+]
+GEOMETRIC_ACTIONS = [
+    [0.2329767, 0.96207565, 0.8715281, -0.00926831],
+    [0.8059867, 0.68779355, 0.07581528, 0.97006166],
+    [-0.02824845, -0.09934618, 1.0, 0.6968023],
+]
+
+
+@pytest.mark.parametrize(
+    ("expert", "actions"),
+    [(PIDExpert(), PID_ACTIONS), (GeometricExpert(), GEOMETRIC_ACTIONS)],
+    ids=["pid", "geometric"],
+)
+def test_a_resting_target_gives_the_actions_of_before(expert, actions):
+    """They were written down before experts knew of references that move."""
+    array = some_states(3)
+    array[X.target_velocity :] = 0.0
+    array[QUATERNION] = np.array([[1.0], [0.1], [-0.1], [0.2]])
+    array[QUATERNION] /= np.linalg.norm(array[QUATERNION], axis=0)
+    np.testing.assert_allclose(expert.actions(QuadcopterState(array)), actions, atol=1e-6)
+
+
+class Following(Hook):
+    """The errors of position, m, and heading, rad, after the first 2 s."""
+
+    def __init__(self):
+        self.position = []
+        self.heading = []
+
+    def after_step(self, step, state, actions, flying):
+        assert flying.all()
+        if step > 200:
+            nose = state.rotation[:, :2, 0]
+            c, s = state.target_heading.T
+            error = np.arctan2(c * nose[:, 1] - s * nose[:, 0], c * nose[:, 0] + s * nose[:, 1])
+            self.position.append(state.distance)
+            self.heading.append(error)
+
+
+def turning_eight(times):
+    """A figure eight of 2.3 m/s, while the heading turns by 90 degrees a second."""
+    angle = 0.8132 * times
+    return np.stack([2 * np.sin(angle), np.sin(2 * angle), 0 * times, np.pi / 2 * times], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("expert", "reference", "metres", "degrees"),
+    [
+        ("privileged_geometric", {"speed": 2.3}, 0.02, None),
+        ("privileged_derived", {"speed": 2.3}, 0.02, None),
+        ("geometric", turning_eight, 0.02, 5.0),
+        ("geometric", {"curve": "helix", "heading": "path"}, 0.02, 5.0),
+        ("pid", turning_eight, 0.8, 5.0),
+    ],
+)
+def test_experts_follow(expert, reference, metres, degrees):
+    itm = load_vehicle("itm")
+    errors = Following()
+    on_it = {"task_kwargs": {"target_distance": 0.0}, "reference": reference, "hooks": [errors]}
+    fly(resolve_expert(expert, itm), n_flights=2, max_steps=1200, **on_it)
+    assert np.sqrt(np.mean(np.square(errors.position))) <= metres
+    if degrees is not None:
+        assert np.degrees(np.abs(errors.heading).max()) <= degrees

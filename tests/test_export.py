@@ -32,6 +32,7 @@ from sb3_quad.export.network import Network, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
 from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import X
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
@@ -289,14 +290,14 @@ def test_it_follows_a_reference_that_it_previews(tmp_path, file_format, looks):
         speed, (c, s) = truth.target_velocity, truth.target_heading.T
         features, ahead = physical_features(truth), world_preview(env, step)
         if file_format == "c":
-            angle, rate = np.arctan2(s, c), np.full(len(c), 1.5)
+            angle, rate = np.arctan2(s, c), truth.array[X.target_heading_rate]
             inputs = np.hstack([features, ahead]).astype(np.float32)
             references = np.ascontiguousarray(np.column_stack([speed, angle, rate]), np.float32)
             result, state = file(inputs, state, references)
         else:
-            related = np.hstack(
-                [relate(*row) for row in zip(features, ahead, speed, c, s, strict=True)]
-            )
+            turning = truth.array[X.target_heading_rate]
+            rows = zip(features, ahead, speed, c, s, turning, strict=True)
+            related = np.hstack([relate(*row) for row in rows])
             result, state = file(related.reshape(len(c), -1), state)
         actions = model.predict(seen, deterministic=True)[0]
         np.testing.assert_allclose(result, ITM.action_to_thrust(actions), atol=2e-4)
@@ -311,7 +312,7 @@ def world_preview(env, step):
     return np.tile(np.concatenate(now), (env.num_envs, 1))
 
 
-def relate(features, ahead, speed, c, s, rate=1.5):
+def relate(features, ahead, speed, c, s, rate):
     """The relative observation, written out otherwise than in the header, float32."""
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     to_body = features[3:12].reshape(3, 3)

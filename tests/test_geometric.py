@@ -13,6 +13,7 @@ from sb3_quad.simulation.state import (
     POSITION,
     QUATERNION,
     ROTOR_SPEEDS,
+    STATE_SIZE,
     TARGET,
     VELOCITY,
     QuadcopterState,
@@ -26,7 +27,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def random_states(seed: int, n: int = 32) -> np.ndarray:
     random = np.random.default_rng(seed)
-    array = np.zeros((20, n))
+    array = np.zeros((STATE_SIZE, n))
     array[POSITION] = random.normal(0, 5, (3, n))
     array[TARGET] = random.normal(0, 5, (3, n))
     quaternion = random.normal(size=(4, n))

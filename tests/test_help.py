@@ -110,7 +110,7 @@ def test_a_misspelt_name_or_a_part_of_names_is_guessed_and_nothing_else(given, v
         ("train --algo a2c", "algorithm 'a2c': (valid: apg, dagger,"),
         (
             "train --conf-file nothere.yml",
-            "settings file 'nothere.yml': (valid: any_quadcopter/dagger.yml,",
+            "settings file 'nothere.yml': (valid: any_quadcopter/apg.yml,",
         ),
         (
             "train --hyperparams bc_coef:1 --algo dagger",

@@ -147,7 +147,7 @@ def test_a_suite_flown_by_another_vehicle(here, capsys):
     assert "thesis" not in capsys.readouterr().out
     results = json.loads((here / "out" / "results.json").read_text())
     assert results["scenarios"][0]["vehicle"] == load_vehicle("my.yaml").model_dump(mode="json")
-    assert results["scenarios"][0]["reference"] == {}
+    assert results["scenarios"][0]["published"] == {}
     assert (
         main([*command, "--vehicle", "hummingbird", "-o", "out"]) == 2
     )  # other flights of the same name

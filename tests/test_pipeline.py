@@ -330,11 +330,11 @@ def test_a_pipeline_that_was_killed_before_it_noted_its_progress_is_resumed(
     with pytest.raises(SystemExit):
         run_pipeline(two_stages(tmp_path), job, "stages", quiet)
     monkeypatch.setattr(pipeline_module, "train", train)
-    passed_on = pipeline_module._passed_on
-    monkeypatch.setattr(pipeline_module, "_passed_on", killed)  # its model is saved
+    agent = pipeline_module._agent
+    monkeypatch.setattr(pipeline_module, "_agent", killed)  # its model is saved
     with pytest.raises(SystemExit):
         resume_pipeline(folder, quiet)
-    monkeypatch.setattr(pipeline_module, "_passed_on", passed_on)
+    monkeypatch.setattr(pipeline_module, "_agent", agent)
     (model,) = (tmp_path / "logs" / "dagger").rglob("Quad*.zip")
     before = model.stat().st_mtime_ns
     result = resume_pipeline(folder, quiet)

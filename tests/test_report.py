@@ -34,7 +34,7 @@ scenarios:
     duration: 6
     tolerances: [0.5, 1.0, 2.0]
     episodes: 5
-    reference: {expert: {success: 0.5, time_to: {0.5: 1.25, 1.0: null}, path: [2, 3]}}
+    published: {expert: {success: 0.5, time_to: {0.5: 1.25, 1.0: null}, path: [2, 3]}}
   - name: course
     target: {waypoints: [[0, 0, 15.5], [0, 0.5, 15.5]], radius: 0.4}
     duration: 2
@@ -134,7 +134,7 @@ def test_the_page_holds_the_results(folder, page):
     )
     low, high = metrics.success.low, metrics.success.high
     assert f"{100 * low:.1f} to {100 * high:.1f}" in text
-    for number in ("1.25", "never", "2 to 3", "paper"):  # the reference's
+    for number in ("1.25", "never", "2 to 3", "paper"):  # the published ones
         assert number in text
 
 

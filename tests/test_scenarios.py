@@ -91,7 +91,7 @@ def test_the_example_of_the_documentation_is_valid():
     text = (Path(__file__).parent.parent / "docs" / "evaluate.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     names = [scenario.name for scenario in parse_suite(example, "example").scenarios]
-    assert names[:2] == ["yard", "course"] and len(names) == 8 and names[-1] == "rolled.90_8"
+    assert names[:2] == ["yard", "course"] and len(names) == 9 and names[-1] == "rolled.90_8"
 
 
 def test_missing_files_and_unknown_names():

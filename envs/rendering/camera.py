@@ -14,7 +14,9 @@ CHASE_SLOPE = math.tan(math.radians(27.0))
 CHASE_MARGIN = 0.6  # around vehicle and target, m, for the default vehicle
 ASIDE = math.radians(9.0)  # between the direction to the target and that of a chasing camera
 STEEPEST = math.radians(70.0)  # elevation of a chasing camera's direction
-DOWN = math.radians(5.0)  # how far a camera that frames points looks down
+# How far a camera that frames points looks down, and one that shows the path of a target
+DOWN = math.radians(5.0)
+ON_PATH = math.radians(40.0)
 LOWEST = (-math.inf, -math.inf, 0.3)  # where a camera is at least, m
 
 
@@ -57,18 +59,18 @@ def direction(course: float, elevation: float) -> FloatArray:
     return np.array([level * math.cos(course), level * math.sin(course), math.sin(elevation)])
 
 
-def broadside(points: FloatArray) -> FloatArray:
-    """Return the direction, (3,), in which a camera sees the spread of points best; a little
-    downwards.
+def broadside(points: FloatArray, down: float = DOWN) -> FloatArray:
+    """Return the direction, (3,), in which a camera sees the spread of points best.
 
     :param points: (n, 3), n > 1.
+    :param down: how far it looks down, rad.
     """
     spread = np.cov(points[:, :2].T)
     # The direction of the least spread. Of its two signs always the same one is taken, so that
     # similar flights are seen from the same side.
     x, y = np.linalg.eigh(spread)[1][:, 0]
     sign = 1.0 if (y, x) > (0.0, 0.0) else -1.0
-    return direction(math.atan2(sign * y, sign * x), -DOWN)
+    return direction(math.atan2(sign * y, sign * x), -down)
 
 
 def chasing(way: FloatArray) -> FloatArray:

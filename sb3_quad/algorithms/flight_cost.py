@@ -13,7 +13,7 @@ COARSE, FINE = 0.5, 0.05
 # Weight of the body rates at the target. Without it an agent oscillates there with delays or motors
 # that it has not seen often.
 CALM = 0.03
-# Weight of the heading's error, rad, where one is asked for
+# Weight of the heading's error, rad, at the target, where a heading is asked for
 HEADING = 0.1
 # Below this height, m, a flight is in danger.
 LOW = 1.5
@@ -35,6 +35,7 @@ class FlownStates(NamedTuple):
     target_acceleration: th.Tensor  # (..., 3), m/s²
     target_heading: th.Tensor  # (..., 2), cosine and sine; zeros where none is asked for
     target_heading_rate: th.Tensor  # (..., 1), rad/s
+    target_ahead: th.Tensor  # (..., 3), m/s², the acceleration in AHEAD seconds
     actions: th.Tensor  # (..., 4), before they are clipped to [-1, 1]
 
     @property
@@ -94,9 +95,10 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     """
     d = flown.distance
     cost = d / (d + COARSE) + d / (d + FINE)
-    weight = 0.002 + CALM / (1.0 + (d / COARSE) ** 2)
+    near = 1.0 / (1.0 + (d / COARSE) ** 2)
+    weight = 0.002 + CALM * near
     cost = cost + weight * length(flown.body_rates) + 0.001 * (1.0 - flown.r33)
-    cost = cost + HEADING * flown.heading_error
+    cost = cost + HEADING * near * flown.heading_error
     beyond = flown.actions - flown.actions.clamp(-1.0, 1.0)
     cost = cost + 0.01 * beyond.square().sum(dim=-1)
     return cost + 0.5 * (LOW - flown.position[..., 2]).clamp(min=0.0)

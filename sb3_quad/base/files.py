@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import StrDict, StrPath
 
 LOCK = ".lock"
@@ -111,12 +111,12 @@ def read_arrays(path: StrPath, prefix: str = "") -> StrDict:
 
     :raises ConfigError: A missing or damaged file.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files if name.startswith(prefix)}
-    except Exception as error:
-        # A damaged archive may raise anything, depending on where the damage is.
-        raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
+    # A damaged archive may raise anything, depending on where the damage is.
+    with (
+        raised_as(ConfigError, f"{path}: cannot be read"),
+        np.load(path, allow_pickle=False) as file,
+    ):
+        return {name: file[name] for name in file.files if name.startswith(prefix)}
 
 
 def read_text(path: StrPath) -> str:

@@ -5,7 +5,7 @@ two share numbers: seeds 0 and 1 of a training are as independent as a training 
 """
 
 import typing
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -37,7 +37,7 @@ _ROW = 1
 SCENARIO_STREAM = 0x5B3
 # NumPy's global generator, which SB3 seeds, takes no larger seed.
 LARGEST = 2**32
-Seed: TypeAlias = Annotated[int, Field(ge=0, lt=LARGEST)]
+Seed = Annotated[int, Field(ge=0, lt=LARGEST)]
 
 
 def seed_for(purpose: Purpose, seed: int = 0) -> int:

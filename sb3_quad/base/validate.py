@@ -95,7 +95,7 @@ def _locate(
     """Return the innermost model at a location, the dotted key, and the meaning of its field in
     brackets.
     """
-    names: list[str] = []
+    names = []
     meaning = ""
     for part in location:
         field = model.model_fields.get(str(part))

@@ -1,9 +1,8 @@
 """YAML files, by the name of one that comes with the package, or by path."""
 
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -78,8 +77,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     return parse_keys(read_text(path), str(path))
 
 
-@dataclass(frozen=True)
-class YamlFolder:
+class YamlFolder(NamedTuple):
     """YAML files of one kind that come with the package. Users name their own files by path.
 
     :param kind: The kind for error messages, such as "vehicle".
@@ -122,8 +120,7 @@ class YamlFolder:
             raise ConfigError(
                 f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file"
             )
-        text = files[name].read_text(encoding="utf-8")
-        return text, name.removesuffix(self.suffix) + self.suffix
+        return files[name].read_text(encoding="utf-8"), name.removesuffix(self.suffix) + self.suffix
 
     def read(self, source: StrPath) -> tuple[dict[Any, Any], str]:
         """Return the keys and values of a file by name or path, and its name for messages.

@@ -7,11 +7,12 @@ import pkgutil
 import sys
 import traceback
 from argparse import Namespace
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
+from sb3_quad.base.files import kind_and_line
 from sb3_quad.base.process import interrupts_leave, trusting
 from sb3_quad.cli import commands
 from sb3_quad.cli.parser import TRACEBACK, Parser, add_flags
@@ -56,15 +57,13 @@ def make_parser() -> Parser:
     parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"sb3_quad {__version__}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
-    siblings: dict[str, Container[str]] = {}
     for name, command in COMMANDS.items():
         text, heading, rest = str(command.__doc__).partition("examples:\n")
         subparser = subparsers.add_parser(
             name, help=text.partition("\n\n")[0], description=text, epilog=heading + rest
         )
         add_flags(subparser, {**command.FLAGS, **TRACEBACK})
-        subparser.siblings = siblings
-        siblings[name] = subparser._option_string_actions
+        subparser.siblings[name] = subparser._option_string_actions
     return parser
 
 
@@ -131,6 +130,6 @@ def _unexpected(error: BaseException) -> str:
     """Return the message of an exception that no check foresaw, with the place that raised it."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'a file'}: {error.strerror}"
-    text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())])
+    text = "; ".join([kind_and_line(error), *getattr(error, "__notes__", ())])
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{text} ({Path(last.filename).name}, line {last.lineno}; add --traceback for all of it)"

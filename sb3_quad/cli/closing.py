@@ -4,12 +4,10 @@ The tables are of fresh episodes, the same for all.
 """
 
 import shlex
-from collections.abc import Iterable
 from typing import Any
 
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.base.types import StrMapping
 from sb3_quad.cli.output import console
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import saved_data
@@ -31,32 +29,14 @@ NEXT = """next:
   sb3-quad export {agent} --format torchscript{vehicle}"""
 
 
-def print_tables(
-    controllers: StrMapping,
-    settings: StrMapping,
-    n: int,
-    seed: int,
-    thesis_columns: Iterable[str] = (),
-) -> None:
-    """Print the tables of some controllers over the same episodes of both tasks of the thesis.
-
-    :param settings: how the controllers fly in any task: vehicle, noise and scaling.
-    """
-    for table in compare(
-        controllers, n_flights=n, seed=seed, thesis_columns=thesis_columns, **settings
-    ).tables:
-        console().print(table)
-
-
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     """Return the table of a job's agent and its expert, over episodes that no training has flown.
 
     :param job: of an environment of this package.
     """
     how = dict(job.flight_settings)
-    controllers = {"agent": model, "expert": job.for_evaluation().make_expert()}
     return compare(
-        controllers,
+        {"agent": model, "expert": job.for_evaluation().make_expert()},
         [how.pop("task")],
         FRESH_EPISODES,
         seed_for("table", job.seed),
@@ -103,13 +83,14 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     for name, stage in result.stages.items():
         controllers[name] = stage.agent
     try:
-        print_tables(
+        tables = compare(
             controllers,
-            result.job.flight_settings.in_any_task(),
-            PIPELINE_EPISODES,
-            seed_for("table", result.job.seed),
-            ("expert", "IL-agent", "RL-agent"),
+            n_flights=PIPELINE_EPISODES,
+            seed=seed_for("table", result.job.seed),
+            thesis_columns=("expert", "IL-agent", "RL-agent"),
+            **result.job.flight_settings.in_any_task(),
         )
+        console().print(tables)
     except SB3QuadError as error:
         print(f"no tables: {error}")
     for name, stage in result.stages.items():

@@ -12,7 +12,7 @@ from argparse import (
     RawDescriptionHelpFormatter,
 )
 from collections.abc import Container, Iterable, Mapping
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, ClassVar, NoReturn, TypeAlias
 
 from pydantic import BaseModel
 
@@ -31,19 +31,6 @@ SHORT_FLAGS = {
     "wandb_tags": "-tags",
 }
 """rl-zoo's short names of some flags."""
-METAVARS = {
-    "vec_env": "KIND",
-    "expert": "SPEC",
-    "trained_agent": "ZIP",
-    "device": "DEVICE",
-    "snapshot_every": "SECONDS",
-    "log_folder": "DIR",
-    "tensorboard_log": "DIR",
-    "wandb_project_name": "NAME",
-    "wandb_entity": "NAME",
-    "wandb_group": "NAME",
-}
-"""The values of flags that take no number, as ``--help`` shows them."""
 # Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
 SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
 
@@ -51,7 +38,7 @@ SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
 class Parser(ArgumentParser):
     """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
 
-    siblings: Mapping[str, Container[str]] = {}
+    siblings: ClassVar[dict[str, Container[str]]] = {}
     """The options of each command."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -120,10 +107,10 @@ class Pairs(Action):
         setattr(namespace, self.dest, pairs)
 
 
-PAIRS: StrDict = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
-YES_OR_NO: StrDict = {"action": BooleanOptionalAction}
-SWITCH: StrDict = {"action": "store_true"}
-SEVERAL: StrDict = {"nargs": "+"}
+PAIRS = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
+YES_OR_NO = {"action": BooleanOptionalAction}
+SWITCH = {"action": "store_true"}
+SEVERAL = {"nargs": "+"}
 
 
 def whole(text: str) -> int:
@@ -163,14 +150,14 @@ def above_zero(text: str) -> float:
     return number
 
 
-KINDS: dict[Any, Any] = {bool: SWITCH, StrDict: PAIRS, float: float, str: str}
+KINDS = {bool: SWITCH, StrDict: PAIRS, float: float, str: str}
 """The types (or keywords of ``add_argument``) of flags by those of their fields; else ``whole``."""
-OWN_KINDS: StrDict = {"trained_agent": agent_path, "wandb_tags": SEVERAL}
+OWN_KINDS = {"trained_agent": agent_path, "wandb_tags": SEVERAL}
 """Those of single fields."""
-Flags: TypeAlias = "Mapping[str, str | tuple[Any, Any, str] | Flags]"
+Flags: TypeAlias = "Mapping[str, str | tuple[Any, ...] | Flags]"
 """A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
-default, and the help; the help alone for a text without a default. A table in it holds flags that
-exclude each other.
+default if there is one, and the help; the help alone for a text without a default. A table in it
+holds flags that exclude each other.
 """
 
 
@@ -180,12 +167,14 @@ def add_flags(parser: Any, flags: Flags) -> None:
         if isinstance(entry, Mapping):
             add_flags(parser.add_mutually_exclusive_group(), entry)
             continue
-        kind, default, text = (str, None, entry) if isinstance(entry, str) else entry
+        kind, *default, text = (str, entry) if isinstance(entry, str) else entry
         arguments = kind if isinstance(kind, dict) else {"type": kind}
         names = words.split()
         if len(names) > 1 and not names[-1].startswith("-"):
             arguments = {**arguments, "metavar": names.pop()}
-        parser.add_argument(*names, default=default, help=text, **arguments)
+        argument = parser.add_argument(*names, help=text, **arguments)
+        if default:
+            (argument.default,) = default
 
 
 def field_flags(model: type[BaseModel], *names: str) -> StrDict:
@@ -196,7 +185,7 @@ def field_flags(model: type[BaseModel], *names: str) -> StrDict:
 
     :param names: the fields; without any, all of them.
     """
-    flags: StrDict = {}
+    flags = {}
     for name in names or model.model_fields:
         field = model.model_fields[name]
         # The alternatives of a union such as `int | None`, or the type itself.
@@ -207,9 +196,9 @@ def field_flags(model: type[BaseModel], *names: str) -> StrDict:
         if field.default not in (None, False):
             text += f" ({field.default})"
         words = f"{SHORT_FLAGS.get(name, '')} --{name.replace('_', '-')}".strip()
-        if not isinstance(kind, dict):
-            words += f" {METAVARS.get(name, 'N')}"
-        flags[words] = (kind, None, text)
+        if kind in (whole, float):
+            words += " N"
+        flags[words] = (kind, text)
     return flags
 
 
@@ -223,16 +212,15 @@ EXECUTOR: Flags = {
         "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)"
     ),
 }
-TRUST: Flags = {
+TRUST = {
     "--trust": (
         SWITCH,
-        False,
         "let zips run code that is pickled in them; only for files you trust (docs/security.md)",
     )
 }
-TRACEBACK: Flags = {"--traceback": (SWITCH, False, "print the traceback of an error, too")}
-OVERWRITE: Flags = {"--overwrite": (SWITCH, False, "replace existing files")}
-PROGRESS: Flags = {"-P --progress": (YES_OR_NO, None, "show a progress bar (yes in a terminal)")}
+TRACEBACK = {"--traceback": (SWITCH, "print the traceback of an error, too")}
+OVERWRITE = {"--overwrite": (SWITCH, "replace existing files")}
+PROGRESS = {"-P --progress": (YES_OR_NO, "show a progress bar (yes in a terminal)")}
 
 
 def given(options: Namespace, *names: str) -> StrDict:

@@ -30,7 +30,7 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
     # Zips of this package say it themselves.
     data = saved_data(zip_file)
     if KEY in data:
-        return _settings_of_zip(data[KEY], f"{zip_file}: {KEY}"), Path(zip_file)
+        return settings_of_record(data[KEY], f"{zip_file}: {KEY}"), Path(zip_file)
 
     # Other zips, such as those of rl_zoo3, lie in a run folder.
     configs = sorted(Path(zip_file).parent.glob("*/config.yml"))
@@ -59,7 +59,12 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
     return warning
 
 
-def _settings_of_zip(record: Any, where: str) -> FlightSettings:
+def settings_of_record(record: Any, where: str) -> FlightSettings:
+    """Return the settings that a zip or a model holds.
+
+    :param where: what messages call the record.
+    :raises ConfigError: it does not fit.
+    """
     if not isinstance(record, dict):
         raise ConfigError(f"{where}: must be a mapping of names to values")
     # A path in a stranger's zip could name a device file, which is read forever. Both a vehicle and
@@ -78,10 +83,10 @@ def _settings_of_zip(record: Any, where: str) -> FlightSettings:
             )
     # A task is saved by its fields; a mixture holds weights by name instead.
     task = record.get("task")
+    changes: StrDict = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}
     if isinstance(task, dict) and "name" in task:
-        record["task"] = validate(Task, task, where)
-    record["vehicle"] = validate(Vehicle, record.get("vehicle"), where)
-    return validate(FlightSettings, record, where)
+        changes["task"] = validate(Task, task, where)
+    return validate(FlightSettings, record | changes, where)
 
 
 def _settings_of_run(config: Path) -> FlightSettings:
@@ -99,7 +104,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
 
     # The folder has the name of the environment, which says the task.
     where = f"{config}: env_kwargs"
-    given: StrDict = {}
+    given = {}
     if config.parent.name in ENVIRONMENTS:
         given["task"] = ENVIRONMENTS[config.parent.name]
     for part in parts:

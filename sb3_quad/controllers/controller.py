@@ -1,7 +1,7 @@
 """One way to ask a controller for actions, whatever it is: an expert, an SB3 model, a function."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
-from sb3_quad.base.types import BoolArray, Float32Array, StrDict
+from sb3_quad.base.types import BoolArray, Float32Array
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.statistics import statistics_of
@@ -219,7 +219,7 @@ class Controller:
         if not hasattr(self.source, "predict"):
             return self.source(observation)
         # Without a state yet, the policy begins by itself. Many policies take no such keywords.
-        keywords: StrDict = {}
+        keywords = {}
         if self._predict_state is not None:
             keywords["state"] = self._predict_state
             if episode_start is not None:
@@ -248,7 +248,7 @@ def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     # The batched environment has the state of all rows; others have one for each environment.
     base: Any = env.unwrapped
     if hasattr(base, "true_state"):
-        return cast(Callable[[], QuadcopterState], base.true_state)
+        return base.true_state  # type: ignore[no-any-return]
     if env.has_attr("true_state"):
         return lambda: QuadcopterState.concatenate(env.env_method("true_state"))
     return None

@@ -1,7 +1,7 @@
 """The type of everything that can be an expert."""
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -16,7 +16,7 @@ class StateExpert(Protocol):
         """Return actions in [-1, 1], (n, 4), for the true state of n vehicles."""
 
 
-ExpertLike: TypeAlias = StateExpert | BaseAlgorithm | Callable[[Any], Any] | str
+ExpertLike = StateExpert | BaseAlgorithm | Callable[[Any], Any] | str
 """An expert on the true state, an SB3 model, or a function from observations to actions.
 
 Or a name as :func:`~sb3_quad.controllers.resolve.resolve_expert` takes it, such as ``"pid"``.

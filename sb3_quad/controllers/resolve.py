@@ -6,10 +6,9 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, ExpertError, raised_as, unknown
 from sb3_quad.base.imports import import_name
-from sb3_quad.base.types import StrPath
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
 from sb3_quad.controllers.zips import load_model, refuse_settings
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
+from sb3_quad.vehicles.vehicle import VehicleSource, first_vehicle
 
 # Experts by name, and their factories, which are imported when they are asked for.
 EXPERTS = {
@@ -24,9 +23,9 @@ DEFAULT_EXPERT = "pid"
 
 def resolve_expert(
     spec: Any,
-    vehicle: StrPath | Vehicle | Sequence[Any] = "itm",
+    vehicle: VehicleSource | Sequence[Any] = "itm",
     kind: str = "expert",
-    layout: StrPath | Vehicle | None = None,
+    layout: VehicleSource | None = None,
 ) -> Any:
     """Return the expert that ``spec`` names.
 
@@ -54,7 +53,7 @@ def resolve_expert(
         return factory(first_vehicle(vehicle, layout))
 
 
-def import_factory(text: str, kind: str = "expert") -> Any:
+def import_factory(text: str, kind: str) -> Any:
     """Return the factory of a named expert, or the one at ``package.module:factory``.
 
     :raises ConfigError: an unknown name, or a factory that cannot be imported.

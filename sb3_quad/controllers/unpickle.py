@@ -192,7 +192,7 @@ _CLASSES = _WITH_ATTRIBUTES | _by_name(
     """
 )
 # The function that is called for a name. Items and state of its result follow in the pickle.
-_FUNCTIONS: StrDict = {
+_FUNCTIONS = {
     "numpy.dtype": _dtype,
     # Random numbers: a space without a generator makes its own, which SB3 seeds.
     "numpy.random._pickle.__bit_generator_ctor": _none,
@@ -318,8 +318,7 @@ class _Reader(pickle._Unpickler):
 
     def read_array(self) -> None:
         # Python's makes room for whatever size is named.
-        size = int.from_bytes(self.read(8), "little")
-        self.stack.append(bytearray(self.read(size)))
+        self.stack.append(bytearray(self.read(int.from_bytes(self.read(8), "little"))))
 
     def extend(self, new: list[Any]) -> None:
         items = self.stack[-1]
@@ -328,8 +327,7 @@ class _Reader(pickle._Unpickler):
 
     def set_item(self) -> None:
         value = self.stack.pop()
-        key = self.stack.pop()
-        self.update([key, value])
+        self.update([self.stack.pop(), value])
 
     def update(self, new: list[Any]) -> None:
         items = self.stack[-1]

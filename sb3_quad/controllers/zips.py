@@ -246,8 +246,7 @@ def refuse_settings(path: StrPath, keys: Sequence[str] = WRAPPERS) -> None:
     if KEY in saved_data(path):
         return
     for config in Path(path).parent.glob("*/config.yml"):
-        settings = read_yaml(config)
-        used = ", ".join(filter(settings.get, keys))
+        used = ", ".join(filter(read_yaml(config).get, keys))
         if used:
             raise ConfigError(
                 f"{path}: was trained with {used} (see {config}), without which it flies otherwise"

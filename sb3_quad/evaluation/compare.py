@@ -4,10 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.console import Group
+
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.types import StrDict, StrMapping
-from sb3_quad.base.validate import validate
+from sb3_quad.controllers.agent_settings import settings_of_record
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
@@ -19,13 +21,13 @@ from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import in_words
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
 THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
 
 
 class Comparison(dict[str, dict[str, Metrics]]):
-    """The metrics by label and task; ``str`` and notebooks show them as tables.
+    """The metrics by label and task; ``str``, ``rich`` and notebooks show them as tables.
 
     ``tables`` (one for each task) are what is shown.
     """
@@ -34,6 +36,9 @@ class Comparison(dict[str, dict[str, Metrics]]):
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.tables))
+
+    def __rich__(self) -> Group:
+        return Group(*self.tables)
 
     def _repr_markdown_(self) -> str:
         # Notebooks render this; a table in Markdown has no title of its own.
@@ -94,10 +99,9 @@ def compare(
     own_reward = load_reward(reward)
     settings = _settings(controllers, env_kwargs)
     pilots = {}
-    for label, controller in controllers.items():
-        flown = settings[label]
+    for label, how in settings.items():
         pilots[label] = resolve_expert(
-            controller, flown.vehicle, "controller", layout=flown.rotor_layout
+            controllers[label], how.vehicle, "controller", layout=how.rotor_layout
         )
 
     comparison = Comparison()
@@ -143,12 +147,7 @@ def _own_settings(controller: Any) -> FlightSettings | None:
     record = getattr(controller, KEY, None)
     if not isinstance(record, dict):
         return None
-    where = f"{type(controller).__name__}.{KEY}"
-    vehicle = validate(Vehicle, record.get("vehicle"), f"{where}: vehicle")
-    # The task of its training does not matter here.
-    default = FlightSettings()
-    changes = {"vehicle": vehicle, "task": default.task, "task_kwargs": default.task_kwargs}
-    return validate(FlightSettings, record | changes, where)
+    return settings_of_record(record, f"{type(controller).__name__}.{KEY}")
 
 
 def _task_table(
@@ -159,25 +158,25 @@ def _task_table(
     n_flights: int,
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task."""
-    vehicles = {}
-    true_state = True
-    for label, how in settings.items():
-        vehicles[label] = first_vehicle(how.vehicle)
-        true_state &= not how.noise
+    vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
     first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
     scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
+    reference = settings[next(iter(settings))].reference
+    if reference is not None:
+        # Nothing is published of targets that move.
+        scenario = scenario.model_copy(update={"reference": reference, "published": {}})
     columns = [*map(Column, metrics)]
-    references = []
+    published = []
     if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):
         for name in thesis_columns:
-            if name in scenario.reference:
+            if name in scenario.published:
                 columns.append(Column(name, source="thesis"))
-                references.append(scenario.reference[name])
-    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
+                published.append(scenario.published[name])
+    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], published)
 
     title = f"{task}: {n_flights} fresh episodes, the same for all"
-    if true_state:
+    if not any(how.noise for how in settings.values()):
         title += ", true state"
     caption = CAPTION
     if others.count(first) < len(others):

@@ -9,7 +9,7 @@ from typing import Literal
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
-from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.types import StrDict
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory
@@ -17,7 +17,7 @@ from sb3_quad.controllers.zips import saved_algorithm
 from sb3_quad.evaluation.flights import OwnReward, Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class ControllerSpec:
             return FlightSettings().observed
         return {**self.own.observed, "rotor_layout": self.own.layout}
 
-    def notice(self, vehicle: StrPath | Vehicle) -> str:
+    def notice(self, vehicle: VehicleSource) -> str:
         """Return a warning if the agent was trained on another vehicle, or does not say on which.
 
         :return: the warning, in one line; else empty.

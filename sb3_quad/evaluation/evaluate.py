@@ -3,17 +3,15 @@ folder of its own.
 """
 
 import hashlib
-import importlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
+from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.controllers.resolve import resolve_expert
@@ -48,8 +46,7 @@ RECORDED_RANDOM = 8
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, the last one done
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A controller in a scenario, as the suite has it.
 
     :param reward: your own, as a function or ``package.module:function``; None: none.
@@ -106,11 +103,10 @@ def evaluate(
     :raises ConfigError: an unknown backend; a reward that cannot be imported; a folder that holds
         results of another call, that cannot be written, or that another process is writing to.
     """
-    if backend not in FLEETS:
-        raise ConfigError(unknown("backend", backend, FLEETS))
+    refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
         # A missing PyBullet is one error here, not one for each controller.
-        importlib.import_module("sb3_quad.base.bullet")
+        from sb3_quad.base import bullet  # noqa: F401
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
     # An error in it shows now, rather than as a failure of each controller.
@@ -118,10 +114,9 @@ def evaluate(
 
     records, failures = _load_controllers(suite, controllers, report)
     # Scenario by scenario, so that a suite that is interrupted compares all controllers.
-    jobs = []
-    for scenario in suite.scenarios:
-        for spec in records:
-            jobs.append(Job(spec, scenario, backend, reward))
+    jobs = [
+        Job(spec, scenario, backend, reward) for scenario in suite.scenarios for spec in records
+    ]
     results = Results(
         suite=suite.name,
         description=suite.description,
@@ -129,7 +124,7 @@ def evaluate(
         reward=str(getattr(reward, "__name__", reward or "")),
         package_version=__version__,
         controllers=[*records.values()],
-        scenarios=[*suite.scenarios],
+        scenarios=suite.scenarios,
         entries=[],
         failures=failures,
         digest=_digest(jobs, records),
@@ -166,8 +161,8 @@ def _load_controllers(
         for scenario in suite.scenarios:
             if scenario.vehicle is None:
                 vehicles[spec.label] = _vehicle(spec, scenario).name
-    if any(scenario.reference and scenario.vehicle is None for scenario in suite.scenarios):
-        vehicles["the reference"] = DEFAULT_VEHICLE
+    if any(scenario.published and scenario.vehicle is None for scenario in suite.scenarios):
+        vehicles["the published one"] = DEFAULT_VEHICLE
     if len({*vehicles.values()}) > 1:
         flown = ", ".join(map(" flies ".join, vehicles.items()))
         report(f"not all fly the same vehicle: {flown}; --vehicle gives all of them one")
@@ -363,6 +358,9 @@ def _digest(jobs: Sequence[Job], records: Mapping[ControllerSpec, ControllerReco
     for job in jobs:
         inputs = job, records[job.spec], job.spec.own, _vehicle(job.spec, job.scenario)
         digest.update(repr(inputs).encode())
+        reference = job.scenario.reference
+        if reference and reference.file:
+            digest.update(Path(reference.file).read_bytes())
     return digest.hexdigest()
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.simulation.batch import QuadcopterBatch, StepResult
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.simulation.state import STATE, TARGET, row_slices
+from sb3_quad.simulation.state import TARGET
 
 # The environment on PyBullet; its task comes with the settings.
 ENV_ID = "QuadTargetTracking-v0"
@@ -40,7 +40,7 @@ class Fleet(QuadcopterBatch):
         """
         self.reset()
         for name, values in start.items():
-            self.state[row_slices(STATE)[name]] = values.T
+            self.fix(name, values.T)
         return self.observe()
 
     def close(self) -> None:
@@ -57,7 +57,13 @@ class PyBulletFleet(Fleet):
         super().__init__(seeds, settings)
         self._seeds = seeds
         # Flights end by their plan; -1 is Gymnasium's word for an environment that truncates none.
-        keywords = {**dict(settings), "max_episode_steps": -1, "disable_env_checker": True}
+        # The batch moves the targets, so that no environment needs tables of its own.
+        keywords = {
+            **dict(settings),
+            "max_episode_steps": -1,
+            "reference": None,
+            "disable_env_checker": True,
+        }
         # By its id, since PyBullet may be missing, which matters here only.
         self._envs: list[Any] = [gymnasium.make(ENV_ID, **keywords).unwrapped for _ in seeds]
 

@@ -12,6 +12,7 @@ import numpy as np
 from sb3_quad.base.files import read_arrays
 from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, StrPath
 from sb3_quad.evaluation.flights import Flights, Hook
+from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.simulation.state import (
     FORCE_BODY,
     FORCE_WORLD,
@@ -37,6 +38,7 @@ EPISODES = (
     "final_offset",
     "recovery_time",
     "cross_track_error",
+    *FOLLOWED,
     "overshoot",
 )
 

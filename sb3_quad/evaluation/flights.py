@@ -20,6 +20,7 @@ from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, S
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
+from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings, known_layout
@@ -72,6 +73,13 @@ class Flights:
     recovery_time: FloatArray  #: (n,), s until it was stable again, NaN if it never was, see Motion
     #: (n,), largest distance from the straight line to the target, m; NaN where there is no line
     cross_track_error: FloatArray
+    #: (n,), of flights whose target moves or turns, after the first 2 s: root mean square of
+    #: |r - r_T|, m, as of the others NaN where a flight was lost or its target rests
+    rms_error: FloatArray
+    greatest_error: FloatArray  #: (n,), largest |r - r_T|, m
+    path_error: FloatArray  #: (n,), root mean square of its part across the target's velocity, m
+    lag: FloatArray  #: (n,), how late the flight is on its path, s, see Following
+    heading_error: FloatArray  #: (n,), root mean square, degrees; NaN where no heading is asked for
     #: (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
     waypoint_times: FloatArray
     #: (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
@@ -157,7 +165,7 @@ def fly(
         asked by ``predict(observation, deterministic=True)``; or a function from observations (n,
         18) to actions (n, 4).
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
-        ``noise`` and ``environment``: ``task_kwargs``, ``observation_std`` and
+        ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
         ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
         ``rotor_layout``, unless you give another.
     :param backend: ``batch``, or ``pybullet`` for the reference.
@@ -239,6 +247,7 @@ def _fly_fleet(
     distance = state.distance
     arrivals = Arrivals(tolerances, course.to_last(distance))
     motion = Motion(start, vehicle.control_step)
+    following = Following(fleet.n, vehicle.control_step)
     if len(plan.waypoints):
         # A course has no single straight line to deviate from.
         motion.cross_track_error[:] = np.nan
@@ -287,6 +296,8 @@ def _fly_fleet(
         # From here on, only the flights that continue count.
         flying &= fleet.outcome["truncated"]
         motion.see(step, state, flying)
+        if fleet.moves:
+            following.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
@@ -319,7 +330,8 @@ def _fly_fleet(
         final_error=distance,
         final_offset=np.where(flying[:, None], offset, np.nan),
         recovery_time=motion.recovery_time,
-        cross_track_error=motion.cross_track_error,
+        cross_track_error=np.where(following.moves, np.nan, motion.cross_track_error),
+        **following.errors(flying),
         waypoint_times=course.times,
         start=start.array[:13].T,
         target=start.target,

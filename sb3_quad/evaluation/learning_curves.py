@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import one_line, read_arrays
+from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.files import read_arrays
 from sb3_quad.base.types import FloatArray, StrPath
 
 # The arrays of a file, (k, episodes), by what they are called here. Environments of others may not
@@ -51,16 +51,14 @@ def read_curve(run: StrPath, task: str | None = None) -> Curve:
         raise ConfigError(f"{path}: no such file; {reason}")
     arrays = read_arrays(path)
     measures = {}
-    try:
+    # A file of another program may hold anything.
+    with raised_as(ConfigError, f"{path}: cannot be read"):
         for name, key in EPISODES.items():
             if key in arrays or key not in OPTIONAL:
                 measures[name] = arrays[key].mean(axis=1)
         # There is a row of episodes, or one number, for each evaluation.
         columns = np.stack([arrays["timesteps"], arrays["seconds"], *measures.values()])
         timesteps, seconds, *_ = columns.astype(np.float64)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        # A file of another program may hold anything.
-        raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
     for key, losses in arrays.items():
         if key.startswith("train/"):
             measures[key.removeprefix("train/")] = losses

@@ -1,18 +1,17 @@
 """Tables of metrics: a column for each controller, then columns of others' metrics."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import groupby
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from sb3_quad.evaluation.flights import arrival_tolerance
+from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_values
-from sb3_quad.evaluation.scenarios.scenario import Printed, Reference, Scenario
+from sb3_quad.evaluation.scenarios.scenario import Printed, Published, Scenario
 from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 
@@ -30,10 +29,18 @@ MEDIAN = Row("final error, median", "m", decimals=3)
 QUANTILE = Row("final error, 95 %", "m", decimals=3)
 RECOVERY_TIME = Row("recovery time", "s", verb="recover")
 CROSS_TRACK_ERROR = Row("cross-track error", "m")
+# Of targets that move, in the order of FOLLOWED
+FOLLOWING = (
+    Row("position error, rms", "m", decimals=3),
+    Row("position error, greatest", "m", decimals=3),
+    Row("cross-track error, rms", "m", decimals=3),
+    Row("heading error, rms", "°", decimals=1),
+    Row("lag", "s", decimals=3),
+)
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
 COURSE_TIME = Row("time of the course", "s", verb="complete")
-# The rows of fields of Metrics; those of Reference have the same names.
+# The rows of fields of Metrics; those of Published have the same names.
 ROWS = {
     "success": SUCCESS,
     "survival": SURVIVAL,
@@ -46,6 +53,7 @@ ROWS = {
     "final_error_median": MEDIAN,
     "final_error_95": QUANTILE,
     "recovery_time": RECOVERY_TIME,
+    **dict(zip(FOLLOWED, FOLLOWING, strict=True)),
 }
 # Flights that are lost end early, which makes other rows incomparable.
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}
@@ -69,13 +77,12 @@ def settling_row(tolerance: float) -> Row:
     return Row(f"settling time ({tolerance:g} m)", "s", verb="settle")
 
 
-def estimate_cell(
-    estimate: Estimate | None, factor: float = 1.0, decimals: int = 2, none: str = "–"
-) -> Cell:
-    """Return an estimate with its interval, both times ``factor``; the words ``none`` for None."""
+def estimate_cell(row: Row, estimate: Estimate | None, none: str = "–") -> Cell:
+    """Return the cell of an estimate with its interval in a row; the words ``none`` for None."""
     if estimate is None:
         return Cell(words=none)
-    return Cell(factor * estimate.value, (factor * estimate.low, factor * estimate.high), decimals)
+    ends = (row.factor * estimate.low, row.factor * estimate.high)
+    return Cell(row.factor * estimate.value, ends, row.decimals)
 
 
 def metric_cells(metrics: Metrics) -> Cells:
@@ -83,8 +90,8 @@ def metric_cells(metrics: Metrics) -> Cells:
 
     What does not exist of these flights, such as the error of survivors without any, has no cell.
     """
-    values: dict[Row, Any] = {row: getattr(metrics, name) for name, row in ROWS.items()}
-    near = arrival_tolerance(map(attrgetter("tolerance"), metrics.arrivals))
+    values = {row: getattr(metrics, name) for name, row in ROWS.items()}
+    near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
     for arrival in metrics.arrivals:
         values[time_row(arrival.tolerance)] = arrival
         # Settling and overshoot are shown of one tolerance only.
@@ -105,13 +112,13 @@ def _measured(row: Row, value: Any) -> Cell:
     if not isinstance(value, Moment):
         # A share has as many digits as a single flight takes to show.
         if row.unit == "%":
-            return estimate_cell(value, 100.0, decimals=len(str(value.n // 200)))
-        return estimate_cell(value, decimals=row.decimals)
+            row = row._replace(decimals=len(str(value.n // 200)))
+        return estimate_cell(row, value)
     # A mean time says how many flights it is of, unless it is all or none.
     note = ""
     if 0.0 < value.share.value < 1.0:
         note = f"{100 * value.share.value:.3g} % {row.verb}"
-    return replace(estimate_cell(value.time, none="never"), note=note)
+    return estimate_cell(row, value.time, none="never")._replace(note=note)
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
@@ -122,31 +129,32 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
     return {**metric_cells(entry.metrics), LIMIT: Cell(entry.physical_limit)}
 
 
-def reference_cells(reference: Reference) -> Cells:
+def published_cells(published: Published) -> Cells:
     """Return others' metrics."""
     cells = {}
     for name, row in {**ROWS, "final_error": MEDIAN}.items():
-        number = getattr(reference, name, None)
+        number = getattr(published, name, None)
         if number is not None:
-            cells[row] = _printed(number, 100.0 if row.unit == "%" else 1.0)
-    for row in {SUCCESS, SURVIVAL} & {*cells}:
-        cells[row] = replace(cells[row], note=reference.note)
+            cells[row] = _printed(row, number)
+            if row in (SUCCESS, SURVIVAL):
+                cells[row] = cells[row]._replace(note=published.note)
     # Here None has a meaning: never within the tolerance.
-    for tolerance, time in reference.time_to.items():
-        cells[time_row(tolerance)] = _printed(time)
+    for tolerance, time in published.time_to.items():
+        row = time_row(tolerance)
+        cells[row] = _printed(row, time)
     return cells
 
 
 def metric_rows(
-    scenario: Scenario, measured: Sequence[Cells | None], references: Iterable[Reference] = ()
+    scenario: Scenario, measured: Sequence[Cells | None], published: Iterable[Published] = ()
 ) -> list[Row]:
-    """Return the rows of a scenario, the best of each marked: controllers first, then references.
+    """Return the rows of a scenario, the best of each marked: controllers first, then others.
 
     :param measured: of each controller; None: it failed.
     """
     # A controller that failed has one cell, which says so.
     ours = [cells or {SUCCESS: Cell(words="failed")} for cells in measured]
-    others = [*map(reference_cells, references)]
+    others = [*map(published_cells, published)]
     none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells)
     rows = []
     for row in _rows_of(scenario):
@@ -156,7 +164,7 @@ def metric_rows(
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        rows.append(replace(row, cells=[*own, *cells_of(row, others)]))
+        rows.append(row._replace(cells=[*own, *cells_of(row, others)]))
     return rows
 
 
@@ -169,7 +177,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a row, the best marked if its interval is apart from all others'."""
     if row in HIGHER_IS_BETTER:
         sign = 1.0
-    elif row.verb:
+    elif row.verb or row in FOLLOWING[:-1]:
         sign = -1.0
     else:
         return list(cells)
@@ -180,18 +188,18 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     for number, cell in enumerate(cells):
         others = np.fmax.reduce(np.delete(high, number), initial=-np.inf)
         # A cell that is alone is not the best.
-        marked.append(replace(cell, best=bool(low[number] > others > -np.inf)))
+        marked.append(cell._replace(best=bool(low[number] > others > -np.inf)))
     return marked
 
 
 def overview(results: Results, controllers: Sequence[str]) -> Table:
-    """Return all scenarios in one table: a section each, references in the last column.
+    """Return all scenarios in one table: a section each, published metrics in the last column.
 
     :param controllers: labels, in the order of their columns.
     """
     columns = [*map(Column, controllers)]
     rows = []
-    if any(scenario.reference for scenario in results.scenarios):
+    if any(scenario.published for scenario in results.scenarios):
         columns.append(Column(results.source, align="left"))
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
@@ -209,11 +217,11 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
         # The values of a cell are name enough for its only row.
         names = values if values and len(rows) == 1 else [*values, row.name]
         cells = [*row.cells[: len(controllers)]]
-        # All references share a column.
+        # All published metrics share a column.
         words = []
-        for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
+        for who, cell in zip(scenario.published, row.cells[len(controllers) :], strict=True):
             if cell != NOTHING:
-                words.append(f"{who} {replace(cell, note='').text}")
+                words.append(f"{who} {cell._replace(note='').text}")
         if words:
             cells.append(Cell(words="; ".join(words)))
         section.append(Row(f"  {', '.join(names)}", row.unit, cells))
@@ -221,11 +229,11 @@ def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -
 
 
 def scenario_rows(results: Results, labels: Iterable[str], scenario: Scenario) -> list[Row]:
-    """Return the :func:`metric_rows` of a scenario: some controllers, then all references."""
+    """Return the :func:`metric_rows` of a scenario: some controllers, then what was published."""
     return metric_rows(
         scenario,
         [measured_cells(results, label, scenario) for label in labels],
-        scenario.reference.values(),
+        scenario.published.values(),
     )
 
 
@@ -248,6 +256,8 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         return [*shares, REACHED, COMPLETED, COURSE_TIME]
     if len(scenario.cell) > 1:
         return [SUCCESS]
+    if scenario.reference is not None:
+        return [*shares, REWARD, OWN_REWARD, *FOLLOWING]
     if scenario.group is not None:
         return [*shares, MEDIAN]
     rewards = [REWARD, OWN_REWARD]
@@ -257,21 +267,22 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         return [*shares, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = {*scenario.tolerances}
     if len(tolerances) > MOST_TOLERANCES:
-        # Only the main ones and those of references; a plot shows the others.
+        # Only the main ones and published ones; a plot shows the others.
         kept = {min(tolerances), *MAIN_TOLERANCES}
-        for reference in scenario.reference.values():
-            kept |= {*reference.time_to}
+        for published in scenario.published.values():
+            kept |= {*published.time_to}
         tolerances &= kept
     settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
     times = map(time_row, sorted(tolerances))
     return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
-def _printed(value: Printed, factor: float = 1.0) -> Cell:
+def _printed(row: Row, value: Printed) -> Cell:
     """A number as its source prints it; a pair is a range, None a time that never came."""
     if value is None:
         return Cell(words="never")
     if isinstance(value, tuple):
         # Tables have a proper minus sign.
-        return Cell(words=" to ".join(f"{factor * end:g}" for end in value).replace("-", "−"))
-    return Cell(factor * value, decimals=len(f"{factor * value:g}".partition(".")[2]))
+        return Cell(words=" to ".join(f"{row.factor * end:g}" for end in value).replace("-", "−"))
+    value *= row.factor
+    return Cell(value, decimals=len(f"{value:g}".partition(".")[2]))

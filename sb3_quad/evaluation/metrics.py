@@ -4,9 +4,10 @@ from functools import partial
 
 import numpy as np
 
-from sb3_quad.base.types import FloatArray, StrDict
+from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flights import Flights
+from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
 
 
@@ -76,6 +77,17 @@ class Metrics(Frozen):
     """flights that became stable again, and when"""
     cross_track_error: Estimate | None
     """mean largest distance from the straight line to the target, m; None: there is no line"""
+    rms_error: Estimate | None
+    """mean root mean square of |r - r_T| after the first 2 s, m; as the next four only of targets
+    that move or turn"""
+    greatest_error: Estimate | None
+    """mean largest |r - r_T| after the first 2 s, m"""
+    path_error: Estimate | None
+    """mean root mean square of its part across the target's velocity, m"""
+    lag: Estimate | None
+    """mean delay along the path, s"""
+    heading_error: Estimate | None
+    """mean root mean square, degrees; None: no heading is asked for"""
     course: Course | None
     """only of scenarios with waypoints"""
 
@@ -107,8 +119,9 @@ def summarise(flights: Flights) -> Metrics:
         final_error=mean(error),
         final_error_median=_median(error),
         final_error_95=mean(error, partial(np.quantile, q=0.95)),
-        recovery_time=Moment(**_moment(flights.recovery_time)),
+        recovery_time=_moment(flights.recovery_time),
         cross_track_error=mean(flights.cross_track_error[survived]),
+        **{name: mean(getattr(flights, name)) for name in FOLLOWED},
         course=course,
     )
 
@@ -119,14 +132,14 @@ def _arrival(flights: Flights, tolerance: float) -> Arrival:
     arrived = np.isfinite(times)
     return Arrival(
         tolerance=tolerance,
-        settling=Moment(**_moment(settled)),
+        settling=_moment(settled),
         overshoot_rate=share((settled != times)[arrived]) if arrived.any() else None,
-        **_moment(times),
+        **dict(_moment(times)),
     )
 
 
-def _moment(times: FloatArray) -> StrDict:
-    return {"share": share(np.isfinite(times)), "time": mean(times)}
+def _moment(times: FloatArray) -> Moment:
+    return Moment(share=share(np.isfinite(times)), time=mean(times))
 
 
 def _median(values: FloatArray) -> float | None:

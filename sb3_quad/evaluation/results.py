@@ -11,7 +11,6 @@ A number that does not exist is None, never NaN.
 import re
 from collections.abc import Iterable, Sequence
 from itertools import cycle
-from operator import attrgetter
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +21,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, read_record
+from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
@@ -31,7 +31,10 @@ FLIGHTS = "flights"
 # Files that are removed together with the results; a report writes the last two.
 WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
 # Columns of episodes.csv that are one array each, and those that are several numbers.
-_COLUMNS = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
+_COLUMNS = (
+    *("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error"),
+    *FOLLOWED,
+)
 _AXES = {
     "target": "x y z",
     "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",
@@ -101,11 +104,11 @@ class Failure(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[6] = 6
+    schema_version: Literal[7] = 7
     suite: str
     description: str
-    source: str = "reference"
-    """where the scenarios' reference comes from"""
+    source: str = "published"
+    """where the scenarios' published metrics come from"""
     reward: str = ""
     """your own reward, as given; empty: none"""
     package_version: str
@@ -121,7 +124,7 @@ class Results(Frozen):
     @property
     def colours(self) -> dict[str, str]:
         """The colours of the controllers in plots, ``#rrggbb``, by label."""
-        return colours_of([*map(attrgetter("label"), self.controllers)])
+        return colours_of([record.label for record in self.controllers])
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """Return the entry of a controller's label and a scenario's name; None if it failed."""

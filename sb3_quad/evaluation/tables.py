@@ -3,10 +3,8 @@ intervals, or words.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from html import escape as escape_html
-from operator import attrgetter
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import rich.console
 import rich.table
@@ -17,8 +15,7 @@ Align = Literal["left", "right"]
 WIDTH = 200  # characters of a line of a table as plain text, at most
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A metric with the ends of its 95 % interval, or words in its place.
 
     :param ends: of the interval; an infinite upper end is an unknown one.
@@ -66,8 +63,7 @@ class Cell:
         return f"{rounded:.{self.decimals}f}".replace("-", "−")
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """The head of a column of cells.
 
     :param colour: of the controller it stands for, ``#rrggbb``.
@@ -85,8 +81,7 @@ class Column:
         return f"{self.source}: {self.name}" if self.source else self.name
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A metric with its unit, and a cell for each column; without cells it is a heading.
 
     :param decimals: of its cells.
@@ -104,9 +99,13 @@ class Row:
         """The name and the unit."""
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
+    @property
+    def factor(self) -> float:
+        """From values to cells, which give shares in %."""
+        return 100.0 if self.unit == "%" else 1.0
 
-@dataclass(frozen=True)
-class Table:
+
+class Table(NamedTuple):
     """Rows of cells. ``rich`` prints it as it is; ``page.html.j2`` makes HTML of it.
 
     :param corner: heads the rows' names.
@@ -137,7 +136,7 @@ class Table:
 
     @property
     def _headings(self) -> list[str]:
-        return [*map(attrgetter("heading"), self.columns)]
+        return [column.heading for column in self.columns]
 
     def __str__(self) -> str:
         """The table as plain text."""
@@ -149,10 +148,12 @@ class Table:
     def __rich__(self) -> rich.table.Table:
         """The table as ``rich`` prints it; the best of a row is bold."""
         table = rich.table.Table(
-            title=escape(self.title) or None, caption=escape(self.caption) or None
+            title=escape(self.title) or None,
+            caption=escape(self.caption) or None,
+            title_justify="left",
+            caption_justify="left",
+            show_header=any([self.corner, *self._headings]),
         )
-        table.title_justify = table.caption_justify = "left"
-        table.show_header = any([self.corner, *self._headings])
         table.add_column(Text(self.corner), no_wrap=True)
         for column in self.columns:
             table.add_column(Text(column.heading), justify=column.align)

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from sb3_quad.base.errors import ConfigError, WorkerDied
+from sb3_quad.base.errors import ConfigError, WorkerDied, raised_as
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import TRUST_VARIABLE
@@ -49,7 +49,8 @@ class RayExecutor:
             "log_to_driver": False,
             "logging_level": "ERROR",
         }
-        try:
+        # Ray raises exceptions of many kinds.
+        with raised_as(ConfigError, f"Ray cluster {address or 'on this machine'}: cannot be used"):
             if address is None:
                 # Ray warns about a variable that this package does not use.
                 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -64,13 +65,6 @@ class RayExecutor:
                     environment["py_modules"] = [str(_copy_package(Path(folder)))]
                     self._ray.init(address=address, **options)
             total = self._ray.cluster_resources()
-        except ConfigError:
-            raise
-        except Exception as error:
-            # Ray raises exceptions of many kinds.
-            raise ConfigError(
-                f"Ray cluster {address or 'on this machine'}: cannot be used ({one_line(error)})"
-            ) from None
         self.workers = workers
         if num_cpus:
             self.workers = max(1, int(total.get("CPU", 0) // num_cpus))
@@ -82,7 +76,23 @@ class RayExecutor:
         reference = call.remote(sys.argv, os.getcwd(), function, *arguments)
         self._references.append(reference)
         future = Future[Any]()
-        reference.future().add_done_callback(lambda done: self._hand_over(done, future))
+
+        def hand_over(done: "Future[Any]") -> None:
+            """Give the future the outcome of Ray's, with an error that is not of Ray's classes."""
+            error = done.exception()
+            if error is None:
+                future.set_result(done.result())
+            elif isinstance(error, self._ray.exceptions.RayTaskError):
+                future.set_exception(error.cause)
+            else:
+                future.set_exception(
+                    WorkerDied(
+                        f"its worker on the cluster ended, and {RETRIES} more after it "
+                        f"({one_line(error)[:120]})"
+                    )
+                )
+
+        reference.future().add_done_callback(hand_over)
         return future
 
     def stop(self) -> None:
@@ -100,21 +110,6 @@ class RayExecutor:
         for reference in self._references:
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
-
-    def _hand_over(self, done: "Future[Any]", future: "Future[Any]") -> None:
-        """Give a future the outcome of Ray's, with an error that is not one of Ray's classes."""
-        error = done.exception()
-        if error is None:
-            future.set_result(done.result())
-        elif isinstance(error, self._ray.exceptions.RayTaskError):
-            future.set_exception(error.cause)
-        else:
-            future.set_exception(
-                WorkerDied(
-                    f"its worker on the cluster ended, and {RETRIES} more after it "
-                    f"({one_line(error)[:120]})"
-                )
-            )
 
 
 def _check_address(address: str) -> None:

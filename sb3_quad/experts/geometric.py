@@ -32,12 +32,12 @@ class GeometricExpert(Expert):
     one of Chaturvedi, Sanyal and McClamroch, "Rigid-body attitude control" (IEEE Control Systems
     31(3), 2011): it turns the thrust direction first and then the yaw, as in Brescianini and
     D'Andrea, "Tilt-prioritized quadrocopter attitude control" (IEEE Trans. Control Systems
-    Technology 28(2), 2020), since no task here asks for a heading.
+    Technology 28(2), 2020): a heading is followed with the thrust that is left.
 
     It adds to them: velocities and body rates that the vehicle can brake from; the attitude at the
     time when the command acts; the long way round where the spin makes that quicker; and rotor
     thrusts that give up yaw before thrust and thrust before tilt. It has no state: its actions are
-    a function of the 18 observed features.
+    a function of the 18 observed features and the reference.
 
     :param vehicle: name, YAML path or Vehicle that it is designed for.
     :param gains: the :class:`GeometricGains`; None: those in the vehicle's YAML
@@ -81,10 +81,10 @@ class GeometricExpert(Expert):
         """Return the external wrench less a part of the vehicles' own drag."""
         if state.vehicles is None or not state.vehicles[P.drag_x : P.drag_z + 1].any():
             return wrench
-        # Drag against the air at rest is that of the vehicle's own motion.
-        at_rest = np.zeros((3, 1))
+        # Drag against air that moves as the reference does is that of errors of the velocity.
+        air = state.target_velocity.T
         wrench = wrench.copy()
-        wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, at_rest)
+        wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, air)
         return wrench
 
 
@@ -99,7 +99,6 @@ def privileged_derived(vehicle: VehicleSource = "itm") -> GeometricExpert:
     It is meant for distributions of vehicles unlike this one. Where commands act late, its outer
     loop is slower and its inner one faster: agents that learn from it can cope with slow motors.
     """
-    gains = derived_gains(load_vehicle(vehicle))
-    expert = GeometricExpert(vehicle, gains, privileged=True)
-    expert._true = TrueConstants(expert.vehicle, gains, is_gentle=True)
+    expert = GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), privileged=True)
+    expert._true = TrueConstants(expert.vehicle, expert.gains, is_gentle=True)
     return expert

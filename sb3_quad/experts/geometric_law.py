@@ -20,7 +20,7 @@ from sb3_quad.experts.vectors import (
     vector_at,
 )
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.state import P, W, X
+from sb3_quad.simulation.state import AHEAD, P, W, X
 
 
 @compiled
@@ -53,10 +53,14 @@ def fly_geometric(state, constants, wrench, actions):
 
         # The force that the rotors should give per mass, and its direction b as the body will see
         # it when the command acts.
+        # All motion is relative to the reference: its acceleration pushes the vehicle backwards.
         f = desired_force(
             difference(vector_at(state, X.target, i), vector_at(state, X.position, i)),
-            vector_at(state, X.velocity, i),
-            divided(force, mass),
+            difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i)),
+            difference(
+                divided(force, mass),
+                reference_acceleration(state, i, constants.lag[k], gains[G.attitude]),
+            ),
             gains,
             g,
         )
@@ -66,7 +70,7 @@ def fly_geometric(state, constants, wrench, actions):
 
         # Moments for the turn, against the yaw rate, and against the external torque.
         mx, my = turn_moments(b, omega, gains, inertia)
-        mz = -gains[G.yaw_rate] * inertia[2] * omega[2]
+        mz = yaw_moment(state, i, rotation, omega[2], gains, inertia[2])
         moments = difference((mx, my, mz), torque)
         allocate(
             mass * size * b[2],
@@ -77,6 +81,35 @@ def fly_geometric(state, constants, wrench, actions):
             tilting,
             actions[i],
         )
+
+
+@compiled
+def reference_acceleration(state, i, lag, attitude):
+    """Return the acceleration of the reference when the vehicle can have it, world frame, m/s².
+
+    Upwards that is when a command acts, sideways when the vehicle has turned, too.
+    """
+    x, y, z = vector_at(state, X.target_acceleration, i)
+    dx, dy, dz = difference(vector_at(state, X.target_ahead, i), (x, y, z))
+    upwards = lag / AHEAD
+    sideways = upwards + 1.0 / (attitude * AHEAD)
+    return x + sideways * dx, y + sideways * dy, z + upwards * dz
+
+
+@compiled
+def yaw_moment(state, i, rotation, r, gains, izz):
+    """Return the yaw moment against the yaw rate, or towards the heading if one is asked for, N m.
+
+    The heading is where the body's x axis points, seen from above.
+    """
+    cosine, sine, rate = vector_at(state, X.target_heading, i)
+    if cosine == sine == 0.0:
+        return -gains[G.yaw_rate] * izz * r
+    (x, _, _), (y, _, _), (_, _, upright) = rotation
+    error = math.atan2(sine * x - cosine * y, cosine * x + sine * y)
+    # Critically damped, and as quick as roll and pitch.
+    gain = gains[G.body_rates]
+    return gain * izz * (upright * (rate + 0.25 * gain * error) - r)
 
 
 @compiled

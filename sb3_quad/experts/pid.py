@@ -18,6 +18,8 @@ ANGLE_FACTOR = 0.25
 class PIDExpert(Expert):
     """Position PID around an attitude PD controller, on the true state (thesis 2.1.2 and 3.2.1).
 
+    Of a reference that moves it follows velocity, acceleration and heading, which the thesis's has
+    not.
     It is made for small angles: from a random attitude it recovers less than a third of the time.
     The attitude gains are I ωn² and 2 ξ ωn I (Eq. 3.15), so they fit any vehicle. With ITM's
     inertia they are those of Table A.1.
@@ -84,29 +86,40 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
     half = (high - low) / 2
     for i in range(actions.shape[0]):
         position_error = difference(vector_at(state, X.target, i), vector_at(state, X.position, i))
+        ahead = vector_at(state, X.target_ahead, i)
+        c, s, yaw_rate = vector_at(state, X.target_heading, i)
+        if c == s == 0.0:
+            c = 1.0
         # The velocity in the body frame, and the Euler angles Z-Y-X.
         rotation, rotation_inverse = rotations_at(state, X.quaternion, i)
-        velocity = rotated(rotation_inverse, vector_at(state, X.velocity, i))
+        vx, vy, vz = rotated(
+            rotation_inverse,
+            difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i)),
+        )
         p, q, r = vector_at(state, X.body_rates, i)
         (r11, _, _), (r21, _, _), (r31, r32, r33) = rotation
         roll = math.atan2(r32, r33)
         pitch = math.asin(min(1.0, max(-1.0, -r31)))
         yaw = math.atan2(r21, r11)
 
-        # Position: desired accelerations, and the angles that make the horizontal ones.
-        ax = kp * position_error[0] - kd * velocity[0]
-        ay = kp * position_error[1] - kd * velocity[1]
-        az = kp * position_error[2] - kd * velocity[2]
+        # Position: desired accelerations, and the angles that make the horizontal ones. The thesis
+        # takes the body for aligned with the world: here, with the heading. Accelerations of the
+        # reference need their whole angles, when the body has turned to them.
+        ax = kp * position_error[0] - kd * (c * vx - s * vy) + ahead[0] / ANGLE_FACTOR
+        ay = kp * position_error[1] - kd * (c * vy + s * vx) + ahead[1] / ANGLE_FACTOR
+        az = kp * position_error[2] - kd * vz + ahead[2]
         sine = math.sin(yaw)
         cosine = math.cos(yaw)
         roll_des = ANGLE_FACTOR * (ax * sine - ay * cosine) / g
         pitch_des = ANGLE_FACTOR * (ax * cosine + ay * sine) / g
 
-        # Attitude: the thrust and the moments (Eqs. 2.7 to 2.10). The desired yaw is 0.
+        # Attitude: the thrust and the moments (Eqs. 2.7 to 2.10). The desired yaw is 0, or the
+        # heading that is asked for.
         u1 = mass * (g + az + ki_dt * position_error[2])
         u2 = proportional[0] * (roll_des - roll) - derivative[0] * p
         u3 = proportional[1] * (pitch_des - pitch) - derivative[1] * q
-        u4 = -proportional[2] * yaw - derivative[2] * r
+        yaw = math.atan2(c * r21 - s * r11, c * r11 + s * r21)
+        u4 = -proportional[2] * yaw - derivative[2] * (r - yaw_rate)
 
         # Scale all four thrusts by one factor, so that the largest is allowed.
         largest = -math.inf

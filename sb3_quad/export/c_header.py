@@ -46,7 +46,7 @@ def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
 
 
 def _comment(metadata: StrDict) -> list[str]:
-    lines: list[str] = []
+    lines = []
     for key, value in metadata.items():
         # A file may have any name, but the name must neither end the comment nor leave ASCII.
         text = f"{key}: {value}".replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")

@@ -2,7 +2,7 @@
 difference.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -102,22 +102,13 @@ class Reference:
         return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
 
 
-class Comparison(NamedTuple):
-    """How much a file differs from its policy."""
-
-    error: float
-    """the largest difference of any rotor, N or rad/s"""
-    n: int
-    """how many observations the file has seen"""
-
-
 def compare(
     reference: Reference,
     call: Call,
     by: str,
     n: int = N_OBSERVATIONS,
     relates: bool = False,
-) -> Comparison:
+) -> tuple[float, int]:
     """Compare a file with the policy that it came from, in the policy's flights.
 
     The flights start at any attitude, up to 30 m from references that move and turn, with
@@ -129,6 +120,8 @@ def compare(
     :param by: the program that runs the file, for the message.
     :param n: observations, at most: a flight may end early.
     :param relates: whether the file also makes observations relative to references.
+    :return: the largest difference of any rotor, N or rad/s, and how many observations the file
+        has seen.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
     """
@@ -202,4 +195,4 @@ def compare(
             f"the exported policy differs from the trained one by {error:.3g}, "
             f"{allowed:.3g} is allowed ({by}); nothing was written"
         )
-    return Comparison(error, count)
+    return error, count

@@ -14,8 +14,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import ACTIONS
@@ -23,12 +24,12 @@ from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
 from sb3_quad.simulation.tracks import ACCELERATION_STD
 
-ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
+ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
 """Each output with the name and the unit of one of its four numbers."""
 
 
-class Network(th.nn.Module):
+class Network(nn.Module):
     """A deterministic policy from features in physical units to the four rotors, all of it float32,
     on the CPU.
 
@@ -56,7 +57,7 @@ class Network(th.nn.Module):
     middle: th.Tensor
     half_range: th.Tensor
 
-    def __init__(self, layers: th.nn.Sequential, reference: Reference) -> None:
+    def __init__(self, layers: nn.Sequential, reference: Reference) -> None:
         super().__init__()
         vehicle = reference.vehicle
         observation = reference.observation
@@ -143,7 +144,7 @@ class Network(th.nn.Module):
                 "activation": ACTIVATIONS.get(type(following), "none"),
             }
             for layer, following in itertools.pairwise([*self.layers, None])
-            if isinstance(layer, th.nn.Linear)
+            if isinstance(layer, nn.Linear)
         ]
 
 
@@ -156,8 +157,7 @@ def build_network(reference: Reference, where: str = "model") -> Network:
         :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
     """
-    if reference.output not in OUTPUTS:
-        raise ConfigError(unknown("output", reference.output, OUTPUTS))
+    refuse_unknown("output", [reference.output], OUTPUTS)
     # The policy must be one whose layers we know, on the spaces that its settings describe.
     model = reference.model
     layers = deterministic_layers(model.policy, where)
@@ -173,7 +173,7 @@ def build_network(reference: Reference, where: str = "model") -> Network:
         )
     # C knows these layers only.
     for layer in layers:
-        if type(layer) is not th.nn.Linear and type(layer) not in ACTIVATIONS:
+        if type(layer) is not nn.Linear and type(layer) not in ACTIVATIONS:
             raise ConfigError(
                 f"{where}: its network has a layer {layer}; "
                 "only linear layers, Tanh and ReLU export"
@@ -181,7 +181,7 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     return Network(layers, reference)
 
 
-def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequential:
+def own_layers(layers: nn.Sequential, reference: Reference) -> nn.Sequential:
     """Copy a policy's layers for features in the vehicle's own body frame and its own order of the
     rotors.
 
@@ -189,7 +189,7 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     """
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
     turn = reference.turn
-    linear = [layer for layer in layers if isinstance(layer, th.nn.Linear)]
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     # One frame: the scaled features, then the last action if the policy sees it.
     observation = reference.observation
     std = reference.std
@@ -201,12 +201,13 @@ def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequenti
     frames = th.from_numpy(np.kron(np.eye(len(observation.ages)), frame))
     seen = linear[0].weight[:, : len(frames)]
     seen.copy_(seen @ frames)
-    linear[-1].weight.copy_(linear[-1].weight[turn.own])
-    linear[-1].bias.copy_(linear[-1].bias[turn.own])
+    last = linear[-1]
+    last.weight.copy_(last.weight[turn.own])
+    last.bias.copy_(last.bias[turn.own])
     return layers
 
 
-def deterministic_layers(policy: Any, where: str) -> th.nn.Sequential:
+def deterministic_layers(policy: Any, where: str) -> nn.Sequential:
     """Return the layers from a policy's observations to its deterministic actions, before they are
     clipped.
 
@@ -216,16 +217,16 @@ def deterministic_layers(policy: Any, where: str) -> th.nn.Sequential:
     actor = getattr(policy, "actor", None)
     if actor is not None and type(actor.features_extractor) is FlattenExtractor:
         if type(policy) is TD3Policy:
-            return th.nn.Sequential(*actor.mu)  # its tanh included
+            return nn.Sequential(*actor.mu)  # its tanh included
         if type(policy) is SACPolicy:
             # gSDE bounds the mean by a Hardtanh, which is in actor.mu and does not export.
-            return th.nn.Sequential(*actor.latent_pi, actor.mu, th.nn.Tanh())
+            return nn.Sequential(*actor.latent_pi, actor.mu, nn.Tanh())
     check_policy(policy, where)
     layers = [*policy.mlp_extractor.policy_net, policy.action_net]
     # gSDE's squashed actions are the tanh of the mean; without squashing the mean is clipped.
     if policy.squash_output:
-        layers.append(th.nn.Tanh())
-    return th.nn.Sequential(*layers)
+        layers.append(nn.Tanh())
+    return nn.Sequential(*layers)
 
 
 def check_policy(policy: Any, where: str) -> None:

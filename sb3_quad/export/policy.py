@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
@@ -20,7 +20,7 @@ from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.simulation.observation import FEATURES, GROUPS
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
 
@@ -39,7 +39,7 @@ def export_policy(
     path: StrPath,
     file_format: str,
     output: str = "thrusts",
-    vehicle: str | Path | Vehicle | None = None,
+    vehicle: VehicleSource | None = None,
     name: str | None = None,
     n_observations: int = N_OBSERVATIONS,
 ) -> Export:
@@ -76,11 +76,9 @@ def export_policy(
         "torchscript": (write_torchscript, load.load_torchscript),
         "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
     }
-    if file_format not in formats:
-        raise ConfigError(unknown("format", file_format, formats))
+    refuse_unknown("format", [file_format], formats)
     write, read = formats[file_format]
     # The zip says how its agent flies, unless another vehicle is given.
-    algorithm = saved_algorithm(path)
     model = load_model(path)
     settings, source = agent_settings(path)
     given = settings
@@ -94,20 +92,20 @@ def export_policy(
     flown = first_vehicle(given.vehicle)
     reference = Reference(model, settings, flown, output)
     network = build_network(reference, f"model {path}")
-    metadata = _describe(Path(path), algorithm, network, reference, flown)
+    metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
         # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata), network.state_size)
-        checked = compare(reference, call, by, n_observations, relates=file_format == "c")
+        error, n_compared = compare(reference, call, by, n_observations, relates=file_format == "c")
         metadata["check"] = (
-            f"largest error {checked.error:.2g} {network.unit} "
-            f"in {checked.n} observations of flights ({by})"
+            f"largest error {error:.2g} {network.unit} "
+            f"in {n_compared} observations of flights ({by})"
         )
         content = write(network, metadata)
-    return Export(content, metadata, checked.error, network.unit, source)
+    return Export(content, metadata, error, network.unit, source)
 
 
 def _describe(

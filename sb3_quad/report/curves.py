@@ -64,8 +64,9 @@ def plot_curves(
                     band(panel, colours[name], name + seeds, points, **POINTS)
             for style, (name, heights) in zip(cycle(("--", ":", "-.")), lines.items()):
                 if measure in heights:
-                    height = heights[measure] * factor
-                    panel.axhline(height, color="0.3", ls=style, linewidth=1.2, label=name)
+                    panel.axhline(
+                        heights[measure] * factor, color="0.3", ls=style, linewidth=1.2, label=name
+                    )
     # A title of the figure would lie on the legend.
     panels[0, 0].set_title(title, loc="left")
     legend(figure)
@@ -75,8 +76,8 @@ def plot_curves(
 def _measures(curves: Sequence[Curve], show: Sequence[str]) -> list[str]:
     """The measures that get a row of panels."""
     # Runs of different algorithms have different losses: all of them are shown.
-    table = pd.concat([pd.DataFrame(dict(curve.measures)) for curve in curves])
-    present = table.dropna(axis="columns", how="all")
+    tables = [pd.DataFrame(dict(curve.measures)) for curve in curves]
+    present = pd.concat(tables).dropna(axis="columns", how="all")
     losses = [*present.filter(regex="loss$")]
     if not show:
         show = ["success", "reward"] if "success" in present else ["reward"]
@@ -95,8 +96,12 @@ def _mean_and_range(runs: Sequence[Curve], axis: str, measure: str) -> pd.DataFr
     Between its evaluations a run is interpolated. There is no line where a run has no values.
     """
     lines = [pd.Series(curve.values(measure), getattr(curve, axis)).dropna() for curve in runs]
-    table = pd.concat(lines, axis="columns").sort_index()
-    table = table.interpolate("index", limit_area="inside").dropna()
+    table = (
+        pd.concat(lines, axis="columns")
+        .sort_index()
+        .interpolate("index", limit_area="inside")
+        .dropna()
+    )
     # pandas cannot aggregate an empty table: a run has no values, or no two runs overlap.
     if table.empty:
         return table

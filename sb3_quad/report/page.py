@@ -3,8 +3,8 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.base.templates import render
@@ -18,8 +18,7 @@ PICTURES = "figures"
 TEMPLATES = "sb3_quad.report.templates"
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """A part of a page.
 
     :param anchor: its place in the page's address; unique in a page.

@@ -2,9 +2,8 @@
 
 import io
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import pandas as pd
@@ -29,11 +28,10 @@ STYLE = matplotlib.rc_params_from_file(
 )
 styled = matplotlib.rc_context(STYLE)
 # None removes these from the file, so that the same results give the same bytes.
-METADATA: Any = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
-@dataclass(frozen=True, eq=False)
-class Plot:
+class Plot(NamedTuple):
     """A plot of a page; ``name``, unique in a page, is that of its files."""
 
     name: str

@@ -16,13 +16,13 @@ from sb3_quad.evaluation.metric_tables import (
     cells_of,
     mark_best,
     measured_cells,
-    reference_cells,
+    published_cells,
     scenario_groups,
     scenario_rows,
 )
 from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
-from sb3_quad.evaluation.scenarios.scenario import Reference, Scenario
+from sb3_quad.evaluation.scenarios.scenario import Published, Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.report.page import PAGE, TEMPLATES, Section, write_page
 from sb3_quad.report.plots import Plot
@@ -35,9 +35,9 @@ from sb3_quad.report.scenario_plots import (
 from sb3_quad.simulation.settings import in_words
 
 OVERVIEW = (
-    "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, within"
-    " 0.25 m and tilted by at most 10°. Survival: it neither touches the ground nor leaves the"
-    " range. Where a scenario is varied, you see the least and the greatest share."
+    "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, which"
+    " rests, within 0.25 m and tilted by at most 10°. Survival: it neither touches the ground nor"
+    " leaves the range. Where a scenario is varied, you see the least and the greatest share."
 )
 
 # Scenarios that are shown together, with their heading.
@@ -75,23 +75,21 @@ def sections(results: Results, folder: StrPath) -> list[Section]:
     parts = [Section("overview", "Success and survival", OVERVIEW, shares)]
     for heading, scenarios in groups:
         parts.append(_flights_section(results, heading, scenarios, Path(folder)))
-    rows = []
-    for record in results.controllers:
-        content = (record.content or "")[:12]
-        rows.append((record.label, record.spec, record.algorithm or "", content))
-    parts.append(
-        _words_section("Controllers", ("name", "controller", "algorithm", "SHA-256"), rows)
-    )
+    controllers = [
+        (record.label, record.spec, record.algorithm or "", (record.content or "")[:12])
+        for record in results.controllers
+    ]
+    heads = ("name", "controller", "algorithm", "SHA-256")
+    table = text_table("", heads, controllers, "left")
+    parts.append(Section("controllers", "Controllers", tables=[table]))
     if results.failures:
-        lines = []
-        for failure in results.failures:
-            lines.append((failure.controller, failure.scenario or "", failure.message))
-        parts.append(_words_section("Failures", ("controller", "scenario", "what happened"), lines))
+        failures = [
+            (failure.controller, failure.scenario or "", failure.message)
+            for failure in results.failures
+        ]
+        table = text_table("", ("controller", "scenario", "what happened"), failures, "left")
+        parts.append(Section("failures", "Failures", tables=[table]))
     return parts
-
-
-def _words_section(heading: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Section:
-    return Section(heading.lower(), heading, tables=[text_table("", heads, rows, align="left")])
 
 
 def _flights_section(
@@ -102,8 +100,8 @@ def _flights_section(
     flown = f"{first.episodes} flights of each controller"
     tables = []
     if first.group is None:
-        columns = _columns(results, first.reference)
-        tables.append(Table(columns, scenario_rows(results, results.colours, first)))
+        rows = scenario_rows(results, results.colours, first)
+        tables.append(Table(_columns(results, first.published), rows))
         plots = _scenario_plots(results, first, folder)
     else:
         flown += f" in each of {len(scenarios)} cells"
@@ -115,11 +113,15 @@ def _flights_section(
                 _share_table(SUCCESS, results, cells, f"{axis_label(key, first)}: success (%)")
             )
         plots = group_plots(results, scenarios)
-    facts = (
+    return Section(
+        first.group or first.name,
+        heading,
+        first.description,
+        tables,
+        plots,
         f"{flown}, {first.duration:g} s; observation noise {in_words(first.noise)};"
-        f" seed {first.seed}."
+        f" seed {first.seed}.",
     )
-    return Section(first.group or first.name, heading, first.description, tables, plots, facts)
 
 
 def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[Plot]:
@@ -135,26 +137,26 @@ def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[
         return []
     plots = [paths_plot(scenario, flights, results.colours)]
     has_way = scenario.target.waypoints is None and scenario.target.distance != 0.0
-    if has_way and len(scenario.tolerances) > 2:
+    if has_way and scenario.reference is None and len(scenario.tolerances) > 2:
         plots.append(arrivals_plot(scenario, metrics, results.colours))
     return [*plots, errors_plot(scenario, flights, results.colours)]
 
 
 def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Table:
     """Success or survival in each group of scenarios; of several, from the worst to the best."""
-    others: list[str] = []
+    others = []
     for _, scenarios in groups:
-        for name, reference in scenarios[0].reference.items():
-            if row in reference_cells(reference) and name not in others:
+        for name, published in scenarios[0].published.items():
+            if row in published_cells(published) and name not in others:
                 others.append(name)
     rows = []
     for heading, scenarios in groups:
         cells = mark_best(
             row, [_share(row, results, label, scenarios) for label in results.colours]
         )
-        # A scenario may lack the reference of another one.
-        references = [scenarios[0].reference.get(name, Reference()) for name in others]
-        cells += cells_of(row, map(reference_cells, references))
+        # A scenario may lack the published metrics of another one.
+        printed = [scenarios[0].published.get(name, Published()) for name in others]
+        cells += cells_of(row, map(published_cells, printed))
         rows.append(Row(heading, "", cells))
     return Table(_columns(results, others), rows, corner)
 
@@ -172,7 +174,5 @@ def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]
 
 
 def _columns(results: Results, others: Iterable[str]) -> list[Column]:
-    columns = [*map(Column, results.colours, results.colours.values())]
-    for name in others:
-        columns.append(Column(name, source=results.source))
-    return columns
+    own = map(Column, results.colours, results.colours.values())
+    return [*own, *(Column(name, source=results.source) for name in others)]

@@ -61,18 +61,20 @@ def arrivals_plot(
 def paths_plot(
     scenario: Scenario, flights: Mapping[str, Sequence[Track]], colours: Mapping[str, str]
 ) -> Plot:
-    """Draw recorded flights from above and from the side, with targets and disturbances.
+    """Draw recorded flights from above and from the side, with targets, or the paths of references
+    that move, and disturbances.
 
     :param flights: by the controllers' labels, as are ``colours``.
     """
     count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
+    follows = scenario.reference is not None
     figure = Figure(figsize=(2.0 * WIDTH, 1.2 * HEIGHT), layout="constrained")
     for axes, (i, j) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
         axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal")
         axes.set_adjustable("datalim")
         for label, tracks in flights.items():
             for track in tracks[:count]:
-                _draw_path(axes, track, label, colours[label], [i, j])
+                _draw_path(axes, track, label, colours[label], [i, j], follows)
     legend(figure)
     flights_shown = "flight" if count == 1 else f"{count} flights"
     return Plot(
@@ -83,11 +85,16 @@ def paths_plot(
     )
 
 
-def _draw_path(axes: Axes, track: Track, label: str, colour: str, plane: list[int]) -> None:
+def _draw_path(
+    axes: Axes, track: Track, label: str, colour: str, plane: list[int], follows: bool
+) -> None:
     stride = -(-len(track.position) // LINE_POINTS)
     path = track.position[:, plane]
     axes.plot(*path[::stride].T, color=colour, label=label, linewidth=1.2)
-    axes.plot(*track.targets[:, plane].T, "D", color=TARGET, markersize=4, label="target")
+    if follows:
+        axes.plot(*track.target[::stride, plane].T, color=TARGET, label="reference", zorder=1)
+    else:
+        axes.plot(*track.targets[:, plane].T, "D", color=TARGET, markersize=4, label="target")
     if track.lost:
         axes.plot(*path[-1], "x", color=colour)
     # An arrow where a force begins.
@@ -135,8 +142,7 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
     """
     group = scenarios[0].group
     keys = [*scenarios[0].cell]
-    table = _cells(results, scenarios)
-    controllers = table.groupby("label", sort=False)
+    controllers = _cells(results, scenarios).groupby("label", sort=False)
     is_single = len(keys) == 1
     plots = []
     for number, key in enumerate(keys):
@@ -164,11 +170,14 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
         legend(figure)
-        caption = (
-            "Median final error of the flights that survive, unless these are fewer than half;"
-            " errors below 1 mm are drawn at 1 mm."
+        plots.append(
+            Plot(
+                f"{group}_error",
+                "Median final error of the flights that survive, unless these are fewer than half;"
+                " errors below 1 mm are drawn at 1 mm.",
+                figure,
+            )
         )
-        plots.append(Plot(f"{group}_error", caption, figure))
     return plots
 
 

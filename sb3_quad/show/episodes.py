@@ -9,7 +9,9 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
+from sb3_quad.envs.rendering.camera import DOWN, ON_PATH, broadside
 from sb3_quad.envs.rendering.models import rotor_turning
+from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.results import COLOURS
@@ -20,6 +22,7 @@ from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
+TARGET = "#1ab847"  # that of the hoops
 WRENCH_SECONDS = 0.4  # a wrench is shown for that long, so that a short blow can be seen
 
 
@@ -56,6 +59,19 @@ class Recording:
         return target[np.diff(target, axis=0, prepend=np.nan).any(axis=1)]
 
     @property
+    def follows(self) -> bool:
+        """Whether the target moves along a path."""
+        return bool(self.state.target_velocity.any())
+
+    def trails(self, step: int) -> list[Trail]:
+        """The path flown until ``step``, and the whole path of a target that moves."""
+        # Every second step makes it smooth enough.
+        trails = [Trail(self.state.position[: step + 1 : 2], self.colour)]
+        if self.follows:
+            trails.insert(0, Trail(self.state.target[::2], TARGET))
+        return trails
+
+    @property
     def disturbances(self) -> list[int]:
         """The steps after which a wrench has begun to act."""
         # A wrench begins to act where it acts in a step and not in the one before.
@@ -89,6 +105,13 @@ def landmarks(recordings: Iterable[Recording]) -> FloatArray:
     for recording in recordings:
         points += [recording.state.position, recording.targets]
     return np.concatenate(points)
+
+
+def outlook(recordings: Sequence[Recording]) -> FloatArray:
+    """Return the direction in which cameras look at flights, (3,), from higher up at paths that
+    targets move along.
+    """
+    return broadside(landmarks(recordings), ON_PATH if recordings[0].follows else DOWN)
 
 
 class Setting(NamedTuple):

@@ -18,11 +18,10 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
-from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
-from sb3_quad.envs.rendering.picture import Trail
+from sb3_quad.envs.rendering.camera import Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
-from sb3_quad.show.episodes import Recording, landmarks
+from sb3_quad.show.episodes import Recording, outlook
 from sb3_quad.show.labels import side_by_side, with_header
 
 FPS = 25
@@ -94,7 +93,7 @@ def film_frames(
     """
     times = frame_times(recordings, speed)
     # One direction for all panels, so that their flights can be compared.
-    forward = broadside(landmarks(recordings))
+    forward = outlook(recordings)
     lens = Lens(width, height)
     panels = [_panel(recording, times, forward, lens) for recording in recordings]
     # Frame by frame, because a film does not fit into memory.
@@ -142,10 +141,8 @@ def _panel(
         cameras = following_cameras([recording], times, scene.scale, forward, lens)
         for seconds, camera in zip(times, cameras, strict=True):
             step = recording.at(seconds)
-            # The trail ends at the vehicle; every second step makes it smooth enough.
             scene.place([recording.pose(step)], recording.state.target[[step]])
-            flown = recording.state.position[: step + 1 : 2]
-            picture = Pillow.fromarray(scene.picture(camera, [Trail(flown, recording.colour)]))
+            picture = Pillow.fromarray(scene.picture(camera, recording.trails(step)))
             yield with_header(picture, recording, [_caption(recording, step)], font_size)
 
 
@@ -188,9 +185,7 @@ def show_in_window(
 
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
-    cameras = following_cameras(
-        recordings, times, scene.scale, broadside(landmarks(recordings)), lens
-    )
+    cameras = following_cameras(recordings, times, scene.scale, outlook(recordings), lens)
     begun = time.perf_counter()
     for number, (seconds, camera) in enumerate(zip(times, cameras, strict=True)):
         # The frames follow the clock, so that flights are shown in real time: each waits for its

@@ -12,11 +12,10 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from sb3_quad.base.types import FloatArray, Image
-from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
+from sb3_quad.envs.rendering.camera import Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.models import span
-from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.show.episodes import Recording, landmarks
+from sb3_quad.show.episodes import Recording, landmarks, outlook
 from sb3_quad.show.labels import INK, PLATE, font, side_by_side, with_header
 from sb3_quad.simulation.state import QuadcopterState
 
@@ -57,9 +56,8 @@ def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
 
 def until_settled(recording: Recording) -> Recording:
     """Return a flight without what follows once the vehicle stays at its target."""
-    away = np.flatnonzero(recording.state.distance > SETTLED)
-    n = int(away.max(initial=-1)) + 2
-    if recording.lost:
+    n = int(np.flatnonzero(recording.state.distance > SETTLED).max(initial=-1)) + 2
+    if recording.lost or recording.follows:
         return recording
     return replace(
         recording,
@@ -71,7 +69,7 @@ def until_settled(recording: Recording) -> Recording:
 def view_of(recordings: Sequence[Recording], lens: Lens) -> View:
     """Return the view that has all flights in its picture."""
     points = landmarks(recordings)
-    forward = broadside(points)
+    forward = outlook(recordings)
     breadth = 2.0 * span(recordings[0].vehicle)
     size = 1.0
     # A larger vehicle needs a camera farther away, from which it must be drawn larger.
@@ -99,12 +97,11 @@ def pose_steps(recording: Recording, view: View) -> list[int]:
 
 def _panel(recording: Recording, view: View) -> Pillow.Image:
     steps = pose_steps(recording, view)
-    targets = recording.targets
+    # Of a target that moves, hoops mark the place at the end.
+    targets = recording.state.target[-1:] if recording.follows else recording.targets
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
-        picture = Pillow.fromarray(
-            scene.picture(view.camera, [Trail(recording.state.position, recording.colour)])
-        )
+        picture = Pillow.fromarray(scene.picture(view.camera, recording.trails(recording.state.n)))
     # The texts grow with the picture, but stay legible in a small one.
     size = max(12, round(view.camera.lens.height / 34))
     draw_times(ImageDraw.Draw(picture, "RGBA"), recording, steps, view, round(0.92 * size))
@@ -118,14 +115,14 @@ def _explanation(recording: Recording, steps: list[int], view: View) -> list[str
     distance = recording.state.distance[-1]
     if recording.lost:
         lines = [f"{recording.lost} after {seconds}"]
-    elif distance <= SETTLED:
+    elif distance <= SETTLED and not recording.follows:
         lines = [f"within {SETTLED:g} m of its target from {seconds} on"]
     else:
         lines = [f"{distance:.2f} m from its target after {seconds}"]
     # Then whatever a reader could misunderstand: an enlarged vehicle, hoops and arrows.
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
-    signs = "green hoops: target"
+    signs = "green line: path of the target" if recording.follows else "green hoops: target"
     if recording.wrench[steps].any():
         signs += "; arrows: force (red), torque (violet)"
     return [*lines, signs]

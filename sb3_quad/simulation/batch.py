@@ -32,11 +32,13 @@ from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import (
     FORCE_WORLD,
     REFERENCE,
+    STATE,
     STATE_SIZE,
     WRENCH_SIZE,
     P,
     QuadcopterState,
     drag_forces,
+    row_slices,
 )
 from sb3_quad.simulation.tasks import resolve_tasks
 from sb3_quad.simulation.threads import share_out
@@ -134,11 +136,12 @@ class QuadcopterBatch:
         tracks = (
             NO_TRACKS if settings.reference is None else settings.reference.tracks(control_step)
         )
-        self.moves = settings.reference is not None
+        self.previews = np.array(self.observation.preview or (), dtype=np.int64)
+        # A preview reads what the rows of the target say of its motion.
+        self.moves = settings.reference is not None or self.previews.size > 0
         self.tracks = tracks.table
         self.track_numbers = tracks.numbers()
-        self.course = np.zeros((COURSE_SIZE, n * self.moves))
-        self.previews = np.array(self.observation.preview or (), dtype=np.int64)
+        self.course = np.zeros((COURSE_SIZE, n * (len(tracks.table) > 0)))
 
         tasks = resolve_tasks(settings.task, settings.task_kwargs)
         self.task_parameters, self.task_weights = tasks
@@ -378,6 +381,17 @@ class QuadcopterBatch:
                 )
         for name, array in snapshot.items():
             getattr(self, name)[...] = array
+
+    def fix(self, quantity: str, values: FloatArray) -> None:
+        """Replace a quantity of :data:`.state.STATE` that an episode has begun with, in all rows.
+
+        A reference that moves begins at the new target.
+
+        :param values: (size, n).
+        """
+        self.state[row_slices(STATE)[quantity]] = values
+        if quantity == "target" and self.course.size:
+            self.course[: C.begin] = values
 
     def set_reference(self, reference: FloatArray, rows: IntArray) -> None:
         """Let rows follow what they are told, (REFERENCE_SIZE, rows), from now on."""

@@ -18,7 +18,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
-from sb3_quad.simulation.state import STATE_SIZE, X
+from sb3_quad.simulation.state import AHEAD, STATE_SIZE, X
 
 Motion = Callable[[FloatArray], FloatArray]
 """The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
@@ -100,7 +100,8 @@ class Reference(Frozen):
     """at the start, rad; path: along the velocity; random: of each piece of random_smooth its own,
     with a rate up to heading_rate; None: nothing is asked of it"""
     heading_rate: float = Field(default=0.0, ge=-20, le=20)
-    """rad/s, for a heading that is a number"""
+    """rad/s, for a heading that is a number; so that curves loop, rounded to whole turns in 600 s,
+    or in 10 s of random_smooth"""
     waypoints: tuple[Point, ...] | None = None
     """polynomial: two or more points, relative to the start, which is added if they do not begin
     there"""
@@ -132,6 +133,8 @@ class Reference(Frozen):
                 raise ValueError(f"curve {curve}: needs {argument}")
         if self.heading == "random" and self.curve != "random_smooth":
             raise ValueError("heading 'random': only with curve random_smooth")
+        if self.heading_rate and self.heading in (None, "path"):
+            raise ValueError("heading_rate: needs a heading that is a number or 'random'")
         return self
 
     def tracks(self, dt: float) -> Tracks:
@@ -142,15 +145,19 @@ class Reference(Frozen):
         if self.curve == "random_smooth":
             return self._random_tracks(dt)
         motion, seconds = self._motion(dt)
+        steps = round(seconds / dt)
         loops = self.curve in _SINES and self.curve != "helix"
+        if loops and self.heading_rate:
+            # The heading must loop, too: whole turns in many periods are nearly at its rate.
+            steps *= math.ceil(MAX_SECONDS / dt / steps)
         with raised_as(ConfigError, f"reference {self.curve}"):
-            table = self._table(motion, round(seconds / dt), dt, loops)
+            table = self._table(motion, steps, dt, loops)
         if not loops:
             # It rests where it ends.
             table = np.vstack([table, table[-1]])
             table[-1, _VELOCITY.start : _ACCELERATION.stop] = 0.0
             table[-1, _HEADING_RATE] = 0.0
-        return Tracks(table, len(table), loops)
+        return _tracks(table, len(table), loops, dt)
 
     def _motion(self, dt: float) -> tuple[Motion, float]:
         """Return a curve as a function of time, and how long it takes, s."""
@@ -199,7 +206,9 @@ class Reference(Frozen):
         elif self.heading == "path":
             heading = np.unwrap(np.arctan2(table[:, 4], table[:, 3]))
         elif isinstance(self.heading, float):
-            heading = self.heading + self.heading_rate * times
+            turn = 2.0 * math.pi / (steps * dt)
+            rate = turn * round(self.heading_rate / turn) if loops else self.heading_rate
+            heading = self.heading + rate * times
         if heading is not None:
             _set_heading(table, heading, dt)
         return table[more : more + steps]
@@ -251,7 +260,17 @@ class Reference(Frozen):
                 angle = start + turns * base * dt * np.arange(length, dtype=np.float64)
                 _set_heading(table, angle, dt)
             pieces.append(table)
-        return Tracks(np.concatenate(pieces), length, True)
+        return _tracks(np.concatenate(pieces), length, True, dt)
+
+
+def _tracks(table: FloatArray, length: int, loops: bool, dt: float) -> Tracks:
+    """Return tables whose accelerations ahead are written, in place."""
+    pieces = table.reshape(-1, length, REFERENCE_SIZE)
+    later = np.arange(length) + round(AHEAD / dt)
+    pieces[..., -3:] = pieces[..., _ACCELERATION].take(
+        later, axis=1, mode="wrap" if loops else "clip"
+    )
+    return Tracks(table, length, loops)
 
 
 def _sum_of_sines(

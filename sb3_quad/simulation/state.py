@@ -43,6 +43,8 @@ def row_slices(sizes: Mapping[str, int]) -> dict[str, slice]:
     return {name: slice(start, start + sizes[name]) for name, start in starts.items()}
 
 
+AHEAD = 0.2  # s
+
 STATE = {
     "position": 3,
     "quaternion": 4,
@@ -55,12 +57,15 @@ STATE = {
     # Its cosine and sine; both zero where nothing is asked of the heading
     "target_heading": 2,
     "target_heading_rate": 1,
+    # The acceleration in AHEAD seconds, for experts; where nobody knows it, as now
+    "target_ahead": 3,
 }
 STATE_SIZE = sum(STATE.values())
 POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = [*row_slices(STATE).values()][:6]
 
 X = first_rows(STATE)
-# The rows that say where the vehicle should be: position, velocity, acceleration, heading, its rate
+# The rows that say where the vehicle should be: position, velocity, acceleration, heading, its
+# rate, and the acceleration ahead
 REFERENCE = slice(X.target, STATE_SIZE)
 
 WRENCH = {"force_world": 3, "force_body": 3, "torque_world": 3, "torque_body": 3}

@@ -11,7 +11,7 @@ A sweep's folder holds
 """
 
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import yaml
 from pydantic import ConfigDict, Field
@@ -25,7 +25,6 @@ from sb3_quad.sweep.spec import SweepSpec
 
 PLAN = "plan.json"
 RECORDS = "records"
-Numbers: TypeAlias = tuple[float | None, ...]
 
 
 class RunResult(Frozen):
@@ -43,7 +42,7 @@ class RunResult(Frozen):
     timesteps: int = 0
     seconds: float = 0.0
     """wall-clock time of the training; of a run that was resumed, since then"""
-    flights: dict[str, dict[str, Numbers]] = {}
+    flights: dict[str, dict[str, list[float | None]]] = {}
     """by scenario and measure, a number for each episode, the same episodes in every run: success
     and survival 0 or 1; reward the sum; final_error in m (NaN: crashed or out of range); time in s
     to the tightest tolerance, or, where it starts at its target, until stable (NaN: never)"""
@@ -53,7 +52,7 @@ class Sweep(Frozen):
     """A sweep with all that its files say; resuming does not read the settings files again."""
 
     spec: SweepSpec
-    runs: tuple[Run, ...] = Field(min_length=1)
+    runs: list[Run] = Field(min_length=1)
     suite: Suite | None = None
 
 

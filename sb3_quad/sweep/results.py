@@ -8,10 +8,8 @@ the Statistical Precipice, NeurIPS 2021): with one seed they cover the choice of
 """
 
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -25,7 +23,7 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation import metric_tables
-from sb3_quad.evaluation.learning_curves import Curve, read_curve
+from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.evaluation.metric_tables import estimate_cell
 from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
@@ -34,13 +32,13 @@ from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
 from sb3_quad.sweep.folder import RunResult, Sweep
 
-# By measure: its row, the factor from values to cells, and their decimals.
+# The rows of the measures.
 ROWS = {
-    "success": (metric_tables.SUCCESS, 100.0, 2),
-    "survival": (metric_tables.SURVIVAL, 100.0, 2),
-    "reward": (metric_tables.REWARD, 1.0, 2),
-    "final_error": (metric_tables.MEDIAN, 1.0, 3),
-    "time": (Row("mean time until there, or stable", "s"), 1.0, 2),
+    "success": metric_tables.SUCCESS,
+    "survival": metric_tables.SURVIVAL,
+    "reward": metric_tables.REWARD,
+    "final_error": metric_tables.MEDIAN,
+    "time": Row("mean time until there, or stable", "s"),
 }
 COMPARED = ("success", "reward")
 CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
@@ -88,7 +86,7 @@ def write_results(
     :return: means, intervals and comparisons of all runs that are finished, and their tables.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    lines: list[StrDict] = []
+    lines = []
     parts = {}
     summary = SweepResults(sweep=sweep.spec.name, runs=len(sweep.runs))
     # In the order of the plan, not in that in which runs ended.
@@ -144,7 +142,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     comparisons = []
     for scenario, group in flights.groupby(level="scenario", sort=False):
         rows = []
-        for measure, (row, factor, decimals) in ROWS.items():
+        for measure, row in ROWS.items():
             key = {"scenario": scenario, "measure": measure}
             statistic = np.nanmedian if measure == "final_error" else np.nanmean
             # Of each configuration a row for each run, a column for each episode.
@@ -156,8 +154,8 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
                     summary.estimates.append({**dict(mean), **key, "configuration": name})
             # No row for what the environment does not report.
             if any(means.values()):
-                cells = [estimate_cell(mean, factor, decimals) for mean in means.values()]
-                rows.append(replace(row, cells=cells))
+                cells = [estimate_cell(row, mean) for mean in means.values()]
+                rows.append(row._replace(cells=cells))
             if measure not in COMPARED:
                 continue
             for first, second in combinations(runs, 2):
@@ -167,10 +165,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
                 if difference is not None:
                     key |= {"first": first, "second": second, "verdict": verdict(difference)}
                     summary.comparisons.append({**dict(difference), **key})
-                    cells = [
-                        Cell(words=key["verdict"]),
-                        estimate_cell(difference, factor, decimals),
-                    ]
+                    cells = [Cell(words=key["verdict"]), estimate_cell(row, difference)]
                     comparisons.append(
                         Row(f"{scenario}, {row.heading}: {first} than {second}", cells=cells)
                     )
@@ -224,11 +219,10 @@ def verdict(difference: Estimate) -> str:
 
 def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) -> None:
     """Write the report of the finished runs: a section for each table, and the learning curves."""
-    parts: list[Section] = []
-    for table in tables:
-        parts.append(
-            Section(f"table-{len(parts)}", table.title, tables=[table], facts=table.caption)
-        )
+    parts = [
+        Section(f"table-{number}", table.title, tables=[table], facts=table.caption)
+        for number, table in enumerate(tables)
+    ]
     plots = _curves(folder, summary)
     if plots:
         parts.append(
@@ -246,7 +240,7 @@ def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
     """Plot the evaluations along the way; of pipelines, one plot for each algorithm and environment
     of a stage.
     """
-    curves: dict[str, dict[str, list[Curve]]] = defaultdict(lambda: defaultdict(list))
+    curves: StrDict = {}
     for name, seeds in summary.configurations.items():
         for seed in seeds:
             # Below it, a run folder is <algo>/<Env>_<number>; its stages have their own.
@@ -254,7 +248,8 @@ def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
             for path in sorted(place.glob("*/*/evaluations.npz")):
                 *_, algo, run, _ = path.parts
                 kind = f"{algo} {run.rpartition('_')[0]}"
-                curves[kind][name].append(read_curve(path.parent))
+                runs = curves.setdefault(kind, {}).setdefault(name, [])
+                runs.append(read_curve(path.parent))
     plots: list[Plot] = []
     for kind, groups in curves.items():
         # An environment of others may report neither success nor reward.

@@ -2,7 +2,6 @@
 agent.
 """
 
-from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from sb3_quad.base.files import kind_and_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.base.types import Report
+from sb3_quad.base.types import Report, StrDict
 from sb3_quad.controllers.statistics import STATISTICS, share_statistics
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
@@ -24,7 +23,7 @@ from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
 from sb3_quad.simulation.settings import KEY, FlightSettings
-from sb3_quad.sweep.folder import Numbers, RunResult, Sweep, read_results, write_result
+from sb3_quad.sweep.folder import RunResult, Sweep, read_results, write_result
 from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import Evaluation, SweepSpec
 from sb3_quad.training.config import TrainingJob
@@ -60,7 +59,7 @@ def execute(
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     results = read_results(folder)
-    calls: dict[Future[RunResult], Run] = {}
+    calls = {}
     # All runs are submitted at once; the executor starts as many as it has workers.
     for run in sweep.runs:
         # Files in the folder of a run name others, which must be found from anywhere.
@@ -146,16 +145,14 @@ def _train(run: Run, place: Path) -> PipelineResult:
         write_text(settings, yaml.safe_dump({stage.env: stage.settings}, sort_keys=False))
         stages.append(stage.model_copy(update={"conf_file": str(settings), "settings": {}}))
     return run_pipeline(
-        Pipeline(stages=tuple(stages)),
+        Pipeline(stages=stages),
         {**run.job, "seed": run.seed, "log_folder": str(place)},
         "pipeline",
         report,
     )
 
 
-def _fly(
-    agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluation
-) -> dict[str, dict[str, Numbers]]:
+def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluation) -> StrDict:
     """Return the numbers of an agent's flights, by scenario and measure."""
     model = load_model(agent)
     episodes = evaluation.episodes or EPISODES
@@ -171,7 +168,7 @@ def _fly(
         with closing(make_environments(config, 1, seed)) as env:
             share_statistics(getattr(model, STATISTICS, None), env)
             rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
-        return {config.env_id: {"reward": tuple(np.ravel(rewards).tolist())}}
+        return {config.env_id: {"reward": np.ravel(rewards).tolist()}}
     flights = {}
     # Without a suite, the episodes are those of the closing table of train.
     if suite is None:
@@ -186,7 +183,7 @@ def _fly(
     return flights
 
 
-def _numbers(flights: Flights) -> dict[str, Numbers]:
+def _numbers(flights: Flights) -> StrDict:
     """Return the measures of all episodes, NaN where there is no number."""
     # The time to the tightest tolerance.
     arrival = flights.time_to[min(flights.time_to)]

@@ -45,7 +45,7 @@ class Run(Frozen):
     seed: int
     job: StrDict
     """arguments of TrainingJob, less config, seed and log_folder"""
-    stages: tuple[Stage, ...]
+    stages: list[Stage]
     """of its pipeline, with all their settings; a single run is one of one stage"""
 
 
@@ -56,7 +56,7 @@ def make_runs(spec: SweepSpec) -> list[Run]:
         two runs of one name.
     """
     # Every configuration is checked before the first run starts.
-    runs: dict[str, Run] = {}
+    runs = {}
     for label, data in _cells(spec):
         configuration = validate(
             Configuration, data, f"configuration {label!r}" if label else "sweep"
@@ -74,7 +74,7 @@ def make_runs(spec: SweepSpec) -> list[Run]:
                 configuration=name,
                 seed=seed,
                 job=job,
-                stages=tuple(stages),
+                stages=stages,
             )
             if run.name in runs:
                 raise ConfigError(
@@ -106,7 +106,7 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[str, StrDict]]:
     for own in spec.configurations or ({},):
         for values in itertools.product(*spec.grid.values()):
             cell = dict(zip(spec.grid, values, strict=True))
-            data = spec.given
+            data = spec.given(Configuration)
             # The entries of mappings are merged, such as those of env_kwargs.
             for key, value in own.items():
                 if isinstance(value, dict) and isinstance(data.get(key), dict):
@@ -121,7 +121,7 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[str, StrDict]]:
 
 def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     """Return the job of a configuration's runs and their stages, with all settings."""
-    job = configuration.model_dump(include={*RunOptions.model_fields}, exclude_defaults=True)
+    job = configuration.given(RunOptions)
     # The agent that the training starts from, as a path that workers find.
     if configuration.trained_agent is not None:
         job["trained_agent"] = agent_path(configuration.trained_agent)
@@ -142,11 +142,8 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
 
 def _pipeline(configuration: Configuration) -> Pipeline:
     """Return the pipeline of a configuration; a single run is one of one stage."""
-    given = configuration.given
-    settings = {**configuration.hyperparams}
-    for name in SettingsOptions.model_fields:
-        if name in given:
-            settings[name] = given[name]
+    given = configuration.given(Configuration)
+    settings = configuration.hyperparams | configuration.given(SettingsOptions)
     # A vehicle is a keyword of the environment.
     if configuration.vehicle is not None:
         settings["env_kwargs"] = {**given.get("env_kwargs", {}), "vehicle": configuration.vehicle}
@@ -164,8 +161,9 @@ def _pipeline(configuration: Configuration) -> Pipeline:
         return with_settings(load_pipeline(file), settings)
     algo = configuration.algo or DEFAULT_ALGO
     env = configuration.env or DEFAULT_ENV
-    stage = Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings)
-    return Pipeline(stages=(stage,))
+    return Pipeline(
+        stages=[Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings)]
+    )
 
 
 def _in_words(varied: StrMapping) -> str:

@@ -38,10 +38,9 @@ class Configuration(SettingsOptions, RunOptions):
     vehicle: str | None = None
     """env_kwargs' vehicle, by name or YAML file"""
 
-    @property
-    def given(self) -> StrDict:
-        """The keys that have another value than their default."""
-        return self.model_dump(include={*Configuration.model_fields}, exclude_defaults=True)
+    def given(self, options: type[Frozen]) -> StrDict:
+        """Return the keys of some options that have another value than their default."""
+        return self.model_dump(include={*options.model_fields}, exclude_defaults=True)
 
 
 class Resources(Frozen):
@@ -58,7 +57,7 @@ class Evaluation(Frozen):
 
     suite: str | None = None
     """name or YAML file; without it, fresh episodes of both tasks"""
-    scenario: Annotated[tuple[str, ...], BeforeValidator(as_list)] = ()
+    scenario: Annotated[list[str], BeforeValidator(as_list)] = []
     """only these of the suite"""
     episodes: PositiveInt | None = None
     """of each scenario; without a suite 240"""
@@ -69,17 +68,17 @@ class Evaluation(Frozen):
 class SweepSpec(Configuration):
     """The keys of a sweep's file."""
 
-    seed: Annotated[tuple[Seed, ...], BeforeValidator(as_list)] = Field(default=(0,), min_length=1)
+    seed: Annotated[list[Seed], BeforeValidator(as_list)] = Field(default=[0], min_length=1)
     """one or a list"""
     grid: StrDict = {}
     """keys, each with a list of values"""
-    configurations: tuple[StrDict, ...] = ()
+    configurations: list[StrDict] = []
     """a list of keys and values each"""
     evaluation: Evaluation = Evaluation()
     """the episodes that the agents fly in the end"""
     resources: Resources = Resources()
     """the resources of a run"""
-    gym_packages: tuple[str, ...] = ()
+    gym_packages: list[str] = []
     """modules that register further environments"""
 
 

@@ -32,7 +32,7 @@ ALGORITHMS = {
     "sac": "stable_baselines3.sac.sac:SAC",
     "td3": "stable_baselines3.td3.td3:TD3",
 }
-BASES: dict[str, type] = {
+BASES = {
     "callback": BaseCallback,
     "env_wrapper": gymnasium.Wrapper,
     "vec_env_wrapper": VecEnvWrapper,

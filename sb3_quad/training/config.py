@@ -8,7 +8,7 @@ n-th part, which it has in the last of n updates.
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 import gymnasium
 from pydantic import (
@@ -49,28 +49,27 @@ from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
-VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
+VecEnvKind = Literal["batch", "dummy", "subproc"]
 NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 # For dummy and subproc. PyBullet allows about as many in a process.
 MAX_SINGLE = 1000
 
 
-Whole: TypeAlias = Annotated[
+Whole = Annotated[
     int,
     Field(lt=2**63),
     BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
 ]
-Keywords: TypeAlias = Annotated[
+Keywords = Annotated[
     StrDict, BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
 ]
-Classes: TypeAlias = Annotated[
+Classes = Annotated[
     list[tuple[str, StrDict]],
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
-Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
 # Units of the layers of all networks, or of each by name; the last form is that of older versions.
-Layers: TypeAlias = list[PositiveInt]
-NetArch: TypeAlias = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
+Layers = list[PositiveInt]
+NetArch = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
 
 
 class TrainingConfig(Frozen):
@@ -92,7 +91,7 @@ class TrainingConfig(Frozen):
     """keywords of the environment's constructor"""
     eval_env_kwargs: Keywords = {}
     """put over env_kwargs in the evaluation's environments"""
-    eval_tasks: Tasks = ()
+    eval_tasks: Annotated[list[str], BeforeValidator(as_list)] = []
     """more tasks to evaluate on; the job's own task decides which model is best"""
     best_by: Literal["success", "survival"] = "success"
     """the rate that decides which model is best"""
@@ -207,8 +206,11 @@ class TrainingConfig(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
         if self.task:
-            keywords = {**self.env_kwargs, **self.eval_env_kwargs}
-            refuse_unknown(f"keyword of {self.env_id}", keywords, FlightSettings.model_fields)
+            refuse_unknown(
+                f"keyword of {self.env_id}",
+                [*self.env_kwargs, *self.eval_env_kwargs],
+                FlightSettings.model_fields,
+            )
             # Evaluations fly with both; each of the two must fit.
             self.flight_settings.with_changes(**self.eval_env_kwargs)
             refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
@@ -290,9 +292,8 @@ class TrainingJob(JobOptions):
 def describe(job: TrainingJob) -> str:
     """Return one line about what is going to be trained, in whole rollouts as SB3 trains."""
     config = job.config
-    rollout = config.rollout
     # The last rollout is flown whole.
-    timesteps = -(-config.n_timesteps // rollout) * rollout
+    timesteps = -(-config.n_timesteps // config.rollout) * config.rollout
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
     if timesteps != config.n_timesteps:
         line += f" ({config.n_timesteps:,} were asked for)"

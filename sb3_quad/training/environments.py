@@ -3,9 +3,8 @@
 The learning problem is the same in all of them.
 """
 
-import importlib
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import gymnasium
 from gymnasium.wrappers import TimeLimit
@@ -14,13 +13,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.process import ignore_interrupts
-from sb3_quad.base.types import StrDict
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.algorithms import as_list, instance
 from sb3_quad.training.config import TrainingConfig
 
-Env: TypeAlias = gymnasium.Env[Any, Any]
+Env = gymnasium.Env[Any, Any]
 WORKER_ENDED = (
     "a worker process of the environments ended (its error, if it had time for one, is above; "
     "else out of memory?); vec_env dummy needs no worker processes"
@@ -49,7 +47,7 @@ class _Subproc(RowSeeds, SubprocVecEnv):
         super().close()
 
 
-SINGLE: StrDict = {"dummy": _Dummy, "subproc": _Subproc}
+SINGLE = {"dummy": _Dummy, "subproc": _Subproc}
 
 
 def make_environments(
@@ -81,7 +79,7 @@ def make_environments(
         else:
             # A worker process could not say that PyBullet is missing.
             if config.task:
-                importlib.import_module("sb3_quad.base.bullet")
+                from sb3_quad.base import bullet  # noqa: F401
             phases = n_envs if staggered else 1
             env = SINGLE[config.vec_env](
                 [partial(_make_row, config, row, phases) for row in range(n_envs)]

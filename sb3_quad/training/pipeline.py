@@ -4,10 +4,9 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -25,7 +24,6 @@ from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.config import (
     SETTINGS,
-    TrainingConfig,
     TrainingJob,
     describe,
     load_config,
@@ -41,7 +39,7 @@ STATUS_FILE = "pipeline.yml"
 class Requirement(Frozen):
     """The least that a stage must reach in its best evaluation before the next stage begins."""
 
-    success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
+    success_rate: float = Field(default=0.0, ge=0, le=1)
 
 
 class Stage(Frozen):
@@ -74,11 +72,11 @@ class Stage(Frozen):
 class Pipeline(Frozen):
     """The stages, in order."""
 
-    stages: tuple[Stage, ...] = Field(min_length=1)
+    stages: list[Stage] = Field(min_length=1)
 
     @field_validator("stages")
     @classmethod
-    def _different_names(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    def _different_names(cls, stages: list[Stage]) -> list[Stage]:
         names = [stage.name for stage in stages]
         if len({*names}) < len(names):
             raise ValueError(f"{', '.join(names)}: give each a name of its own")
@@ -90,7 +88,7 @@ class Status(Pipeline):
 
     job: StrDict
     """options of every job"""
-    runs: tuple[str, ...]
+    runs: list[str]
     """the run folders of the stages that have begun"""
 
 
@@ -108,8 +106,7 @@ class StageResult(NamedTuple):
     seconds: float
 
 
-@dataclass(frozen=True)
-class PipelineResult:
+class PipelineResult(NamedTuple):
     """How a pipeline ended.
 
     :param stages: the finished stages by name. After an interruption, some are missing and
@@ -151,7 +148,7 @@ def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
         # The pipeline may be resumed from another folder.
         settings = with_vehicle_paths(merged(stage.settings, changes, stage.name))
         stages.append(stage.model_copy(update={"settings": settings}))
-    return pipeline.model_copy(update={"stages": tuple(stages)})
+    return pipeline.model_copy(update={"stages": stages})
 
 
 def run_pipeline(
@@ -170,7 +167,7 @@ def run_pipeline(
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was
         missed.
     """
-    status = Status(stages=pipeline.stages, job=dict(job), runs=())
+    status = Status(stages=pipeline.stages, job=dict(job), runs=[])
     jobs = stage_jobs(pipeline, job)
     folder = claim_folder(Path(jobs[0].log_folder) / name, name)
     # The stages are written, too, since the settings file may change before a resume.
@@ -189,7 +186,19 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
             if stage.correct_offset:
-                _check_correction(config)
+                if not config.task:
+                    raise ConfigError(
+                        f"correct_offset: {config.env_id} is not an environment of this package"
+                    )
+                if config.env_wrapper or config.vec_env_wrappers:
+                    raise ConfigError(
+                        "correct_offset: flies without wrappers; remove them, and normalize"
+                    )
+                if config.flight_settings.size != OBSERVATION_SIZE:
+                    raise ConfigError(
+                        f"correct_offset is for agents that see the {OBSERVATION_SIZE} features "
+                        "alone"
+                    )
             if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
                 raise ConfigError("normalize: must be as in the stage before, whose agent it has")
         except ConfigError as error:
@@ -199,18 +208,6 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
-
-
-def _check_correction(config: TrainingConfig) -> None:
-    """Check that the offset of an agent with these settings can be corrected."""
-    if not config.task:
-        raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
-    if config.env_wrapper or config.vec_env_wrappers:
-        raise ConfigError("correct_offset: flies without wrappers; remove them, and normalize")
-    if config.flight_settings.size != OBSERVATION_SIZE:
-        raise ConfigError(
-            f"correct_offset is for agents that see the {OBSERVATION_SIZE} features alone"
-        )
 
 
 def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:
@@ -224,7 +221,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     status = validate(Status, content, where)
     jobs = stage_jobs(status, {**status.job, **changes})
     runs = list(status.runs)
-    results: dict[str, StageResult] = {}
+    results = {}
     agent = ""
 
     def note(number: int, run: RunFolder) -> None:
@@ -267,10 +264,23 @@ def _write_status(folder: Path, content: StrDict) -> None:
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
-    """Return the zip that a stage passes on, after the offset correction where it has one."""
+    """Return the zip that a stage passes on, after the offset correction where it has one.
+
+    :raises TrainingError: it misses what the stage requires.
+    """
     if stage.correct_offset and run.corrected_model.is_file():
         return run.corrected_model
-    agent = _passed_on(stage, run)
+    if run.evaluations.is_file():
+        rates = np.nan_to_num(read_curve(run.path).values("success"))
+        success = rates.max() if stage.pass_on == "best" else rates[-1]
+        if success < stage.require.success_rate:
+            raise TrainingError(
+                f"stage {stage.name!r}: success {success:.3f} "
+                f"misses what it requires ({stage.require}); its run is {run.path}"
+            )
+    agent = run.model
+    if stage.pass_on == "best" and run.best_model.is_file():
+        agent = run.best_model
     if not stage.correct_offset:
         return agent
     model = load_zip(job.config.algorithm, agent, device=job.device)
@@ -284,21 +294,3 @@ def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Pa
         f"{run.corrected_model}"
     )
     return run.corrected_model
-
-
-def _passed_on(stage: Stage, run: RunFolder) -> Path:
-    """Return the zip that a stage passes on, before the offset correction.
-
-    :raises TrainingError: it misses what the stage requires.
-    """
-    if run.evaluations.is_file():
-        rates = np.nan_to_num(read_curve(run.path).values("success"))
-        success = rates.max() if stage.pass_on == "best" else rates[-1]
-        if success < stage.require.success_rate:
-            raise TrainingError(
-                f"stage {stage.name!r}: success {success:.3f} "
-                f"misses what it requires ({stage.require}); its run is {run.path}"
-            )
-    if stage.pass_on == "best" and run.best_model.is_file():
-        return run.best_model
-    return run.model

@@ -107,15 +107,17 @@ class RunFolder:
         return read_yaml(self.config), read_yaml(self.arguments)
 
 
-def made_with() -> dict[str, str]:
+def made_with() -> StrDict:
     """Return the commit of the checkout and the versions of the packages that train a run.
 
     The commit has a mark where files differ from it.
     """
-    command = shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'")
     try:
         commit = subprocess.check_output(
-            command, cwd=Path(__file__).parent, text=True, stderr=subprocess.DEVNULL
+            shlex.split("git describe --always --abbrev=40 --exclude=* '--dirty= and changes'"),
+            cwd=Path(__file__).parent,
+            text=True,
+            stderr=subprocess.DEVNULL,
         )
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"

@@ -17,8 +17,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError, TrainingError
-from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
+from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
+from sb3_quad.base.files import read_arrays, write_arrays, write_bytes
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.types import Arrays, Report, StrDict
 from sb3_quad.controllers.statistics import STATISTICS, share_statistics
@@ -133,8 +133,7 @@ class SnapshotFile(BaseCallback):
         if not self._state:
             return ""
         write_bytes(self._run.model, self._state["model"].tobytes())
-        timesteps = int(self._state["timesteps"])
-        return f"; the model after {timesteps:,} timesteps is in {self._run.model}"
+        return f"; the model after {self._state['timesteps']:,} timesteps is in {self._run.model}"
 
 
 def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: Any) -> Any:
@@ -194,11 +193,10 @@ def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) 
     else:
         _require(not environment, f"{ENVIRONMENT}… is of environments of another kind")
     # The random numbers come last, since loading may sample.
-    try:
+    # A damaged text may raise anything.
+    with raised_as(ConfigError, "log, random or torch cannot be read"):
         LOG.validate_json(str(state["log"]))
         set_random_state(state)
-    except Exception as error:  # a damaged text may raise anything
-        raise ConfigError(f"log, random or torch cannot be read ({one_line(error)})") from None
     return model
 
 

@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import stable_baselines3
@@ -51,8 +51,7 @@ METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")
 OWN_TASK = ""  # the name of the evaluations on the task of the training
 
 
-@dataclass(frozen=True)
-class TrainingResult:
+class TrainingResult(NamedTuple):
     """How a run ended.
 
     :param seconds: wall-clock time of the training, evaluations included.
@@ -146,7 +145,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
     the former.
     """
     config = job.config
-    eval_envs: dict[str, VecEnv] = {}
+    eval_envs = {}
     with ExitStack() as stack:
         seed = seed_for("training", job.seed)
         env = stack.enter_context(
@@ -154,10 +153,8 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
         )
         if job.eval_episodes > 0:
             # The batched environment flies all episodes of an evaluation at once.
-            n_envs = job.n_eval_envs
-            if n_envs is None:
-                n_envs = job.eval_episodes if config.vec_env == "batch" else 1
-            n_envs = min(n_envs, job.eval_episodes)
+            most = job.eval_episodes if config.vec_env == "batch" else 1
+            n_envs = min(job.n_eval_envs or most, job.eval_episodes)
             seed = seed_for("evaluation", job.seed)
             for task in (OWN_TASK, *config.eval_tasks):
                 eval_config = job.for_evaluation(**({"task": task} if task else {}))
@@ -194,8 +191,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     model = _construct(config, env, keywords)
     # An expert that fails does so before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
-        observation: Any = env.reset()
-        Controller.for_env(keywords.get("expert"), env).labels(observation)
+        Controller.for_env(keywords.get("expert"), env).labels(env.reset())
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):
@@ -283,11 +279,10 @@ class _Training:
 
     def run_to_end(self) -> TrainingResult:
         """Train until the job is done, or a signal or an error ends it, and save the model."""
-        config = self.job.config
         statistics = self.model.get_vec_normalize_env()
         setattr(self.model, STATISTICS, statistics)
         # A zip says how its agent flies, but a flight cannot have the user's wrappers.
-        if config.task and flight_settings_of(self.model.get_env()) is not None:
+        if self.job.config.task and flight_settings_of(self.model.get_env()) is not None:
             self.job.flight_settings.write_into(self.model)
         self.run.error.unlink(missing_ok=True)
         start = time.perf_counter()

@@ -26,41 +26,37 @@ def write_results(search: Search) -> None:
     # The table is written after each trial, so that an interruption loses none.
     columns = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds"]
     columns += [*search.space.dimensions, RUN, ERROR]
+    rows = []
+    for trial in search.trials():
+        row: StrDict = {
+            **trial.user_attrs,
+            **search.space.values(trial.params),
+            "number": trial.number,
+            "state": trial.state.name,
+            "evaluations": len(trial.intermediate_values),
+        }
+        if trial.duration is not None:
+            row["seconds"] = round(trial.duration.total_seconds(), 2)
+        if trial.state == TrialState.COMPLETE:
+            row["value"] = trial.value
+        if trial.state == TrialState.FAIL:
+            # A process that was killed could not write down why its trial ended.
+            row.setdefault(ERROR, INTERRUPTED)
+        rows.append(row)
     # A cell is empty where its row lacks the key. Keys without a column are ignored.
-    table = pd.DataFrame(
-        [_row(search, trial) for trial in search.trials()], columns=columns, dtype=object
-    )
+    table = pd.DataFrame(rows, columns=columns, dtype=object)
     write_text(folder / TRIALS, table.to_csv(index=False))
     best = search.best
     if best is None:
         return
     config = search.config(best)
-    # The best settings say where they come from, in comments that train skips.
     settings = yaml.safe_dump({config.env_id: config.settings}, sort_keys=False)
-    origin = (
+    # The best settings say where they come from, in comments that train skips.
+    write_text(
+        folder / BEST,
         f"# Found by sb3-quad tune: trial {best.number} of study {search.name}, "
-        f"{in_words(search, best)}.\n# {train_command(search)}\n"
+        f"{in_words(search, best)}.\n# {train_command(search)}\n{settings}",
     )
-    write_text(folder / BEST, origin + settings)
-
-
-def _row(search: Search, trial: FrozenTrial) -> StrDict:
-    """The line of a trial in the table of all trials."""
-    row: StrDict = {
-        **trial.user_attrs,
-        **search.space.values(trial.params),
-        "number": trial.number,
-        "state": trial.state.name,
-        "evaluations": len(trial.intermediate_values),
-    }
-    if trial.duration is not None:
-        row["seconds"] = round(trial.duration.total_seconds(), 2)
-    if trial.state == TrialState.COMPLETE:
-        row["value"] = trial.value
-    if trial.state == TrialState.FAIL:
-        # A process that was killed could not write down why its trial ended.
-        row.setdefault(ERROR, INTERRUPTED)
-    return row
 
 
 def in_words(search: Search, trial: FrozenTrial) -> str:

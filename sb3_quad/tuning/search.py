@@ -185,12 +185,8 @@ class Search:
         config = self.config(trial)
         # A training ends with a whole rollout.
         total = math.ceil(config.n_timesteps / config.rollout) * config.rollout
-        changes = {
-            "config": config,
-            "eval_freq": math.ceil(total / self.n_evaluations),
-            "snapshot_every": 0,
-        }
-        values: list[float] = []
+        every = math.ceil(total / self.n_evaluations)
+        values = []
 
         def should_continue(success: float, reward: float) -> bool:
             if config.task is None:
@@ -203,7 +199,7 @@ class Search:
             return len(values) >= self.n_evaluations or not trial.should_prune()
 
         result = train(
-            self.job.model_copy(update=changes),
+            self.job.model_copy(update={"config": config, "eval_freq": every, "snapshot_every": 0}),
             report=lambda line: None,
             on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
             should_continue=should_continue,
@@ -276,23 +272,20 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
     backend: Any = str(storage)
     try:
         if "://" not in backend:
-            backend = _open_journal(Path(storage))
+            path = Path(storage)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Optuna would ignore a cut line, and append the next one to it.
+            if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):
+                raise ConfigError(
+                    "the last line is cut, as by a full disk, or it is no journal; remove that line"
+                )
+            # Optuna's other lock needs symbolic links, which Windows reserves for administrators.
+            backend = JournalStorage(JournalFileBackend(backend, JournalFileOpenLock(backend)))
         return optuna.create_study(
             study_name=name, storage=backend, direction="maximize", load_if_exists=True
         )
     except Exception as error:  # databases and damaged journals raise anything
         raise ConfigError(f"storage {storage}: cannot be used ({kind_and_line(error)})") from None
-
-
-def _open_journal(path: Path) -> JournalStorage:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Optuna would ignore a cut line, and append the next one to it.
-    if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):
-        raise ConfigError(
-            "the last line is cut, as by a full disk, or it is no journal; remove that line"
-        )
-    # Optuna's other lock needs symbolic links, which Windows reserves for administrators.
-    return JournalStorage(JournalFileBackend(str(path), JournalFileOpenLock(str(path))))
 
 
 def retry_dead_trials(study: optuna.Study) -> None:

@@ -9,8 +9,7 @@ whole numbers, others get four significant digits.
 
 import json
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from optuna.distributions import (
     BaseDistribution,
@@ -57,8 +56,7 @@ class Factor(Frozen):
     around: float = Field(gt=1)
 
 
-@dataclass(frozen=True)
-class SearchSpace:
+class SearchSpace(NamedTuple):
     """The settings that are varied, by name, and those that stay.
 
     :param config: the settings that a search starts from.
@@ -71,7 +69,7 @@ class SearchSpace:
 
     def values(self, parameters: StrMapping) -> StrDict:
         """Return the values of the varied settings that some parameters stand for."""
-        values: StrDict = {}
+        values = {}
         for name, parameter in parameters.items():
             values[name] = parameter
             if isinstance(parameter, str) and parameter[:1] in ("[", "{"):
@@ -101,7 +99,7 @@ class SearchSpace:
         """Return the parameters that stand for the settings as they are; None if one of these lies
         outside the space.
         """
-        start: StrDict = {}
+        start = {}
         for name, dimension in self.dimensions.items():
             value = _current(self.config, name)
             is_list = isinstance(dimension, CategoricalDistribution)
@@ -172,30 +170,26 @@ def _dimension(config: TrainingConfig, name: str, values: Any, where: str) -> Ba
     parameter = constructor_parameters(config.algorithm).get(name)
     whole = name in (MINIBATCHES, "n_envs") or (parameter is not None and takes_whole(parameter))
     if "around" in values:
-        values = _around(_current(config, name), values, whole, where)
+        around = validate(Factor, values, where).around
+        value = _current(config, name)
+        middle = _number_of(value)
+        if middle is None or middle <= 0:
+            raise ConfigError(
+                f"{where}: around needs a number above 0 in the settings, not {value!r}; "
+                "give low and high"
+            )
+        low = middle / around
+        high = middle * around
+        if whole:
+            low = max(1, math.floor(low))
+            high = math.ceil(high)
+        values = {"low": low, "high": high, "log": True}
     # The fields of an interval are the arguments of Optuna's distributions.
     interval = validate(WholeInterval if whole else Interval, values, where)
     try:
         return (IntDistribution if whole else FloatDistribution)(**dict(interval))
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
-
-
-def _around(value: Any, factor: Any, whole: bool, where: str) -> StrDict:
-    """Return the bounds of ``around``, from the setting's present value."""
-    around = validate(Factor, factor, where).around
-    middle = _number_of(value)
-    if middle is None or middle <= 0:
-        raise ConfigError(
-            f"{where}: around needs a number above 0 in the settings, not {value!r}; "
-            "give low and high"
-        )
-    low = middle / around
-    high = middle * around
-    if whole:
-        low = max(1, math.floor(low))
-        high = math.ceil(high)
-    return {"low": low, "high": high, "log": True}
 
 
 def _entries(value: Any) -> StrDict:

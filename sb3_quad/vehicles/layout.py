@@ -51,7 +51,7 @@ def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
     # Places in the plane as complex numbers: a turn is a factor.
     places = np.dot(own.rotor_positions, (1.0, 1.0j))
     goals = np.dot(other.rotor_positions, (1.0, 1.0j))
-    fits: dict[Turn, float] = {}
+    fits = {}
     for order in itertools.permutations(range(4)):
         if tuple(own.rotor_directions[k] for k in order) != other.rotor_directions:
             continue

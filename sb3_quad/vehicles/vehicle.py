@@ -151,9 +151,9 @@ class Vehicle(Frozen):
         # Eq. 2.4.
         if name == "rotor_speed_limits":
             thrusts = self.thrust_coefficient * thrusts**2
-        limits = tuple((thrusts / self.hover_thrust).tolist())
+        limits = (thrusts / self.hover_thrust).tolist()
         # The model is frozen, but not yet handed out.
-        vars(self).update({"thrust_limits": limits, name: None})
+        vars(self).update({"thrust_limits": tuple(limits), name: None})
         return self
 
     @model_validator(mode="after")
@@ -353,22 +353,23 @@ class Vehicle(Frozen):
 
     def parameters(self) -> FloatArray:
         """Return what the compiled kernel needs, in the order of ``PARAMETER_NAMES``, (names,)."""
-        values = [
-            self.mass,
-            *self.inertia,
-            self.thrust_coefficient,
-            self.motor_gain_up,
-            self.motor_gain_down,
-            self.motor_integration == "exact",
-            self.gravity,
-            *self.drag,
-            self.hover_thrust,
-            *self._middle_and_half,
-            self.collision_radius,
-            self.delay,
-            *self.mixer[1:].flat,
-        ]
-        return np.array(values, dtype=np.float64)
+        return np.array(
+            [
+                self.mass,
+                *self.inertia,
+                self.thrust_coefficient,
+                self.motor_gain_up,
+                self.motor_gain_down,
+                self.motor_integration == "exact",
+                self.gravity,
+                *self.drag,
+                self.hover_thrust,
+                *self._middle_and_half,
+                self.collision_radius,
+                self.delay,
+                *self.mixer[1:].flat,
+            ]
+        )
 
 
 VehicleSource = StrPath | Vehicle

@@ -71,8 +71,8 @@ FLAGS: Flags = {
 def run(options: Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if the vehicle cannot hover."""
     from sb3_quad.base.seeds import seed_for
-    from sb3_quad.cli.closing import print_tables
     from sb3_quad.cli.output import console
+    from sb3_quad.evaluation.compare import compare
     from sb3_quad.evaluation.tables import text_table
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
@@ -100,11 +100,9 @@ def run(options: Namespace) -> int:
             "PID": PIDExpert(vehicle),
             f"geometric, gains {gains}": GeometricExpert(vehicle),
         }
-        print_tables(
-            controllers,
-            {"vehicle": vehicle, "noise": 0.0},
-            options.episodes,
-            seed_for("expert", options.seed),
+        seed = seed_for("expert", options.seed)
+        console().print(
+            compare(controllers, n_flights=options.episodes, seed=seed, vehicle=vehicle, noise=0.0)
         )
         if derived:
             print(

@@ -32,7 +32,6 @@ from sb3_quad.cli.parser import (
 FLAGS: Flags = {
     "agents CONTROLLER": (
         {"nargs": "*"},
-        None,
         "controllers to show (pid, geometric, and agents of the package)",
     ),
     "-o --output FILE": (str, "demo.html", "page to write (demo.html)"),

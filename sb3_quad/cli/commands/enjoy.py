@@ -13,6 +13,8 @@ examples:
   # a scenario as poses in one picture, and another one in slow motion
   sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
   sb3-quad enjoy agent.zip --scenario thesis:side_hit -o hit.mp4 --speed 0.5
+  # along a curve, drawn in green
+  sb3-quad enjoy itm-robust --reference figure_eight -o eight.mp4
   # your own vehicle without noise, printed only
   sb3-quad enjoy geometric --vehicle my_vehicle.yaml --env-kwargs noise:0 \
     -n 3000 --no-render
@@ -24,8 +26,6 @@ agent (vehicle, task and observation) hold for all, unless you give --env,
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-import io
-import itertools
 import sys
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Sequence
@@ -33,7 +33,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.files import refuse_existing, write_bytes
+from sb3_quad.base.files import refuse_existing, replacing
+from sb3_quad.base.literals import parse_value
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     OVERWRITE,
@@ -73,21 +74,9 @@ FLAGS: Flags = {
     "-f --folder --log-folder DIR": (str, "logs", "folder that holds the run folders (logs)"),
     "--exp-id N": (whole, 0, "number of the run (0: the latest one that has an agent)"),
     "agent": {
-        "--load-best": (
-            {"dest": "which", "action": "store_const", "const": "best"},
-            None,
-            "fly the best agent of the evaluations",
-        ),
-        "--load-checkpoint N": (
-            {"dest": "which", "type": whole},
-            None,
-            "fly the checkpoint after N timesteps",
-        ),
-        "--load-last-checkpoint": (
-            {"dest": "which", "action": "store_const", "const": "last"},
-            None,
-            "fly the last checkpoint",
-        ),
+        "--load-best": (SWITCH, "fly the best agent of the evaluations"),
+        "--load-checkpoint N": (whole, "fly the checkpoint after N timesteps"),
+        "--load-last-checkpoint": (SWITCH, "fly the last checkpoint"),
     },
     "episode": {
         "--env": f"environment id ({DEFAULT_ENV})",
@@ -95,17 +84,15 @@ FLAGS: Flags = {
         "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
     },
     "actions": {
-        "--deterministic": (SWITCH, False, "fly the mean of a policy's actions (default)"),
-        "--stochastic": (SWITCH, False, "sample a policy's actions"),
+        "--deterministic": (SWITCH, "fly the mean of a policy's actions (default)"),
+        "--stochastic": (SWITCH, "sample a policy's actions"),
     },
     "controllers CONTROLLER": (
         {"nargs": "*"},
-        None,
         "controllers to fly, in addition to the agent of --algo",
     ),
     "-n --n-timesteps N": (
         positive,
-        None,
         "control steps, in as many episodes as needed (one episode)",
     ),
     "--n-envs N": (positive, 1, "number of parallel episodes, with consecutive seeds (1)"),
@@ -114,16 +101,20 @@ FLAGS: Flags = {
     "--vehicle": "vehicle, by name or YAML file (the scenario's, else the first agent's own)",
     "--target": (
         {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")},
-        None,
         "target to fly to, m",
     ),
-    "--no-render": (SWITCH, False, "only fly and print the results"),
+    "--reference X": (
+        parse_value,
+        "what the target does: a curve such as figure_eight, fields such as "
+        "dict(curve='circle',speed=3), or the path of a .csv file",
+    ),
+    "--no-render": (SWITCH, "only fly and print the results"),
     "-o --output FILE": (
         SEVERAL,
         [],
         "write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
     ),
-    "--size WxH": (_size, None, "size of one controller's panel, pixels"),
+    "--size WxH": (_size, "size of one controller's panel, pixels"),
     "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
     **TRUST,
     **OVERWRITE,
@@ -165,9 +156,9 @@ def run(options: Namespace) -> int:
     size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
         if _is_picture(file):
-            picture = io.BytesIO()
-            Image.fromarray(sequence(episodes[0], *size)).save(picture, format="png", optimize=True)
-            write_bytes(file, picture.getvalue())
+            picture = Image.fromarray(sequence(episodes[0], *size))
+            with replacing(file) as stream:
+                picture.save(stream, format="png", optimize=True)
             print(f"saved {file}")
         else:
             _write_film(file, episodes, size, options)
@@ -228,8 +219,10 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
         setting = fixed_setting(_flight_settings(options, first), options.target)
-    elif options.env_kwargs or options.target:
-        raise ConfigError("--scenario describes a whole flight; remove --env-kwargs and --target")
+    elif options.env_kwargs or options.target or options.reference:
+        raise ConfigError(
+            "--scenario describes a whole flight; remove --env-kwargs, --target and --reference"
+        )
     else:
         setting = scenario_setting(options.scenario, first and first.vehicle, options.vehicle)
     controllers = {}
@@ -254,7 +247,7 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
 
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)
-    changes: StrDict = {}
+    changes = {}
     # With --algo, --env names the environment of the run rather than the task.
     task = options.task or (options.env and not options.algo and env_task)
     if task and task != settings.task:
@@ -262,6 +255,8 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
         changes = {"task": task, "task_kwargs": None}
     if options.vehicle:
         changes["vehicle"] = options.vehicle
+    if options.reference:
+        changes["reference"] = options.reference
     return settings.with_changes(**changes | options.env_kwargs)
 
 
@@ -278,12 +273,12 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
         # Raises if there is no such algorithm.
         get_algorithm(options.algo)
     run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
-    if options.which == "last":
+    if options.load_last_checkpoint:
         path = run.latest_checkpoint()
-    elif options.which == "best":
+    elif options.load_best:
         path = run.best_model
-    elif options.which is not None:
-        path = run.checkpoint(options.which)
+    elif options.load_checkpoint is not None:
+        path = run.checkpoint(options.load_checkpoint)
     else:
         path = run.result
     if not path.is_file():
@@ -301,10 +296,12 @@ def _write_film(
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
 
     def frames() -> Iterator[Any]:
-        films = (film_frames(episode, *size, options.speed) for episode in episodes)
-        for done, frame in enumerate(itertools.chain.from_iterable(films), 1):
-            yield frame
-            show(done, total, "frames")
+        done = 0
+        for episode in episodes:
+            for frame in film_frames(episode, *size, options.speed):
+                yield frame
+                done += 1
+                show(done, total, "frames")
 
     with progress_bar(options.progress) as show:
         write_film(Path(file), frames())

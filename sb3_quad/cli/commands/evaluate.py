@@ -47,6 +47,7 @@ from sb3_quad.cli.parser import (
     TRUST,
     YES_OR_NO,
     Flags,
+    given,
     whole,
 )
 
@@ -54,20 +55,21 @@ DEFAULT_FOLDER = "evaluations"
 
 
 FLAGS: Flags = {
-    "controllers CONTROLLER": (SEVERAL, None, "controllers to fly, see below"),
+    "controllers CONTROLLER": (SEVERAL, "controllers to fly, see below"),
     "--suite": (
         str,
         "thesis",
-        "suite of scenarios: thesis (default), robustness, wind, quadcopters, quick or a file",
+        "suite of scenarios: thesis (default), robustness, wind, quadcopters, trajectories, quick "
+        "or a file",
     ),
     "-o --output FOLDER": f"folder for the results ({DEFAULT_FOLDER}/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
-    "--episodes N": (whole, None, "episodes of each scenario (the suite's number)"),
-    "--seed N": (whole, None, "seed of each scenario (the suite's seed)"),
+    "--episodes N": (whole, "episodes of each scenario (the suite's number)"),
+    "--seed N": (whole, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
     "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
     "--workers N": (whole, 1, "number of parallel processes (1)"),
-    "--overwrite": (SWITCH, False, "remove the results that the folder holds"),
+    "--overwrite": (SWITCH, "remove the results that the folder holds"),
     "--reward MODULE:FUNCTION": (
         "show the mean of a reward of your own, function(state, actions) per control step"
     ),
@@ -99,14 +101,9 @@ def run(options: Namespace) -> int:
             suite,
             controllers,
             folder,
-            options.backend,
-            options.workers,
-            options.overwrite,
             progress=show,
             report=warn,
-            executor=options.executor,
-            address=options.address,
-            reward=options.reward,
+            **given(options, "backend", "workers", "overwrite", "executor", "address", "reward"),
         )
     # The folder may hold the results of further controllers, from an earlier command.
     flown = {entry.controller for entry in results.entries}
@@ -114,7 +111,7 @@ def run(options: Namespace) -> int:
     columns = [label for label in labels if label in flown]
     if columns:
         console().print(
-            overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), columns)
+            overview(results.model_copy(update={"scenarios": suite.scenarios}), columns)
         )
     if flown:
         print(

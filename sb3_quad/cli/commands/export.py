@@ -39,14 +39,12 @@ FACTS = ("vehicle", "scaling", "network", "observation", "state", "result", "rot
 FLAGS: Flags = {
     "model MODEL": (
         agent_path,
-        None,
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     ),
-    "--format": ({"required": True}, None, "onnx, torchscript or c"),
+    "--format": ({"required": True}, "onnx, torchscript or c"),
     "-o FILE": (
         {"dest": "file"},
-        None,
         "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
     ),
     "--output KIND": (

@@ -20,7 +20,6 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     OVERWRITE,
     SEVERAL,
@@ -45,7 +44,6 @@ def _line(text: str) -> tuple[str, dict[str, float]]:
 FLAGS: Flags = {
     "groups RUN": (
         SEVERAL,
-        None,
         "run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
     ),
     "--line NAME:SUCCESS:REWARD": (
@@ -55,7 +53,6 @@ FLAGS: Flags = {
     ),
     "--thesis TASK": (
         {"choices": [*THESIS_SCENARIOS]},
-        None,
         f"draw the thesis's results for {' or '.join(THESIS_SCENARIOS)} as horizontal lines",
     ),
     "--show PANEL": (
@@ -77,7 +74,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.report.curves import plot_curves
     from sb3_quad.report.plots import picture
 
-    groups: StrDict = {}
+    groups = {}
     for text in options.groups:
         name, folders = _group(text)
         if name in groups:
@@ -89,8 +86,8 @@ def run(options: Namespace) -> int:
     lines = {}
     if options.thesis:  # its success is our survival
         scenario = load_suite("thesis").scenario(THESIS_SCENARIOS[options.thesis])
-        for name, reference in scenario.reference.items():
-            lines[f"thesis: {name}"] = reference.model_dump(
+        for name, published in scenario.published.items():
+            lines[f"thesis: {name}"] = published.model_dump(
                 include={"survival", "reward"}, exclude_none=True
             )
     show = options.show

@@ -47,23 +47,21 @@ from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 FLAGS: Flags = {
     "sweep SWEEP": (
         {"nargs": "?"},
-        None,
         "YAML file, or the name of a sweep of the package; the flags below replace its keys",
     ),
-    "--seed N": ({"nargs": "+", "type": seed}, None, "seeds of each configuration (0)"),
+    "--seed N": ({"nargs": "+", "type": seed}, "seeds of each configuration (0)"),
     "-conf --conf-file FILE": (
         SEVERAL,
-        None,
         "settings files, of single runs or pipelines (two_stage.yml)",
     ),
-    "--algo": (SEVERAL, None, "algorithms of single runs (dagger)"),
+    "--algo": (SEVERAL, "algorithms of single runs (dagger)"),
     "--env": "environment id of single runs (QuadTargetTracking-v0)",
-    "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
+    "-params --hyperparams": (PAIRS, "settings to change, such as n_steps:500"),
     "--suite": "suite for the comparison (240 fresh episodes of each task)",
-    "--episodes N": (positive, None, "episodes of each scenario in the comparison"),
-    "--gym-packages MODULE": (SEVERAL, None, "modules that register further environments"),
-    "--workers N": (positive, None, "number of parallel runs (one per core)"),
-    "--dry-run": (SWITCH, False, "list the runs and train nothing"),
+    "--episodes N": (positive, "episodes of each scenario in the comparison"),
+    "--gym-packages MODULE": (SEVERAL, "modules that register further environments"),
+    "--workers N": (positive, "number of parallel runs (one per core)"),
+    "--dry-run": (SWITCH, "list the runs and train nothing"),
     "--resume FOLDER": "continue the sweep in its folder",
     **EXECUTOR,
     **TRUST,
@@ -90,7 +88,7 @@ def run(options: Namespace) -> int:
         return _execute(options, read_sweep(folder), folder)
     spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
-    sweep = Sweep(spec=spec, runs=tuple(make_runs(spec)), suite=suite_of(spec))
+    sweep = Sweep(spec=spec, runs=make_runs(spec), suite=suite_of(spec))
     if not options.dry_run:
         return _execute(options, sweep, None)
     for planned in sweep.runs:

@@ -86,8 +86,8 @@ SETTINGS_FLAGS: Flags = {
         "settings: a YAML file, or one of the package, such as thesis/dagger.yml "
         "(ALGO.yml: undisturbed, PID expert)"
     ),
-    "-params --hyperparams": (PAIRS, None, "settings to change, such as n_steps:500"),
-    "--num-threads N": (positive, None, "threads (the cores; one where PyTorch computes)"),
+    "-params --hyperparams": (PAIRS, "settings to change, such as n_steps:500"),
+    "--num-threads N": (positive, "threads (the cores; one where PyTorch computes)"),
     "--gym-packages MODULE": (SEVERAL, [], "modules that register further environments"),
     **TRUST,
     **PROGRESS,
@@ -97,11 +97,11 @@ SETTINGS_FLAGS: Flags = {
 # The flags of rl-zoo's ``train.py``, with their meanings.
 FLAGS: Flags = {
     **SETTINGS_FLAGS,
-    "--thesis": (SWITCH, False, f"the thesis's method: --conf-file {THESIS}"),
+    "--thesis": (SWITCH, f"the thesis's method: --conf-file {THESIS}"),
     "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
     **field_flags(JobOptions),
     # These replace what the fields say.
-    "--seed N": (seed, None, "seed (0); negative: a random one, recorded in args.yml"),
+    "--seed N": (seed, "seed (0); negative: a random one, recorded in args.yml"),
     **PROGRESS,
 }
 
@@ -132,8 +132,9 @@ def run(options: Namespace) -> int:
             "{} goes with a single run (--algo, --env); "
             f"a pipeline's stages have their own in {options.conf_file}",
         )
-        stages = pipeline.load_pipeline(options.conf_file)
-        stages = pipeline.with_settings(stages, changed_settings(options))
+        stages = pipeline.with_settings(
+            pipeline.load_pipeline(options.conf_file), changed_settings(options)
+        )
         result = pipeline.run_pipeline(stages, job, Path(options.conf_file).stem)
     else:
         checked = validate(TrainingJob, {"config": make_config(options), **job}, "command line")
@@ -185,8 +186,7 @@ def make_config(options: Namespace) -> Any:
     config = load_config(algo, env, options.conf_file, changes)
     # A file of settings takes precedence over those of the agent.
     if options.trained_agent is not None and options.conf_file is None:
-        changes = as_agent(options.trained_agent, config, changes)
-        config = load_config(algo, env, None, changes)
+        return load_config(algo, env, None, as_agent(options.trained_agent, config, changes))
     return config
 
 

@@ -48,7 +48,6 @@ FLAGS: Flags = {
     "--n-trials N": (natural, 500, "trials of this process; 0 only writes the results (500)"),
     "--max-total-trials N": (
         positive,
-        None,
         "trials of the whole study, without failed ones (no limit)",
     ),
     "--sampler NAME": (
@@ -67,8 +66,8 @@ FLAGS: Flags = {
     "--study-name NAME": "name of the study in the storage (ALGO_ENV)",
     "--search-space FILE": "YAML file of settings to vary (the package's file for the algorithm)",
     "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
-    "--seed N": (seed, None, "seed of trainings and sampler, negative for a random one (0)"),
-    "--eval-episodes N": (positive, None, "episodes per evaluation (batch: 240, else 48)"),
+    "--seed N": (seed, "seed of trainings and sampler, negative for a random one (0)"),
+    "--eval-episodes N": (positive, "episodes per evaluation (batch: 240, else 48)"),
 }
 
 

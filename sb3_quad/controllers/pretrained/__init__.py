@@ -8,7 +8,7 @@ writes both.
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import refuse_unknown
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -33,8 +33,7 @@ def pretrained(name: str) -> Path:
 
     :raises ConfigError: an unknown name.
     """
-    if name not in pretrained_names():
-        raise ConfigError(unknown("pretrained policy", name, pretrained_names()))
+    refuse_unknown("pretrained policy", [name], pretrained_names())
     return FOLDER / f"{name}.zip"
 
 

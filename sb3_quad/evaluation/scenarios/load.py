@@ -38,6 +38,7 @@ UNITS = {
     "torque_to_inertia": "rad/s²",
     "motor_time_constant": "s",
     "noise": "relative std",
+    "speed": "m/s",
     "gusts": "std, N",
     "wind": "m/s",
     "wind_gusts": "std, m/s",
@@ -73,15 +74,19 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         raise ConfigError(
             f"{where}: must hold 'name' and a list 'scenarios', each with keys and values"
         )
-    scenarios: list[Scenario] = []
+    scenarios = []
     for number, entry in enumerate(entries):
         place = f"{where}: scenario {entry.get('name', number)}"
         vehicle = entry.get("vehicle")
         if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
             entry["vehicle"] = str(folder / vehicle)
+        reference = entry.get("reference")
+        if str(reference).endswith(".csv"):
+            reference = {"curve": "file", "file": reference}
+        if isinstance(reference, dict) and "file" in reference:
+            entry["reference"] = {**reference, "file": folder / str(reference["file"])}
         # A cell of a grid is a scenario like any other.
-        for cell in grid(entry, place):
-            scenarios.append(validate(Scenario, cell, place))
+        scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)
 
 

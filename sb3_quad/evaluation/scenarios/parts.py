@@ -34,10 +34,8 @@ class OneOf(Frozen):
     def _exactly_one(self) -> "OneOf":
         given = [name for name in self.ways if getattr(self, name) is not None]
         if len(given) != 1:
-            message = f"give exactly one of {', '.join(self.ways)}"
-            if given:
-                message += f", not {' and '.join(given)}"
-            raise ValueError(message)
+            found = " and ".join(given) or "none"
+            raise ValueError(f"give exactly one of {', '.join(self.ways)}, not {found}")
         return self
 
 
@@ -70,7 +68,7 @@ class Attitude(OneOf):
 
     quaternion: Quaternion | None = None
     """w, x, y, z, body to world; is normalised"""
-    tilt: Annotated[float, Field(ge=0, le=180)] | None = None
+    tilt: float | None = Field(default=None, ge=0, le=180)
     """angle between body z and world z, deg; about a random horizontal axis"""
     distribution: Literal["uniform"] | None = None
     """uniform on SO(3), as in state recovery"""
@@ -183,7 +181,7 @@ class VehicleChanges(Frozen):
     """factor of Ixx, Iyy and Izz, or one for each"""
     motor_gain: Factor = 1.0
     """is a factor of k_m (Eq. 4.1): 1.3 is 30 % more"""
-    delay: Annotated[int, Field(ge=0, le=100)] | None = None
+    delay: int | None = Field(default=None, ge=0, le=100)
     """control steps from a command to its effect; default: the vehicle's own"""
 
     def apply(self, vehicle: Vehicle) -> Vehicle:

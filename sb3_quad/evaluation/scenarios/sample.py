@@ -58,8 +58,7 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     wrenches = sample_wrenches(
         scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators
     )
-    waypoints = np.array(target.waypoints or ()).reshape(-1, 3)
-    return Plan(start, wrenches, waypoints, target.radius)
+    return Plan(start, wrenches, np.array(target.waypoints or ()).reshape(-1, 3), target.radius)
 
 
 def sample_wrenches(

@@ -4,17 +4,24 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
-from operator import attrgetter
 from typing import Annotated, Any
 
-from pydantic import Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PositiveFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.errors import refuse_unknown
+from sb3_quad.base.seeds import Seed, row_seeds, seed_for
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.references import Reference
 from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
@@ -29,7 +36,7 @@ Printed = float | tuple[float, float] | None  # None: not known
 _by_name = cache(load_vehicle)
 
 
-class Reference(Frozen):
+class Published(Frozen):
     """Metrics that others measured, printed next to our own; a pair is a range."""
 
     success: Printed = None
@@ -68,11 +75,14 @@ class Scenario(Frozen):
     """where an episode starts; default: hovering at (0, 0, 15) m"""
     target: Target = Target(distance=0.0)
     """where to fly; default: to the start"""
+    reference: Reference | None = None
+    """what the target does from there on: a curve's name, the path of a CSV file (relative to the
+    suite's) or fields of Reference; default: it rests"""
     wrenches: tuple[Wrench, ...] = ()
     """external forces and torques"""
     noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
     """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
-    duration: Annotated[float, Field(gt=0, le=600)] = 15.0
+    duration: float = Field(default=15.0, gt=0, le=600)
     """of an episode; the unit is s"""
     max_distance: PositiveFloat = 30.0
     """farther than this from the target ends an episode, m"""
@@ -84,13 +94,15 @@ class Scenario(Frozen):
     """each episode has one of these, unknown to the controller, such as {distribution: raptor}"""
     randomize: Randomization | None = None
     """what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"""
-    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 240
+    episodes: int = Field(default=240, ge=1, le=1_000_000)
     """number of episodes"""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    seed: Seed = 0
     """every episode derives its own from it"""
-    tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1)
+    tolerances: Annotated[
+        tuple[PositiveFloat, ...], AfterValidator(lambda values: tuple(sorted(set(values))))
+    ] = Field(default=TOLERANCES, min_length=1)
     """of arrival, |r - r_T|, m"""
-    reference: dict[str, Reference] = {}
+    published: dict[str, Published] = {}
     """from a column's title to others' metrics"""
     group: str | None = None
     """the scenario that this one is a cell of; set by vary"""
@@ -104,11 +116,6 @@ class Scenario(Frozen):
         if isinstance(value, str) and VEHICLES.is_path(value):
             return load_vehicle(value)
         return value
-
-    @field_validator("tolerances")
-    @classmethod
-    def _rising(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        return tuple(sorted(set(value)))
 
     @model_validator(mode="after")
     def _possible(self) -> "Scenario":
@@ -210,7 +217,7 @@ class Scenario(Frozen):
             velocity_std=start.velocity.std or 0.0,
             body_rates_std=start.body_rates.std or 0.0,
             max_distance=self.max_distance,
-            **({} if elsewhere else RECOVERED),
+            **({} if elsewhere or self.reference else RECOVERED),
         )
 
     @property
@@ -222,6 +229,7 @@ class Scenario(Frozen):
             noise=self.noise,
             vehicles=self.vehicles,
             randomize=self.randomize,
+            reference=self.reference,
             max_episode_steps=self.steps,
         )
 
@@ -230,7 +238,7 @@ class Scenario(Frozen):
         """The least possible mean settling time (0.1 m) of the vehicle, s; None: unknown."""
         # It is known of undisturbed flights from the tasks' own start.
         changed = self.start != Start() or self.wrenches or self.randomize or self.vehicles
-        if changed or 0.1 not in self.tolerances:
+        if changed or self.reference or 0.1 not in self.tolerances:
             return None
         return (self.flown_vehicle().time_optimal or {}).get(self.target.distance or 0.0)
 
@@ -243,7 +251,8 @@ class Scenario(Frozen):
         random: list[Any] = [vector.std or vector.magnitude for vector in vectors]
         attitude = self.start.attitude
         random += [attitude.distribution, attitude.tilt, self.target.distance]
-        return not any([*random, self.randomize, self.vehicles])
+        smooth = self.reference and self.reference.curve == "random_smooth"
+        return not any([*random, self.randomize, self.vehicles, smooth])
 
     def _check_way(self, vehicle: Vehicle) -> None:
         """Check that start and targets lie above ground, within ``max_distance`` of each other."""
@@ -263,6 +272,18 @@ class Scenario(Frozen):
                 f"target: {distance:.3g} m away, and an episode ends beyond max_distance"
                 f" {self.max_distance:g} m"
             )
+        if self.reference is None:
+            return
+        if self.target.waypoints or self.reference.function is not None:
+            raise ValueError(
+                "reference: must be a curve or file, no function, and goes with no waypoints of the"
+                " target; the curve polynomial has waypoints of its own"
+            )
+        lowest = before[2] + self.reference.tracks(vehicle.control_step).table[:, 2].min()
+        if lowest <= least:
+            raise ValueError(
+                f"reference: goes down to z = {lowest:.3g} m; it must stay above {least:g} m"
+            )
 
 
 class Suite(Frozen):
@@ -272,9 +293,9 @@ class Suite(Frozen):
     """letters, digits, _ . -"""
     description: str = ""
     """its purpose"""
-    source: str = "reference"
-    """where the reference comes from; heads its column"""
-    scenarios: tuple[Scenario, ...] = Field(min_length=1)
+    source: str = "published"
+    """where the published metrics come from; heads their column"""
+    scenarios: list[Scenario] = Field(min_length=1)
 
     def scenario(self, name: str) -> Scenario:
         """Return the scenario of a name.
@@ -282,8 +303,7 @@ class Suite(Frozen):
         :raises ConfigError: an unknown name.
         """
         scenarios = {scenario.name: scenario for scenario in self.scenarios}
-        if name not in scenarios:
-            raise ConfigError(unknown("scenario", name, scenarios))
+        refuse_unknown("scenario", [name], scenarios)
         return scenarios[name]
 
     def with_changes(
@@ -297,14 +317,14 @@ class Suite(Frozen):
 
         :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
         :param vehicle: name, or path of a YAML file, that flies all scenarios. Forces and torques
-            stay the same, in N and N m; references, which are of another vehicle, are removed.
+            stay the same, in N and N m; published metrics, of another vehicle, are removed.
         :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible
             for the vehicle.
         """
         chosen: StrDict = {"episodes": episodes, "seed": seed, "vehicle": vehicle}
         flown_by = ""
         if vehicle is not None:
-            chosen["reference"] = {}
+            chosen["published"] = {}
             flown_by = f", flown by {vehicle}"
         changes = {key: value for key, value in chosen.items() if value is not None}
         known = set[str]()
@@ -320,14 +340,12 @@ class Suite(Frozen):
                         f"scenario {scenario.name}{flown_by}",
                     )
                 )
-        for name in names:
-            if name not in known:
-                raise ConfigError(unknown("scenario", name, known))
-        return self.model_copy(update={"scenarios": tuple(changed)})
+        refuse_unknown("scenario", names, known)
+        return self.model_copy(update={"scenarios": changed})
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = Counter(map(attrgetter("name"), self.scenarios))
+        names = Counter(scenario.name for scenario in self.scenarios)
         for name, times in names.items():
             if times > 1:
                 raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")

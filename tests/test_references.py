@@ -1,0 +1,358 @@
+"""References that move: their tables, the observation relative to them, and how closely flights
+follow.
+"""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
+from sb3_quad.cli.app import main
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.compare import compare
+from sb3_quad.evaluation.controllers import parse_controllers
+from sb3_quad.evaluation.evaluate import evaluate, fly_scenario
+from sb3_quad.evaluation.flightlog import read_tracks
+from sb3_quad.evaluation.flights import Hook, fly
+from sb3_quad.evaluation.following import FOLLOWED, Following
+from sb3_quad.evaluation.metric_tables import overview
+from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
+from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.report.scenario_plots import paths_plot
+from sb3_quad.simulation.references import Reference, read_points
+from sb3_quad.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
+
+DT = 0.01
+WAYPOINTS = [(3, 0, 1), (3, 3, 0), (0, 0, 0)]
+SINES = ("circle", "figure_eight", "lissajous")
+
+
+def spiral(times):
+    radius = 0.2 * times
+    return np.stack([radius * np.cos(times), radius * np.sin(times), 0.1 * times, times], axis=1)
+
+
+@pytest.fixture
+def csv(tmp_path):
+    times = DT * np.arange(401)
+    frame = pd.DataFrame(spiral(times), columns=["x", "y", "z", "heading"])
+    frame.insert(0, "t", times + 7.0)
+    frame.to_csv(tmp_path / "path.csv", index=False)
+    return str(tmp_path / "path.csv")
+
+
+def scenario(entry):
+    return parse_suite(f"name: mine\nscenarios:\n  - {{name: s, {entry}}}\n", "x").scenarios[0]
+
+
+def watched(table, delay=0, aside=0.0, turned=0.0, flying=True):
+    """Return the errors of a flight that is ``delay`` control steps late on the path of a table,
+    ``aside`` m above it, its heading ``turned`` rad away.
+    """
+    following = Following(1, DT)
+    for step in range(delay, len(table)):
+        array = np.zeros((STATE_SIZE, 1))
+        array[:3, 0] = table[step - delay, :3] + (0.0, 0.0, aside)
+        half = 0.5 * (math.atan2(table[step, 10], table[step, 9]) + turned)
+        array[QUATERNION, 0] = math.cos(half), 0.0, 0.0, math.sin(half)
+        array[REFERENCE, 0] = table[step]
+        following.see(step, QuadcopterState(array), np.array([flying]))
+    errors = following.errors(np.array([flying]))
+    return {name: float(values[0]) for name, values in errors.items()}
+
+
+# Metrics
+
+
+def test_whoever_sits_on_the_reference_has_no_errors():
+    table = Reference(heading="path").tracks(DT).table
+    assert watched(table) == pytest.approx(dict.fromkeys(FOLLOWED, 0.0), abs=1e-12)
+
+
+@pytest.mark.parametrize("curve", SINES)
+def test_the_lag_of_a_delayed_copy_is_its_delay(curve):
+    table = np.tile(Reference(curve=curve).tracks(DT).table, (2, 1))
+    errors = watched(table, delay=5)
+    assert errors["lag"] == pytest.approx(0.05, rel=0.01)
+    assert errors["path_error"] < 0.02 < errors["rms_error"] < errors["greatest_error"] < 0.11
+
+
+def test_errors_across_the_path_and_of_the_heading():
+    errors = watched(Reference(heading="path").tracks(DT).table, aside=0.3, turned=-0.2)
+    assert errors["lag"] == pytest.approx(0.0, abs=1e-12)
+    for name in ("rms_error", "greatest_error", "path_error"):
+        assert errors[name] == pytest.approx(0.3)
+    assert errors["heading_error"] == pytest.approx(math.degrees(0.2))
+
+
+def test_what_was_lost_or_rests_or_has_no_heading_has_no_such_errors():
+    table = Reference().tracks(DT).table
+    assert all(map(math.isnan, watched(table, flying=False).values()))
+    assert all(map(math.isnan, watched(0.0 * table).values()))
+    assert math.isnan(watched(table)["heading_error"])
+    resting = fly(GeometricExpert(), n_flights=2, max_steps=300)
+    assert np.isfinite(resting.cross_track_error).all()
+    moving = fly(GeometricExpert(), n_flights=2, max_steps=300, reference="circle")
+    assert np.isnan([resting.rms_error, moving.heading_error, moving.cross_track_error]).all()
+    assert (moving.rms_error > 0).all()
+
+
+# Tables
+
+
+@pytest.mark.parametrize("heading", [None, 0.5, "path"])
+@pytest.mark.parametrize("curve", SINES)
+def test_curves_loop_without_a_jump_at_the_speed_that_was_asked_for(curve, heading):
+    rate = 1.5 if heading == 0.5 else 0.0
+    tracks = Reference(curve=curve, speed=3.0, heading=heading, heading_rate=rate).tracks(DT)
+    table = tracks.table
+    assert tracks.loops and not table[0, :3].any()
+    assert np.linalg.norm(table[:, 3:6], axis=1).max() == pytest.approx(3.0, rel=5e-3)
+    steps = np.abs(np.diff(table, axis=0, append=table[:1]))
+    assert (steps[-1] <= steps[:-1].max(axis=0) + 1e-9).all()
+    if rate:
+        np.testing.assert_allclose(table[:, 11], rate, atol=math.radians(0.3))
+
+
+def test_random_motion_loops_within_its_limits():
+    reference = Reference(curve="random_smooth", speed=3, acceleration=5, resting=0.25)
+    tracks = reference.tracks(DT)
+    pieces = tracks.table.reshape(-1, tracks.length, tracks.table.shape[1])
+    speeds = np.linalg.norm(pieces[..., 3:6], axis=2)
+    assert speeds.max() < 3.001 and np.mean(speeds.max(axis=1) == 0.0) == 0.25
+    assert np.linalg.norm(pieces[..., 6:9], axis=2).max() < 5.001
+    jumps = np.linalg.norm(pieces[:, 0, :3] - pieces[:, -1, :3], axis=1)
+    assert (jumps <= 1.01 * DT * speeds.max(axis=1)).all()
+
+
+def test_least_snap_rests_at_its_ends_and_meets_its_waypoints():
+    table = Reference(curve="polynomial", speed=2, waypoints=WAYPOINTS).tracks(DT).table
+    speeds = np.linalg.norm(table[:, 3:6], axis=1)
+    assert speeds.max() == pytest.approx(2.0, rel=5e-3) and speeds[[0, -1]].max() < 0.01
+    for point in WAYPOINTS:
+        assert np.linalg.norm(table[:, :3] - point, axis=1).min() < 0.02
+
+
+def test_a_file_and_a_function_give_the_same_table(csv):
+    from_file = Reference.model_validate(csv).tracks(DT)
+    reference = Reference(curve="function", function=spiral, duration=4.0)
+    from_function = reference.tracks(DT)
+    np.testing.assert_allclose(from_file.table, from_function.table, atol=1e-9)
+    times, points = read_points(csv)
+    assert times[0] == 0.0 and points.shape == (401, 4)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"curve": "polynomial"}, "needs waypoints"),
+        ({"heading": "random"}, "only with curve random_smooth"),
+        ({"heading_rate": 1.0}, "needs a heading"),
+        ("no_such.csv", "no_such.csv"),
+        (lambda times: times, "must be finite numbers"),
+    ],
+)
+def test_what_is_no_reference_is_refused(fields, message):
+    with pytest.raises(ConfigError, match=message):
+        QuadcopterVecEnv(1, reference=fields)
+
+
+# Environments
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [
+        *("hover", *SINES, {"curve": "helix", "heading": 1, "heading_rate": 2}),
+        {"curve": "polynomial", "waypoints": WAYPOINTS, "heading": "path"},
+        {"curve": "random_smooth", "heading": "random", "heading_rate": 2},
+        {"curve": "function", "function": spiral},
+        "csv",
+    ],
+    ids=str,
+)
+def test_moving_targets_are_the_same_in_pybullet(reference, request):
+    from sb3_quad.envs import QuadcopterEnv
+
+    if reference == "csv":
+        reference = request.getfixturevalue("csv")
+    how = {"task": "state_recovery", "reference": reference, "preview": [0, 5]}
+    many = QuadcopterVecEnv(3, seed=0, **how)
+    single = QuadcopterEnv(**how)
+    expert = GeometricExpert()
+    one = single.reset(seed=row_seeds(0, 3)[1])[0]
+    several = many.reset()
+    for _ in range(60):
+        np.testing.assert_allclose(one, several[1], rtol=1e-6, atol=1e-6)  # float32
+        state = many.true_state().array[:, 1].copy()
+        other = single.true_state().array[:, 0]
+        # q and -q are one attitude.
+        state[QUATERNION] *= np.sign(state[QUATERNION] @ other[QUATERNION])
+        np.testing.assert_allclose(other, state, rtol=1e-9, atol=1e-9)
+        one, reward, *_ = single.step(expert.actions(single.true_state())[0])
+        several, rewards, *_ = many.step(expert.actions(many.true_state()))
+        assert reward == pytest.approx(rewards[1], abs=1e-7)
+    single.close()
+
+
+def test_a_given_target_is_where_a_reference_begins(csv):
+    from sb3_quad.envs import QuadcopterEnv
+
+    env = QuadcopterEnv(reference=csv)
+    env.reset(seed=0, options={"target": (1.0, 2.0, 20.0)})
+    env.step(np.zeros(4))
+    moved = spiral(np.array([DT]))[0, :3]
+    np.testing.assert_allclose(env.target, np.add((1.0, 2.0, 20.0), moved), atol=1e-12)
+    env.close()
+
+
+def test_rows_have_references_of_their_own():
+    env = QuadcopterVecEnv(4, seed=0, reference="circle")
+    env.reset()
+    env.env_method(
+        "set_reference", (1, 2, 20), (1, 0, 0), heading=math.pi, heading_rate=0.5, indices=[1, 3]
+    )
+    for _ in range(3):
+        env.step(np.zeros((4, 4)))
+    state = env.true_state()
+    np.testing.assert_array_equal(state.target[[1, 3]], [(1, 2, 20)] * 2)
+    np.testing.assert_array_equal(state.target_velocity[[1, 3]], [(1, 0, 0)] * 2)
+    np.testing.assert_allclose(state.target_heading, [(0, 0), (-1, 0)] * 2, atol=1e-12)
+    assert (np.linalg.norm(state.target_velocity[[0, 2]], axis=1) > 1.9).all()
+
+
+@pytest.mark.parametrize("reference", [None, {"curve": "hover", "heading": 0}])
+def test_a_heading_of_zero_at_rest_changes_no_bit_of_the_observation(reference):
+    plain = QuadcopterVecEnv(5, "state_recovery", seed=1)
+    turned = QuadcopterVecEnv(5, "state_recovery", seed=1, reference=reference)
+    np.testing.assert_array_equal(plain.reset(), turned.reset())
+    if reference is None:
+        turned.set_reference((0, 0, 15), heading=0.0)
+    for _ in range(50):
+        actions = np.random.default_rng(0).uniform(-1, 1, (5, 4))
+        np.testing.assert_array_equal(plain.step(actions)[0], turned.step(actions)[0])
+
+
+# Scenarios
+
+
+class Targets(Hook):
+    def on_start(self, state, vehicle):
+        self.seen = [state.target.copy()]
+
+    def after_step(self, step, state, actions, flying):
+        self.seen.append(state.target.copy())
+
+
+@pytest.mark.parametrize("backend", ["batch", "pybullet"])
+def test_a_scenario_moves_its_own_target(backend):
+    flown = scenario(
+        "target: [5, 0, 15], reference: {curve: circle, speed: 3}, duration: 3, episodes: 2"
+    )
+    flights, arrays = fly_scenario(GeometricExpert(), flown, backend, recorded=2)
+    table = flown.reference.tracks(DT).table
+    moved = (5.0, 0.0, 15.0) + table[:301:2, :3]
+    np.testing.assert_allclose(arrays["target"][0], moved, atol=1e-5)
+    assert (flights.rms_error > 0).all() and (flights.target == (5, 0, 15)).all()
+
+
+def test_both_backends_measure_the_same():
+    flown = scenario("reference: {curve: lissajous, heading: path}, duration: 3, episodes: 2")
+    batch, _ = fly_scenario(GeometricExpert(), flown)
+    pybullet, _ = fly_scenario(GeometricExpert(), flown, "pybullet")
+    for name in FOLLOWED:
+        np.testing.assert_allclose(getattr(batch, name), getattr(pybullet, name), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("reference: circel", "reference.curve"),
+        ("reference: circle, target: {waypoints: [[1, 0, 15]]}", "no waypoints"),
+        (
+            "reference: {curve: polynomial, waypoints: [[0, 0, -14.95]]}",
+            "reference: goes down to z = 0.05 m",
+        ),
+        ("reference: missing.csv", "missing.csv"),
+        ("reference: circle, vary: {reference.speed: [1, 2]}", "holds no keys"),
+    ],
+)
+def test_what_no_scenario_can_follow_is_refused(entry, message):
+    with pytest.raises(ConfigError) as caught:
+        scenario(entry)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("reference", ["path.csv", "{curve: file, file: path.csv}"])
+def test_files_of_a_reference_lie_beside_the_suite(csv, tmp_path, reference):
+    suite = tmp_path / "mine.yaml"
+    suite.write_text(f"name: x\nscenarios: [{{name: a, reference: {reference}}}]")
+    flown = load_suite(suite).with_changes(episodes=1).scenarios[0]
+    assert str(flown.reference.file) == csv
+
+
+def test_the_curves_of_the_suite_have_the_speeds_of_their_names():
+    suite = load_suite("trajectories")
+    for flown in suite.scenarios:
+        table = flown.reference.tracks(DT).table
+        speed = np.linalg.norm(table[:, 3:6], axis=1).max()
+        *_, name = flown.name.split("_")
+        assert speed == pytest.approx({"turning": 2, "limit": 3.8}.get(name) or int(name), rel=5e-3)
+    vehicle = flown.nominal_vehicle()
+    level = vehicle.gravity * math.sqrt(vehicle.thrust_limits[1] ** 2 - 1.0)
+    steepest = np.linalg.norm(table[:, 6:9], axis=1).max()
+    assert flown.name == "figure_eight_limit" and steepest == pytest.approx(0.7 * level, rel=0.01)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trajectories")
+    suite = load_suite("trajectories").with_changes(["figure_eight_turning"], episodes=2)
+    suite = suite.model_copy(
+        update={"scenarios": (suite.scenarios[0].model_copy(update={"duration": 4.0}),)}
+    )
+    return folder, evaluate(suite, parse_controllers(["geometric"]), str(folder))
+
+
+def test_tables_and_files_hold_the_errors(results):
+    folder, flown = results
+    text = str(overview(flown, ["geometric"]))
+    for row in ("position error, rms, m", "lag, s", "heading error, rms, °"):
+        assert row in text
+    assert "settling" not in text and "final error" not in text
+    metrics = flown.entries[0].metrics
+    assert metrics.rms_error.n == 2 and metrics.cross_track_error is None
+    table = pd.read_csv(folder / "episodes.csv")
+    np.testing.assert_allclose(table.rms_error.mean(), metrics.rms_error.value, rtol=1e-6)
+
+
+def test_plots_show_the_path_of_the_reference(results):
+    folder, flown = results
+    tracks = {"geometric": read_tracks(folder / flown.entries[0].flights)}
+    figure = paths_plot(flown.scenarios[0], tracks, flown.colours).figure
+    for axes in figure.axes:
+        lines = {line.get_label(): line for line in axes.lines}
+        assert len(lines["reference"].get_xdata()) > 50
+        assert {"reference", "geometric"} == lines.keys()
+
+
+def test_comparisons_of_flights_that_follow():
+    text = str(
+        compare({"law": "geometric"}, n_flights=2, reference="circle", max_episode_steps=300)
+    )
+    assert text.count("position error, rms") == 2 and "settling" not in text
+
+
+def test_enjoy_follows_a_reference(tmp_path, capsys):
+    picture = tmp_path / "eight.png"
+    command = ["enjoy", "geometric", "--task", "state_recovery", "-n", "40", "--size", "160x120"]
+    assert main([*command, "--reference", "figure_eight", "-o", str(picture)]) == 0
+    assert picture.stat().st_size > 0
+    assert main([*command, "--reference", "dict(speed=-1)", "--no-render"]) == 2
+    assert "reference.speed" in capsys.readouterr().err
+    scenario = ["--scenario", "thesis:side_hit", "--no-render"]
+    assert main(["enjoy", "pid", *scenario, "--reference", "circle"]) == 2
+    assert "remove" in capsys.readouterr().err
