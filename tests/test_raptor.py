@@ -45,6 +45,15 @@ def test_it_recovers_about_each_axis_and_flies_a_metre_to_its_target(axis, vehic
     assert np.abs([x, y, z]).max() < 0.1 and np.abs(w).min() > 0.99  # it turns to its heading, too
 
 
+@pytest.mark.parametrize("vehicle", ["itm", "crazyflie"])
+def test_it_follows_what_it_sees_relative_to_a_moving_target(vehicle):
+    entry = "{name: s, reference: {curve: figure_eight, speed: 1}, duration: 10, episodes: 2}"
+    scenario = parse_suite(f"{{name: one, scenarios: [{entry}]}}", "x").scenarios[0]
+    scenario = scenario.model_copy(update={"vehicle": vehicle})
+    flights, _ = fly_scenario(resolve_expert("raptor:Raptor", vehicle), scenario)
+    assert (flights.rms_error < 0.06).all()
+
+
 def test_each_row_begins_an_episode_of_its_own():
     raptor, first = resolve_expert("raptor:Raptor"), QuadcopterVecEnv(3, seed=0, noise=0.0).reset()
     actions, state = raptor.predict(first)

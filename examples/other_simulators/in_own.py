@@ -73,7 +73,6 @@ for name in ("rotorpy_crazyflie", "rotorpy_hummingbird"):
     CELLS[name + "_wind"] = Cell(name, "drag, wind 4 m/s", partial(Own, name, 4.0))
 
 
-
 def se3(simulator: Own) -> Policy | None:
     """RotorPy's controller for RotorPy's vehicles, with its gains for them."""
     brand, _, vehicle = simulator.name.partition("_")

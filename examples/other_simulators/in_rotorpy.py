@@ -162,8 +162,8 @@ class SE3:
             "yaw": np.zeros(n),
             "yaw_dot": np.zeros(n),
         }
-        fields = to_fields(state)
-        commands = self._control.update(0.0, fields, {k: torch.tensor(v) for k, v in wanted.items()})
+        flat = {name: torch.tensor(values) for name, values in wanted.items()}
+        commands = self._control.update(0.0, to_fields(state), flat)
         return np.asarray(commands["cmd_motor_thrusts"].numpy())
 
 
@@ -195,4 +195,5 @@ for vehicle in ("crazyflie", "hummingbird"):
         )
 
 if __name__ == "__main__":
-    main(__doc__ or "", CELLS, {"RAPTOR": Raptor, "SE3 (true state)": lambda simulator: SE3(simulator.parameters)})
+    se3 = {"SE3 (true state)": lambda simulator: SE3(simulator.parameters)}
+    main(__doc__ or "", CELLS, {"RAPTOR": Raptor, **se3})
