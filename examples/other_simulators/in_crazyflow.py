@@ -13,6 +13,7 @@ gyroscopic propellers; Runge-Kutta with a step of 2 ms. Its controller, Mellinge
 Crazyflie's firmware, sees the true state; the others see observations with noise.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from crazyflow.control.transform import motor_force2rotor_vel
 from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.sim import Sim
 from crazyflow.sim.integration import Integrator
-from flights import CONTROL_STEP, CURVES, Array, Cell, Raptor, Setpoint, State, main
+from flights import CONTROL_STEP, CURVES, Array, Cell, Policy, Raptor, Setpoint, State, main
 
 FREQUENCY = 500  # Hz, of its physics
 
@@ -118,5 +119,8 @@ CELLS = {
 }
 
 if __name__ == "__main__":
-    others = {"RAPTOR": Raptor, "Mellinger (true state)": Mellinger}
+    others: dict[str, Callable[[Crazyflow], Policy]] = {
+        "RAPTOR": Raptor,
+        "Mellinger (true state)": Mellinger,
+    }
     main(__doc__ or "", CELLS, others, (*CURVES, "vertical_eight_0.889"))

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import ExportedAgent, check_rotors, fly
+from flights import ExportedAgent, check_rotors, fly, follow
 from in_crazyflow import CELLS as CRAZYFLOW
+from in_crazyflow import Crazyflow, Mellinger
 from in_l2f import CELLS as L2F
 from in_rotorpy import CELLS as ROTORPY
+from in_rotorpy import SE3, RotorPy
+from rotorpy.wind.default_winds import BatchedNoWind
 
 FILES = Path(os.environ["TRANSFER_FILES"])
 MAKERS = {f"crazyflow {name}": cell.make for name, cell in CRAZYFLOW.items()} | {
@@ -69,3 +72,12 @@ def test_exported_agents_fly(task, make, file, targets, recoveries):
     )
     assert flights.succeeded.mean() >= {"targets": targets, "recoveries": recoveries}[task]
     assert np.median(flights.error[flights.survived]) < 0.03
+
+
+def test_others_controllers_follow_a_curve_in_their_simulators():
+    quadrotors = RotorPy("crazyflie", BatchedNoWind, 2)
+    followed = follow(quadrotors, SE3(quadrotors.parameters), "figure_eight_1", 1, 0.0, 0)
+    assert (followed.rms < 0.03).all()
+    mellinger = Mellinger(Crazyflow("cf2x_L250", 2))
+    followed = follow(mellinger.simulator, mellinger, "figure_eight_1", 1, 0.0, 0, moving=True)
+    assert (followed.rms < 0.05).all()
