@@ -14,6 +14,7 @@ that the acceleration of the reference is finite, too; the sum of the velocities
 
 import argparse
 import sys
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -126,8 +127,8 @@ def fly(agent, stick, speed=3.0, turn=1.5, render_mode="human"):
     settings = {**settings, "vehicles": None, "randomize": None}
     settings["task_kwargs"] = {"target_distance": 0.0, "nearest_target": 0.0}
     settings.pop("max_episode_steps", None)
-    env = gymnasium.make("QuadTargetTracking-v0", -1, render_mode=render_mode, **settings)
-    env = env.unwrapped
+    made = gymnasium.make("QuadTargetTracking-v0", -1, render_mode=render_mode, **settings)
+    env: Any = made.unwrapped
     dt = env.vehicle.control_step
     env.reset(seed=0)
     guide = Guide(env.target, speed, turn, dt)
@@ -183,5 +184,5 @@ if __name__ == "__main__":
     worst = 0.0
     for flown, wanted in fly(arguments.agent, sticks, arguments.speed, arguments.turn):
         off = np.linalg.norm(flown.true_state().position[0] - wanted.position)
-        worst = max(worst, off)
+        worst = max(worst, float(off))
     print(f"farthest from its reference: {worst:.2f} m")
