@@ -172,7 +172,7 @@ def test_what_is_no_reference_is_refused(fields, message):
         {"curve": "function", "function": spiral},
         "csv",
     ],
-    ids=str,
+    ids=lambda given: given if isinstance(given, str) else f"fields of {given['curve']}",
 )
 def test_moving_targets_are_the_same_in_pybullet(reference, request):
     from sb3_quad.envs import QuadcopterEnv
