@@ -282,7 +282,7 @@ def test_the_agents_follow_a_reference_as_in_python(name, how, tmp_path, monkeyp
     start = start_of(env)
     table = env.batch.tracks.copy()
     table[:, :3] += start["target"]
-    rows = [table[k % len(table)].tolist() for k in range(STEPS + 20)]
+    rows = [table[k % len(table)].tolist() for k in range(STEPS + 40)]
     source = {"zip": zip_file} if how == "zip" else {"agent": {"label": name, **describe(spec)}}
     path = in_node(
         tmp_path,

@@ -16,6 +16,7 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.simulation.frames import PositionIntegral
+from sb3_quad.simulation.state import X
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -334,8 +335,8 @@ def test_the_observation_in_plain_sb3_is_that_of_the_environment():
             (state.velocity - state.target_velocity)[0],
             state.body_rates[0],
             action,
-            heading=0.3 + 0.5 * 0.01 * step,
-            heading_rate=0.5,
+            heading=np.arctan2(*state.target_heading[0, ::-1]),
+            heading_rate=state.array[X.target_heading_rate, 0],
             accelerations=table[[step, step + 5], 6:9],
         )
         np.testing.assert_allclose(ours, seen, atol=1e-5, err_msg=f"step {step}")

@@ -69,11 +69,15 @@ def test_a_wider_vehicle_with_the_same_rotors_is_not_turned():
 class File:
     """An exported file, flown as docs/export.md says."""
 
-    def __init__(self, call, vehicle):
+    def __init__(self, call, vehicle, previews):
         self.call, self.vehicle, self.state = call, vehicle, None
+        self.previews = previews
 
     def actions(self, state):
-        result, self.state = self.call(physical_features(state), self.state)
+        # A target at rest has no acceleration.
+        ahead = np.zeros((state.n, 3 * self.previews))
+        seen = np.hstack([physical_features(state), ahead]).astype(np.float32)
+        result, self.state = self.call(seen, self.state)
         return self.vehicle.thrust_to_action(result.astype(np.float64))
 
 
@@ -86,7 +90,8 @@ def assert_it_flies(agent, vehicle, file_format="torchscript"):
         *vehicle.rotor_positions[0], vehicle.rotor_directions[0]
     )
     assert exported.metadata["rotors"].startswith(first[:-1])
-    file = File(load(file_format, exported, "own"), vehicle)
+    previews = len(sb3_quad.env_kwargs(agent)["preview"] or ())
+    file = File(load(file_format, exported, "own"), vehicle, previews)
     flights = fly(file, "state_recovery", 8, 3, vehicle, noise=0.0, max_steps=500)
     assert flights.survival.all() and flights.final_error.max() < 0.2
 

@@ -319,7 +319,8 @@ PIPELINES = "two_stage.yml", "imitation.yml", "robust/crazyflie.yml", THESIS
     "name", [name for name in SETTINGS.names() if not name.endswith(PIPELINES)]
 )
 def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of_tasks(name):
-    algo = name.rpartition("/")[2].removesuffix(".yml").replace("reference", "ppo_bc")
+    algo = name.rpartition("/")[2].removesuffix(".yml")
+    algo = {"reference": "ppo_bc", "following": "apg"}.get(algo, algo)
     assert {*ENVIRONMENTS} <= SETTINGS.read(name)[0].keys()
     for env_id, task in ENVIRONMENTS.items():
         config = load_config(algo, env_id, name)

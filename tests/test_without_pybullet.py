@@ -52,6 +52,10 @@ def without_pybullet(monkeypatch):
     """No module of PyBullet can be imported, nor be found as imported before."""
     for name in [name for name in sys.modules if name.startswith(NEEDS_PYBULLET)]:
         monkeypatch.delitem(sys.modules, name)
+        # Where its package has it, `from package import module` does not import it again.
+        package, _, module = name.rpartition(".")
+        if module in vars(sys.modules.get(package, sys)):
+            monkeypatch.delattr(sys.modules[package], module)
     monkeypatch.setitem(sys.modules, "pybullet", None)
     monkeypatch.setattr(
         sys,
