@@ -71,19 +71,18 @@ NO_TRACKS = Tracks(np.zeros((0, REFERENCE_SIZE)), 1, False)
 class Reference(Frozen):
     """A reference that moves from the target of an episode on; units m, s, rad.
 
-    The axes of a curve are those of the world. With ω such that the greatest speed is ``speed``:
+    The axes of a curve are those of the world. With ω such that the greatest speed is ``speed``,
+    its position at the time t relative to its start is:
 
-    | curve | position at the time t, relative to its start |
-    |---|---|
-    | `hover` | 0 |
-    | `circle` | (A cos ωt - A, A sin ωt, 0) |
-    | `figure_eight` | (A sin ωt, B sin 2ωt, C sin ωt) |
-    | `helix` | the circle, and C upwards in each turn, for ``duration`` |
-    | `lissajous` | (A sin ωt, B sin 2ωt, C sin 3ωt) |
-    | `polynomial` | least snap through ``waypoints``, from rest to rest |
-    | `file` | cubic Hermite splines through the rows of a CSV file: t, x, y, z, maybe heading |
-    | `function` | what ``function`` returns, for ``duration`` |
-    | `random_smooth` | one of 256 random sums of sines, which repeat after 10 s |
+    - ``hover``: it stays.
+    - ``circle``: (A cos ωt - A, A sin ωt, 0)
+    - ``figure_eight``: (A sin ωt, B sin 2ωt, C sin ωt)
+    - ``helix``: the circle, and C upwards in each turn, for ``duration``
+    - ``lissajous``: (A sin ωt, B sin 2ωt, C sin 3ωt)
+    - ``polynomial``: the least snap through ``waypoints``, from rest to rest
+    - ``file``: cubic Hermite splines through the rows of a CSV file: t, x, y, z, maybe heading
+    - ``function``: what ``function`` returns, for ``duration``
+    - ``random_smooth``: one of 256 random sums of sines, which repeat after 10 s
     """
 
     curve: Literal[CURVES] = "figure_eight"  # type: ignore[valid-type]
