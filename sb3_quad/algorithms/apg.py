@@ -89,8 +89,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     :param n_steps: Control steps of each flight in an update. Whole flights take some 300.
     :param max_grad_norm: The gradient is scaled down to this length where it is longer.
     :param max_row_ratio: At each step the gradient by the actions of an environment is scaled down
-        to this many times the median length over all of them, since a few flights on the verge of
-        chaos would outweigh the others.
+        to this many times the median length over all of them. With a vehicle for each episode a few
+        flights on the verge of chaos outweigh the others without it; 3 is a good value. None: it is
+        left as it is.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. From scratch, whole flights learn badly: clone an expert first (DAgger), or
         fly short windows with ``carry_on``.
@@ -122,7 +123,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         device: th.device | str = "auto",
         *,
         initial_policy: BaseAlgorithm | StrPath | None = None,
-        max_row_ratio: float = 3.0,
+        max_row_ratio: float | None = None,
         carry_on: bool = False,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         substeps: int | None = 2,
@@ -257,6 +258,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     def _limited(self, gradients: FloatArray) -> FloatArray:
         """Return gradients (n, a), the longest shortened to ``max_row_ratio`` times the median."""
         lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
+        if self.max_row_ratio is None:
+            return gradients
         # Rows that were lost have none.
         present = lengths[lengths > 0.0]
         if present.size == 0:
