@@ -15,9 +15,10 @@ from sb3_quad.base.validate import validate
 from sb3_quad.simulation.batch import QuadcopterBatch, Rows
 from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.frames import PositionIntegral
+from sb3_quad.simulation.motions import Motion
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.randomization import Randomization
-from sb3_quad.simulation.references import Motion, Reference
+from sb3_quad.simulation.references import Reference
 from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.state import TARGET, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec
@@ -143,19 +144,16 @@ class BatchEnv:
         """
         rows = self.batch.rows(indices)
         n = rows.size
-        parts = [
-            per_row("position", position, n, 3),
-            per_row("velocity", velocity, n, 3),
-            per_row("acceleration", acceleration, n, 3),
-            np.zeros((2, n)),
-            np.zeros((1, n)),
-        ]
-        # Nobody knows its future, so the acceleration ahead is the present one.
-        parts.append(parts[2])
+        positions = per_row("position", position, n, 3)
+        velocities = per_row("velocity", velocity, n, 3)
+        accelerations = per_row("acceleration", acceleration, n, 3)
+        turning = np.zeros((3, n))
         if heading is not None:
             angle = per_row("heading", heading, n)[0]
-            parts[3] = np.stack([np.cos(angle), np.sin(angle)])
-            parts[4] = per_row("heading_rate", heading_rate, n)
+            rate = per_row("heading_rate", heading_rate, n)[0]
+            turning = np.stack([np.cos(angle), np.sin(angle), rate])
+        # Nobody knows its future, so the acceleration ahead is the present one.
+        parts = [positions, velocities, accelerations, turning, accelerations]
         self.batch.set_reference(np.concatenate(parts), rows)
 
     def set_wrench(

@@ -22,7 +22,8 @@ from sb3_quad.evaluation.metric_tables import overview
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.report.scenario_plots import paths_plot
-from sb3_quad.simulation.references import Reference, read_points
+from sb3_quad.simulation.motions import read_points
+from sb3_quad.simulation.references import Reference
 from sb3_quad.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
 
 DT = 0.01

@@ -257,9 +257,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
     def _limited(self, gradients: FloatArray) -> FloatArray:
         """Return gradients (n, a), the longest shortened to ``max_row_ratio`` times the median."""
-        lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
         if self.max_row_ratio is None:
             return gradients
+        lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
         # Rows that were lost have none.
         present = lengths[lengths > 0.0]
         if present.size == 0:

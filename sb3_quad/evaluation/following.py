@@ -48,10 +48,9 @@ class Following:
         x, y = state.rotation[:, :2, 0].T
         turn = np.arctan2(cosine * y - sine * x, cosine * x + sine * y)
         np.fmax(self._greatest, distance, out=self._greatest, where=flying)
-        counted = (
-            *(np.ones_like(along), distance**2, distance**2 - on_path**2),
-            *(along, speed**2, asked, asked * turn**2),
-        )
+        squared = distance**2
+        across = squared - on_path**2
+        counted = np.ones_like(along), squared, across, along, speed**2, asked, asked * turn**2
         self._sums += np.where(flying, counted, 0.0)
 
     def errors(self, survival: BoolArray) -> dict[str, FloatArray]:

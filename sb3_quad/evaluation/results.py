@@ -31,10 +31,8 @@ FLIGHTS = "flights"
 # Files that are removed together with the results; a report writes the last two.
 WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
 # Columns of episodes.csv that are one array each, and those that are several numbers.
-_COLUMNS = (
-    *("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error"),
-    *FOLLOWED,
-)
+_FLOWN = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
+_COLUMNS = (*_FLOWN, *FOLLOWED)
 _AXES = {
     "target": "x y z",
     "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",

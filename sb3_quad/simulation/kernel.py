@@ -285,9 +285,18 @@ def step(
                     store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
                     if integral.shape[0] > 0:
                         integrate_position(b, i, lane, integral_numbers, integral)
-            _write_observations(b, count, integral, ages, frames, observations)
-            if previews.size > 0:
-                observe_preview(b, count, previews, course, tracks, track_numbers, observations)
+            _write_observations(
+                b,
+                count,
+                integral,
+                ages,
+                frames,
+                previews,
+                course,
+                tracks,
+                track_numbers,
+                observations,
+            )
             ended = _end_episodes(
                 b, first, count, autoreset, observations, rewards, dones, returns, limits,
                 outcome, last_observations,
@@ -328,9 +337,10 @@ def step(
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
         observe(b, moves)
-        _write_observations(b, count, integral, ages, frames, observations)
-        if previews.size > 0:
-            observe_preview(b, count, previews, course, tracks, track_numbers, observations)
+        _write_observations(
+            b, count, integral, ages, frames, previews, course, tracks, track_numbers,
+            observations,
+        )  # fmt: skip
     atomic_add(control, DONE, taken)
     if leads:
         finish(control, chunks)
@@ -494,18 +504,20 @@ def _load_commands(b, first, count, actions, queue, own_delays):
 
 
 @compiled
-def _write_observations(b, count, integral, ages, frames, out):
+def _write_observations(
+    b, count, integral, ages, frames, previews, course, tracks, track_numbers, out
+):
     """Write the observations of a block to its rows of ``out``, float32 (n, size)."""
-    if frames.shape[1] == 0:
-        for lane in range(count):
-            i = b.row[lane]
-            for k in range(OBSERVATION_SIZE):
-                out[i, k] = b.feature[k, lane]
-        return
     for lane in range(count):
         i = b.row[lane]
-        since = np.int64(b.stream[STEP, lane])
-        observe_frames(b, i, since, lane, integral, ages, frames, out)
+        if frames.shape[1] == 0:
+            for k in range(OBSERVATION_SIZE):
+                out[i, k] = b.feature[k, lane]
+        else:
+            since = np.int64(b.stream[STEP, lane])
+            observe_frames(b, i, since, lane, integral, ages, frames, out)
+    if previews.size > 0:
+        observe_preview(b, count, previews, course, tracks, track_numbers, out)
 
 
 @inlined

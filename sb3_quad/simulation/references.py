@@ -6,45 +6,36 @@ environment is; in flight, :mod:`.tracks` reads them.
 """
 
 import math
-from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-import pandas as pd
 from pydantic import Field, PositiveFloat, model_validator
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
-from sb3_quad.simulation.state import AHEAD, STATE_SIZE, X
+from sb3_quad.simulation.motions import (
+    HARMONICS,
+    MAX_SECONDS,
+    SINES,
+    Motion,
+    interpolated,
+    least_snap,
+    read_points,
+    sum_of_sines,
+)
+from sb3_quad.simulation.state import AHEAD, REFERENCE_PARTS, REFERENCE_SIZE, row_slices
 
-Motion = Callable[[FloatArray], FloatArray]
-"""The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]
-REFERENCE_SIZE = STATE_SIZE - X.target
-_POSITION, _VELOCITY, _ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
-_HEADING, _HEADING_RATE = slice(9, 11), 11
+_PLACES = row_slices(REFERENCE_PARTS).values()
+_POSITION, _VELOCITY, _ACCELERATION, _HEADING, _HEADING_RATE, _AHEAD = _PLACES
 # Random motion: so many pieces of so many seconds, each a sum of sines that fit into it.
 PIECES = 256
 PIECE_SECONDS = 10.0
-HARMONICS = np.arange(1, 7)
-MAX_SECONDS = 600.0
-_COLUMNS = ["t", "x", "y", "z", "heading"]
-# Of a segment of a polynomial with the least snap
-_COEFFICIENTS = 8
-# Curves of sines, as functions of the angle ωt and the sizes A, B and C
-_SINES: Mapping[str, Callable[..., Any]] = {
-    "hover": lambda p, a, b, c: (0.0 * p, 0.0 * p, 0.0 * p),
-    "circle": lambda p, a, b, c: (a * np.cos(p), a * np.sin(p), 0.0 * p),
-    "figure_eight": lambda p, a, b, c: (a * np.sin(p), b * np.sin(2.0 * p), c * np.sin(p)),
-    "helix": lambda p, a, b, c: (a * np.cos(p), a * np.sin(p), c * p / (2.0 * math.pi)),
-    "lissajous": lambda p, a, b, c: (a * np.sin(p), b * np.sin(2.0 * p), c * np.sin(3.0 * p)),
-}
-
-CURVES = (*_SINES, "polynomial", "file", "function", "random_smooth")
+CURVES = (*SINES, "polynomial", "file", "function", "random_smooth")
 
 
 class Tracks(NamedTuple):
@@ -145,7 +136,7 @@ class Reference(Frozen):
             return self._random_tracks(dt)
         motion, seconds = self._motion(dt)
         steps = round(seconds / dt)
-        loops = self.curve in _SINES and self.curve != "helix"
+        loops = self.curve in SINES and self.curve != "helix"
         if loops and self.heading_rate:
             # The heading must loop, too: whole turns in many periods are nearly at its rate.
             steps *= math.ceil(MAX_SECONDS / dt / steps)
@@ -164,11 +155,11 @@ class Reference(Frozen):
             return self._polynomial()
         if self.curve == "file":
             times, points = read_points(Path(str(self.file)))
-            return _interpolated(times, points), times[-1]
+            return interpolated(times, points), times[-1]
         if self.curve == "function":
             return self.function, self.duration
         a, b, c = self.size or (2.0, 1.0, 0.0 if self.curve == "figure_eight" else 0.5)
-        sines = _SINES[self.curve]
+        sines = SINES[self.curve]
         # The greatest speed per ω, on a fine grid
         grid = np.linspace(0.0, 2.0 * math.pi, 7201)
         way = np.gradient(np.stack(sines(grid, a, b, c)), grid, axis=1)
@@ -219,11 +210,10 @@ class Reference(Frozen):
         The times between waypoints are as the distances, then the whole is stretched so that the
         greatest speed is ``speed``.
         """
-        points = np.vstack([np.zeros(3), np.array(self.waypoints)])
-        lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        # A first waypoint at the start is the start.
-        points = points[int(lengths[0] == 0.0) :]
-        seconds = lengths[int(lengths[0] == 0.0) :]
+        points = np.array(self.waypoints)
+        if points[0].any():
+            points = np.vstack([np.zeros(3), points])
+        seconds = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if not seconds.all():
             raise ConfigError("reference polynomial: two waypoints in a row are the same point")
         grid = np.linspace(0.0, seconds.sum(), 5000)
@@ -243,7 +233,7 @@ class Reference(Frozen):
             amplitudes: Any = random.normal(size=(3, len(HARMONICS))) / HARMONICS**1.5
             amplitudes[2] *= 0.5
             phases = random.uniform(0.0, 2.0 * math.pi, size=amplitudes.shape)
-            motion = partial(_sum_of_sines, base, phases, amplitudes)
+            motion = partial(sum_of_sines, base, phases, amplitudes)
             table = self._table(motion, length, dt, True)
             speed = self.speed * random.uniform(0.1, 1.0)
             greatest = np.linalg.norm(table[:, _VELOCITY], axis=1).max()
@@ -266,108 +256,13 @@ def _tracks(table: FloatArray, length: int, loops: bool, dt: float) -> Tracks:
     """Return tables whose accelerations ahead are written, in place."""
     pieces = table.reshape(-1, length, REFERENCE_SIZE)
     later = np.arange(length) + round(AHEAD / dt)
-    pieces[..., -3:] = pieces[..., _ACCELERATION].take(
+    pieces[..., _AHEAD] = pieces[..., _ACCELERATION].take(
         later, axis=1, mode="wrap" if loops else "clip"
     )
     return Tracks(table, length, loops)
 
 
-def _sum_of_sines(
-    rate: float, phases: FloatArray, amplitudes: FloatArray, times: FloatArray
-) -> FloatArray:
-    """Return sums of sines, (t, 3); amplitudes and phases are (3, harmonics)."""
-    angles = np.multiply.outer(rate * times, HARMONICS)[:, None, :] + phases
-    return np.asarray((amplitudes * np.sin(angles)).sum(axis=2))
-
-
 def _set_heading(table: FloatArray, heading: FloatArray, dt: float) -> None:
     """Write the direction and the rate of a heading, (t,), rad, into a table, in place."""
     table[:, _HEADING] = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    table[:, _HEADING_RATE] = np.gradient(heading, dt)
-
-
-def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Return the times (t,), from 0 on, and positions (t, 3), or (t, 4) with headings, of a CSV
-    file.
-
-    Its first line names the columns: t, x, y, z and maybe heading; s, m, rad.
-
-    :raises ConfigError: a file that cannot be read, or whose times do not rise.
-    """
-    with raised_as(ConfigError, str(path)):
-        frame = pd.read_csv(path, dtype=np.float64)
-    if [*frame.columns] not in (_COLUMNS[:4], _COLUMNS) or len(frame) < 2:
-        raise ConfigError(f"{path}: needs two or more rows with the columns t,x,y,z[,heading]")
-    numbers = frame.to_numpy()
-    times = numbers[:, 0] - numbers[0, 0]
-    if not np.isfinite(numbers).all() or not 0.0 < np.diff(times).min() <= times[-1] <= MAX_SECONDS:
-        raise ConfigError(
-            f"{path}: every number must be finite, and t rise from row to row, by {MAX_SECONDS:g} s"
-            " at most"
-        )
-    return times, numbers[:, 1:]
-
-
-def _interpolated(times: FloatArray, points: FloatArray) -> Motion:
-    """Return cubic Hermite splines through points, as a function of time."""
-    slopes = np.gradient(points, times, axis=0)
-
-    def motion(t: FloatArray) -> FloatArray:
-        after = np.clip(np.searchsorted(times, t, side="right"), 1, len(times) - 1)
-        before = after - 1
-        width = (times[after] - times[before])[:, None]
-        u = (t - times[before])[:, None] / width
-        mean = points[before] + u * u * (3.0 - 2.0 * u) * (points[after] - points[before])
-        bend = u * (1.0 - u) * width * ((1.0 - u) * slopes[before] - u * slopes[after])
-        return np.asarray(mean + bend)
-
-    return motion
-
-
-def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
-    """Return the motion along polynomials of degree 7 with the least integral of the squared snap.
-
-    :param points: (m + 1, 3), with rest at both ends.
-    :param seconds: (m,), from each point to the next.
-    """
-    m = len(seconds)
-    rows = []
-    right = []
-    for k in range(m):
-        for time, point in ((0.0, points[k]), (seconds[k], points[k + 1])):
-            rows.append(_constraint(m, {k: _powers(time, 0)}))
-            right.append(point)
-        # In between, the optimum is continuous up to the sixth derivative.
-        for derivative in range(1, 7) if k > 0 else ():
-            ends = {k - 1: _powers(seconds[k - 1], derivative), k: -_powers(0.0, derivative)}
-            rows.append(_constraint(m, ends))
-            right.append(np.zeros(3))
-    for derivative in (1, 2, 3):
-        rows.append(_constraint(m, {0: _powers(0.0, derivative)}))
-        rows.append(_constraint(m, {m - 1: _powers(seconds[-1], derivative)}))
-        right += [np.zeros(3), np.zeros(3)]
-    coefficients = np.linalg.solve(np.array(rows), np.array(right)).reshape(m, _COEFFICIENTS, 3)
-    starts = np.concatenate([[0.0], np.cumsum(seconds)])
-
-    def motion(t: FloatArray) -> FloatArray:
-        segment = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, m - 1)
-        powers = np.vander(t - starts[segment], _COEFFICIENTS, increasing=True)
-        return np.asarray(np.einsum("tk,tka->ta", powers, coefficients[segment]))
-
-    return motion
-
-
-def _constraint(segments: int, parts: Mapping[int, FloatArray]) -> FloatArray:
-    """Return a row of the linear system: factors of the coefficients of some segments."""
-    row = np.zeros((segments, _COEFFICIENTS))
-    for segment, factors in parts.items():
-        row[segment] = factors
-    return row.ravel()
-
-
-def _powers(time: float, derivative: int) -> FloatArray:
-    """Return the derivative of 1, t, t², … at a time."""
-    result = np.zeros(_COEFFICIENTS)
-    for power in range(derivative, _COEFFICIENTS):
-        result[power] = math.perm(power, derivative) * time ** (power - derivative)
-    return result
+    table[:, _HEADING_RATE] = np.gradient(heading, dt)[:, None]

@@ -45,12 +45,7 @@ def row_slices(sizes: Mapping[str, int]) -> dict[str, slice]:
 
 AHEAD = 0.2  # s
 
-STATE = {
-    "position": 3,
-    "quaternion": 4,
-    "velocity": 3,
-    "body_rates": 3,
-    "rotor_speeds": 4,
+REFERENCE_PARTS = {
     "target": 3,
     "target_velocity": 3,
     "target_acceleration": 3,
@@ -60,12 +55,21 @@ STATE = {
     # The acceleration in AHEAD seconds, for experts; where nobody knows it, as now
     "target_ahead": 3,
 }
+"""Where the vehicle should be, and how that moves: the last rows of :data:`STATE`."""
+REFERENCE_SIZE = sum(REFERENCE_PARTS.values())
+
+STATE = {
+    "position": 3,
+    "quaternion": 4,
+    "velocity": 3,
+    "body_rates": 3,
+    "rotor_speeds": 4,
+    **REFERENCE_PARTS,
+}
 STATE_SIZE = sum(STATE.values())
 POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = [*row_slices(STATE).values()][:6]
 
 X = first_rows(STATE)
-# The rows that say where the vehicle should be: position, velocity, acceleration, heading, its
-# rate, and the acceleration ahead
 REFERENCE = slice(X.target, STATE_SIZE)
 
 WRENCH = {"force_world": 3, "force_body": 3, "torque_world": 3, "torque_body": 3}

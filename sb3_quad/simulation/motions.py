@@ -1,0 +1,124 @@
+"""Motions: positions as functions of time, of curves, points in a file and waypoints."""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.types import FloatArray
+
+Motion = Callable[[FloatArray], FloatArray]
+"""The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
+MAX_SECONDS = 600.0
+HARMONICS = np.arange(1, 7)
+_COLUMNS = ["t", "x", "y", "z", "heading"]
+# Of a segment of a polynomial with the least snap
+_COEFFICIENTS = 8
+# Curves of sines, as functions of the angle ωt and the sizes A, B and C
+SINES: Mapping[str, Callable[..., Any]] = {
+    "hover": lambda p, a, b, c: (0.0 * p, 0.0 * p, 0.0 * p),
+    "circle": lambda p, a, b, c: (a * np.cos(p), a * np.sin(p), 0.0 * p),
+    "figure_eight": lambda p, a, b, c: (a * np.sin(p), b * np.sin(2.0 * p), c * np.sin(p)),
+    "helix": lambda p, a, b, c: (a * np.cos(p), a * np.sin(p), c * p / (2.0 * math.pi)),
+    "lissajous": lambda p, a, b, c: (a * np.sin(p), b * np.sin(2.0 * p), c * np.sin(3.0 * p)),
+}
+
+
+def sum_of_sines(
+    rate: float, phases: FloatArray, amplitudes: FloatArray, times: FloatArray
+) -> FloatArray:
+    """Return sums of sines, (t, 3); amplitudes and phases are (3, harmonics)."""
+    angles = np.multiply.outer(rate * times, HARMONICS)[:, None, :] + phases
+    return np.asarray((amplitudes * np.sin(angles)).sum(axis=2))
+
+
+def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Return the times (t,), from 0 on, and positions (t, 3), or (t, 4) with headings, of a CSV
+    file.
+
+    Its first line names the columns: t, x, y, z and maybe heading; s, m, rad.
+
+    :raises ConfigError: a file that cannot be read, or whose times do not rise.
+    """
+    with raised_as(ConfigError, str(path)):
+        frame = pd.read_csv(path, dtype=np.float64)
+    if [*frame.columns] not in (_COLUMNS[:4], _COLUMNS) or len(frame) < 2:
+        raise ConfigError(f"{path}: needs two or more rows with the columns t,x,y,z[,heading]")
+    numbers = frame.to_numpy()
+    times = numbers[:, 0] - numbers[0, 0]
+    if not np.isfinite(numbers).all() or not 0.0 < np.diff(times).min() <= times[-1] <= MAX_SECONDS:
+        raise ConfigError(
+            f"{path}: every number must be finite, and t rise from row to row, by {MAX_SECONDS:g} s"
+            " at most"
+        )
+    return times, numbers[:, 1:]
+
+
+def interpolated(times: FloatArray, points: FloatArray) -> Motion:
+    """Return cubic Hermite splines through points, as a function of time."""
+    slopes = np.gradient(points, times, axis=0)
+
+    def motion(t: FloatArray) -> FloatArray:
+        after = np.clip(np.searchsorted(times, t, side="right"), 1, len(times) - 1)
+        before = after - 1
+        width = (times[after] - times[before])[:, None]
+        u = (t - times[before])[:, None] / width
+        mean = points[before] + u * u * (3.0 - 2.0 * u) * (points[after] - points[before])
+        bend = u * (1.0 - u) * width * ((1.0 - u) * slopes[before] - u * slopes[after])
+        return np.asarray(mean + bend)
+
+    return motion
+
+
+def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
+    """Return the motion along polynomials of degree 7 with the least integral of the squared snap.
+
+    :param points: (m + 1, 3), with rest at both ends.
+    :param seconds: (m,), from each point to the next.
+    """
+    m = len(seconds)
+    rows = []
+    right = []
+    for k in range(m):
+        for time, point in ((0.0, points[k]), (seconds[k], points[k + 1])):
+            rows.append(_constraint(m, {k: _powers(time, 0)}))
+            right.append(point)
+    # In between, the optimum is continuous up to the sixth derivative.
+    for k in range(1, m):
+        for derivative in range(1, 7):
+            ends = {k - 1: _powers(seconds[k - 1], derivative), k: -_powers(0.0, derivative)}
+            rows.append(_constraint(m, ends))
+            right.append(np.zeros(3))
+    for derivative in (1, 2, 3):
+        rows.append(_constraint(m, {0: _powers(0.0, derivative)}))
+        rows.append(_constraint(m, {m - 1: _powers(seconds[-1], derivative)}))
+        right += [np.zeros(3), np.zeros(3)]
+    coefficients = np.linalg.solve(np.array(rows), np.array(right)).reshape(m, _COEFFICIENTS, 3)
+    starts = np.concatenate([[0.0], np.cumsum(seconds)])
+
+    def motion(t: FloatArray) -> FloatArray:
+        segment = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, m - 1)
+        powers = np.vander(t - starts[segment], _COEFFICIENTS, increasing=True)
+        return np.asarray(np.einsum("tk,tka->ta", powers, coefficients[segment]))
+
+    return motion
+
+
+def _constraint(segments: int, parts: Mapping[int, FloatArray]) -> FloatArray:
+    """Return a row of the linear system: factors of the coefficients of some segments."""
+    row = np.zeros((segments, _COEFFICIENTS))
+    for segment, factors in parts.items():
+        row[segment] = factors
+    return row.ravel()
+
+
+def _powers(time: float, derivative: int) -> FloatArray:
+    """Return the derivative of 1, t, t², … at a time."""
+    result = np.zeros(_COEFFICIENTS)
+    for power in range(derivative, _COEFFICIENTS):
+        result[power] = math.perm(power, derivative) * time ** (power - derivative)
+    return result
