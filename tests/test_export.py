@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from hovering import teach_to_hover
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import A2C, PPO, SAC, TD3
@@ -23,7 +24,6 @@ from test_extending import DIFFS, ROOT, apply
 
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
-from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, network, policy
 from sb3_quad.export.check import Reference
@@ -108,10 +108,7 @@ def extended(tmp_path_factory):
     """Zips of policies that hover, by the weights of one that came with the package, and react to
     all that they see.
     """
-    folder, old = (
-        tmp_path_factory.mktemp("extended"),
-        PPO.load(pretrained("itm-recovery"), device="cpu").policy,
-    )
+    folder = tmp_path_factory.mktemp("extended")
     torch.manual_seed(0)
     for name, sees in SEES.items():
         model = PPO(
@@ -120,12 +117,7 @@ def extended(tmp_path_factory):
             policy_kwargs={"net_arch": [64, 64]},
             device="cpu",
         )
-        with torch.no_grad():
-            for new, known in zip(model.policy.parameters(), old.parameters(), strict=True):
-                if new.shape == known.shape:
-                    new.copy_(known)
-                elif new.dim() == 2:
-                    new.normal_(std=0.02)[:, :18] = known
+        teach_to_hover(model, std=0.02)
         FlightSettings(**sees).write_into(model)
         model.save(folder / f"{name}.zip")
     return folder

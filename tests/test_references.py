@@ -357,3 +357,29 @@ def test_enjoy_follows_a_reference(tmp_path, capsys):
     scenario = ["--scenario", "thesis:side_hit", "--no-render"]
     assert main(["enjoy", "pid", *scenario, "--reference", "circle"]) == 2
     assert "remove" in capsys.readouterr().err
+
+
+def test_a_snapshot_keeps_how_targets_move():
+    flown = QuadcopterVecEnv(3, seed=0)
+    other = QuadcopterVecEnv(3, seed=1)
+    flown.reset()
+    flown.set_reference((0, 0, 15), velocity=(1, 0, 0), heading=0.5)
+    other.reset()
+    other.batch.restore(flown.batch.snapshot())
+    np.testing.assert_array_equal(other.batch.observe(), flown.batch.observe())
+
+
+def test_a_heading_that_jumps_by_a_whole_turn_turns_no_further():
+    def turning(times):
+        heading = (3.0 + 0.5 * times + np.pi) % (2 * np.pi) - np.pi
+        return np.column_stack([0 * times, 0 * times, 0 * times, heading])
+
+    rates = Reference(curve="function", function=turning, duration=2.0).tracks(DT).table[:-1, 11]
+    np.testing.assert_allclose(rates, 0.5, atol=1e-9)
+
+
+def test_the_heading_of_a_file_goes_the_shorter_way(tmp_path):
+    file = tmp_path / "turn.csv"
+    file.write_text("t,x,y,z,heading\n0,0,0,0,3.1\n1,0,0,0,-3.1\n")
+    heading = read_points(file)[1][:, 3]
+    np.testing.assert_allclose(np.diff(heading), 2 * np.pi - 6.2)

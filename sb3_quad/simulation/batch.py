@@ -37,6 +37,7 @@ from sb3_quad.simulation.state import (
     WRENCH_SIZE,
     P,
     QuadcopterState,
+    X,
     drag_forces,
     row_slices,
 )
@@ -381,6 +382,7 @@ class QuadcopterBatch:
                 )
         for name, array in snapshot.items():
             getattr(self, name)[...] = array
+        self._notice_motion()
 
     def fix(self, quantity: str, values: FloatArray) -> None:
         """Replace a quantity of :data:`.state.STATE` that an episode has begun with, in all rows.
@@ -398,7 +400,11 @@ class QuadcopterBatch:
         self.state[REFERENCE, rows] = reference
         if self.course.size:
             self.course[C.begin, rows] = -1.0
-        if not self.moves and reference[3:].any():
+        self._notice_motion()
+
+    def _notice_motion(self) -> None:
+        """Let steps read how targets move, once one does."""
+        if not self.moves and self.state[X.target_velocity :].any():
             self.moves = True
             self._bind()
 

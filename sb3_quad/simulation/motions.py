@@ -55,6 +55,8 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
             f"{path}: every number must be finite, and t rise from row to row, by {MAX_SECONDS:g} s"
             " at most"
         )
+    # Headings may be given from -π to π: between two of them is the shorter way.
+    numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)
     return times, numbers[:, 1:]
 
 

@@ -192,7 +192,7 @@ class Reference(Frozen):
         table[:, _ACCELERATION] = np.gradient(table[:, _VELOCITY], dt, axis=0)
         heading: Any = None
         if columns == 4:
-            heading = values[:, 3]
+            heading = np.unwrap(values[:, 3])
         elif self.heading == "path":
             heading = np.unwrap(np.arctan2(table[:, 4], table[:, 3]))
         elif isinstance(self.heading, float):
