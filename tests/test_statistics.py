@@ -198,7 +198,8 @@ def test_an_agent_goes_on_with_its_statistics_or_is_refused(run, tmp_path):
         transfer_policy(PPO("MlpPolicy", QuadcopterVecEnv(2)), model)
 
 
-def test_best_model_freezes_and_synchronises_the_environments_of_a_user():
+def test_best_model_freezes_and_synchronises_the_environments_of_a_user(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     env: Any = VecNormalize(QuadcopterVecEnv(4, seed=0))
     held: Any = VecNormalize(VecMonitor(QuadcopterVecEnv(4, max_episode_steps=20)))
     model = PPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=1, device="cpu")
