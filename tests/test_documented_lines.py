@@ -95,7 +95,7 @@ LINES = [line for line in documented() if not any(part in line for part in ELSEW
 def folder(tmp_path_factory, trained_runs):
     """A folder with what the lines read: runs, agents, files of the reader."""
     place = tmp_path_factory.mktemp("documented")
-    for name in ("agent.zip", "path/to/agent.zip"):
+    for name in ("agent.zip", "path/to/agent.zip", "mine.zip"):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(pretrained("thesis-recovery"), place / name)
     for algo, env in (("dagger", "Tracking"), ("dagger", "Recovery"), ("ppo_bc", "Recovery")):
