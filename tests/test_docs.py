@@ -269,6 +269,8 @@ def test_readme_and_tutorial_lead_to_an_own_agent_in_the_demo(folder, monkeypatc
                 exec(compile(block, page, "exec"), scope)
                 continue
             for line in block.splitlines():
+                if line.startswith("#"):
+                    continue
                 program, *arguments = shlex.split(line, comments=True)
                 if program == "cp":
                     shutil.copy(*arguments)
