@@ -21,12 +21,11 @@ from sb3_quad.evaluation.real_flights import (
     errors,
     open_loop,
     read_logs,
-    turn_between,
 )
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import TORQUE_BODY, QuadcopterState, rotation_matrices
+from sb3_quad.simulation.state import TORQUE_BODY, QuadcopterState
 
 STEP = 0.01  # s, of the estimates
 GRAVITY = np.array([0.0, 0.0, 9.81])
@@ -103,12 +102,17 @@ def longest_flight(log):
     return slice(begins[best], ends[best])
 
 
+def state_of(motion):
+    """Return the state of rows (n, 13)."""
+    return QuadcopterState(motion.T)
+
+
 def run_of(log):
     """Return commands and response of a log's flight."""
     rows = longest_flight(log)
     force = 9.81 * log.columns["imu_acc_z"][rows]
-    response = np.column_stack([log.columns["body_rates"][rows], force])
-    return Run(log.columns["thrusts"][rows] @ SIDES.T, response)
+    response = np.column_stack([state_of(log.motion[rows]).body_rates, force])
+    return Run(log.thrusts[rows] @ SIDES.T, response)
 
 
 # --- (a) one step ---------------------------------------------------------------------------------
@@ -120,15 +124,14 @@ def one_step_table(logs, vehicle):
     given = []
     for log in logs:
         rows = longest_flight(log)
-        columns = {name: values[rows] for name, values in log.columns.items()}
-        rotation = rotation_matrices(columns["quaternion"])
-        force = np.gradient(columns["velocity"], STEP, axis=0) + GRAVITY
-        turning = np.gradient(columns["body_rates"], STEP, axis=0)
-        flown.append(np.column_stack([in_body(rotation, force), turning]))
-        speeds = np.sqrt(np.maximum(columns["thrusts"], 0.0))
+        state = state_of(log.motion[rows])
+        force = np.gradient(state.velocity, STEP, axis=0) + GRAVITY
+        turning = np.gradient(state.body_rates, STEP, axis=0)
+        flown.append(np.column_stack([in_body(state.rotation, force), turning]))
+        speeds = np.sqrt(np.maximum(log.thrusts[rows], 0.0))
         turned = lagged(speeds, 1.0 / vehicle.motor_gain_up, vehicle.delay * STEP) ** 2
         wrench = turned @ vehicle.mixer.T
-        drag = in_body(rotation, columns["velocity"]) * vehicle.drag / vehicle.mass
+        drag = in_body(state.rotation, state.velocity) * vehicle.drag / vehicle.mass
         lift = np.column_stack([-drag[:, :2], wrench[:, 0] / vehicle.mass - drag[:, 2]])
         given.append(np.column_stack([lift, wrench[:, 1:] / vehicle.inertia]))
     flown = np.concatenate([part[50:] for part in flown])
@@ -136,7 +139,7 @@ def one_step_table(logs, vehicle):
     names = ["specific force " + axis + ", m/s²" for axis in "xyz"]
     names += ["angular acceleration " + axis + ", rad/s²" for axis in "xyz"]
     rows = []
-    for name, one, other in zip(names, given.T, flown.T):
+    for name, one, other in zip(names, given.T, flown.T, strict=True):
         gap = one - other
         rows.append([name, *(f"{value:.3g}" for value in (other.std(), gap.mean(), gap.std()))])
     heads = ("one step", "flown, std", "residual, mean", "residual, std")
@@ -174,7 +177,9 @@ def lag_table(runs, title):
         whole = np.array(estimates(runs, axis))
         parts = np.array([estimates(runs[:i] + runs[i + 1 :], axis) for i in range(len(runs))])
         spread = 1.96 * np.sqrt((len(runs) - 1) * parts.var(axis=0))
-        texts = [f"{value:.3g} ± {each:.2g}" for value, each in zip(whole, spread)]
+        texts = []
+        for value, width in zip(whole, spread, strict=True):
+            texts.append(f"{value:.3g} ± {width:.2g}")
         rows.append([name, *texts, f"{resonance(runs, axis):.1f}"])
     heads = (
         "axis",
@@ -297,7 +302,9 @@ def told_table(logs):
     values = told(logs)
     parts = np.array([told(logs[:i] + logs[i + 1 :]) for i in range(len(logs))])
     spread = 1.96 * np.sqrt((len(logs) - 1) * parts.var(axis=0))
-    rows = [[name, f"{v:.3g} ± {each:.2g}"] for name, v, each in zip(names, values, spread)]
+    rows = []
+    for name, value, width in zip(names, values, spread, strict=True):
+        rows.append([name, f"{value:.3g} ± {width:.2g}"])
     return text_table(f"told by {len(logs)} flights", ("parameter", "value"), rows)
 
 
@@ -321,11 +328,11 @@ def fit(logs, vehicle, names=("mass", "drag", "drag_z"), iterations=4):
             products.append(-slopes.T @ here)
         step = np.linalg.solve(sum(squares), sum(products))
         parts = []
-        for one, other in zip(squares, products):
+        for one, other in zip(squares, products, strict=True):
             if len(logs) > 1:
                 parts.append(np.linalg.solve(sum(squares) - one, sum(products) - other))
         step = np.clip(step, -0.5, 0.5)
-        vehicle = scaled(vehicle, dict(zip(names, np.exp(step))))
+        vehicle = scaled(vehicle, dict(zip(names, np.exp(step), strict=True)))
     spread = 1.96 * np.sqrt((len(logs) - 1) * np.var(parts, axis=0)) if parts else None
     return vehicle, spread
 
@@ -352,15 +359,16 @@ def gaps(log, vehicle, names):
     """
     found = []
     for time, predictions, end in open_loop([log], vehicle, stride=5):
-        simulated = predictions[0]
         if time > 0.25:
             break
-        found.append((simulated["position"] - end["position"]) / 0.01)
-        found.append((simulated["velocity"] - end["velocity"]) / 0.1)
+        flown = state_of(end)
+        simulated = state_of(predictions[0])
+        found.append((simulated.position - flown.position) / 0.01)
+        found.append((simulated.velocity - flown.velocity) / 0.1)
         if "inertia" in names:
-            one, other = (rotation_matrices(each["quaternion"]) for each in (end, simulated))
-            found.append(turn_between(one, other) / 0.05)
-            found.append((simulated["body_rates"] - end["body_rates"]) / 0.5)
+            between = np.einsum("nji,njk->nik", flown.rotation, simulated.rotation)
+            found.append(between[:, [2, 0, 1], [1, 2, 0]] / 0.05)
+            found.append((simulated.body_rates - flown.body_rates) / 0.5)
     return np.concatenate(found).ravel()
 
 
@@ -368,7 +376,7 @@ def fit_text(vehicle, spread, names):
     """Return the lines of a vehicle file that were fitted."""
     values = {"mass": vehicle.mass, "drag": vehicle.drag[0], "drag_z": vehicle.drag[2]}
     lines = []
-    for name, width in zip(names, spread):
+    for name, width in zip(names, spread, strict=True):
         lines.append(f"{name}: {values[name]:.4g} ± {values[name] * width:.2g}")
     return "\n".join(lines)
 
@@ -384,11 +392,10 @@ def fit_forces(logs):
     held = []
     for log in logs:
         rows = longest_flight(log)
-        rotation = rotation_matrices(log.columns["quaternion"][rows])
-        velocity = log.columns["velocity"][rows]
-        force = in_body(rotation, np.gradient(velocity, STEP, axis=0) + GRAVITY)
-        airspeed = in_body(rotation, velocity)
-        commands = log.columns["thrusts"][rows] @ SIDES.T
+        state = state_of(log.motion[rows])
+        force = in_body(state.rotation, np.gradient(state.velocity, STEP, axis=0) + GRAVITY)
+        airspeed = in_body(state.rotation, state.velocity)
+        commands = log.thrusts[rows] @ SIDES.T
         total = lagged(commands[:, 3:], 0.07, 0.0)[:, 0]
         lift.append([total @ force[:, 2], total @ total])
         for axis in (0, 1):
@@ -414,10 +421,12 @@ def moment_table(logs, vehicle, moment):
     def push(batch):
         state = batch.true_state()
         speed = in_body(state.rotation, state.velocity)
-        batch.wrench[TORQUE_BODY] = moment * np.stack([speed[:, 1], -speed[:, 0], 0.0 * speed[:, 0]])
+        batch.wrench[TORQUE_BODY] = moment * np.stack(
+            [speed[:, 1], -speed[:, 0], 0.0 * speed[:, 0]]
+        )
 
     for time, predictions, end in open_loop(logs, vehicle, before_step=push):
-        for quantity, error in zip(QUANTITIES, errors(predictions[0], end)):
+        for quantity, error in zip(QUANTITIES, errors(predictions[0], end), strict=True):
             rows[f"{quantity}, after {time:g} s"] = f"{error:.3g}"
     title = f"{vehicle.name}, with a moment of {1000 * moment:.2g} mN m by m/s of airspeed"
     return text_table(title, ("open loop", "simulated"), [[k, rows[k]] for k in sorted(rows)])
@@ -502,7 +511,7 @@ def closed_loop_table(logs, vehicle):
     for log in logs:
         part = longest_flight(log)
         setpoint = np.stack([log.columns[f"sp_ctrltarget_{axis}"][part] for axis in "xyz"], axis=1)
-        position = log.columns["position"][part]
+        position = state_of(log.motion[part]).position
         texts = [f"{off(position, setpoint):.3f}"]
         for kind in ("cascade", "PID"):
             texts.append(f"{off(follow(vehicle, setpoint, position[0], kind), setpoint):.3f}")

@@ -7,10 +7,9 @@ agree best; how the markers of the motion capture are mounted, so that the mean 
 along z; and the motors against each other, so that the mean commands give no moment.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +20,13 @@ from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.physics import quaternion_product
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import rotation_matrices
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    VELOCITY,
+    rotation_matrices,
+)
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
@@ -37,10 +42,11 @@ OFFSETS = np.arange(-0.1, 0.1005, 0.001)
 # platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM / 65,535 of the battery's.
 THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
 FULL_PWM = 65_535.0
-SEEN = "px py pz vx vy vz qw qx qy qz".split()
-FELT = "imu_gyro_x imu_gyro_y imu_gyro_z".split()
-THRUSTS = "thrust_m1 thrust_m2 thrust_m3 thrust_m4".split()
-PWM = "motor_motor_m1 motor_motor_m2 motor_motor_m3 motor_motor_m4 pwr_pm_vbat".split()
+# By the motion capture, in the order of the state's first rows
+SEEN = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
+FELT = ["imu_gyro_x", "imu_gyro_y", "imu_gyro_z"]
+THRUSTS = ["thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4"]
+PWM = ["motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4", "pwr_pm_vbat"]
 NEEDED = (
     f"a log is a CSV file with the columns t, {', '.join(SEEN + FELT)}, and thrusts in N "
     f"({', '.join(THRUSTS)}) or {', '.join(PWM)}"
@@ -54,9 +60,10 @@ class Log:
     """A flight of n rows, one for each control step, in SI units."""
 
     name: str  #: of its file
-    #: position (n, 3), quaternion (n, 4), velocity (n, 3), body_rates (n, 3) and commanded thrusts
-    #: (n, 4), M1 to M4; and all columns of the file, (n,), at the time of the vehicle's clock
-    columns: Arrays
+    #: (n, 13): position, quaternion, velocity and body rates, as the rows of the state have them
+    motion: FloatArray
+    thrusts: FloatArray  #: (n, 4), commanded, M1 to M4, N
+    columns: Arrays  #: all columns of the file, (n,), by the clock of the vehicle
     flying: BoolArray  #: (n,), in the air
     offset: float  #: s, by which the vehicle's clock was behind that of the motion capture
 
@@ -85,18 +92,20 @@ def read_log(path: Path, step: float) -> Log:
     time = table["t"]
     grid = np.arange(time.iloc[0], time.iloc[-1], step)
 
-    def at(names: Sequence[str], behind: float = 0.0) -> FloatArray:
+    def at(names: Iterable[str], behind: float = 0.0) -> FloatArray:
         return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
 
-    position, velocity, quaternion = np.split(at(SEEN), [3, 6], axis=1)
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    rotation = rotation_matrices(quaternion)
-    flying = position[:, 2] > LEAST_HEIGHT
+    motion = at(SEEN + FELT)
+    attitude = motion[:, QUATERNION]
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    flying = motion[:, 2] > LEAST_HEIGHT
     flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
-    rates = np.zeros_like(position)
-    rates[1:-1] = turn_between(rotation[:-2], rotation[2:]) / (2.0 * step)
-    rates *= flying[:, None]
+    inverse = (attitude[:-2] * [1.0, -1.0, -1.0, -1.0]).T
+    turns = quaternion_product.py_func(*inverse, *attitude[2:].T)
+    # Twice the step, and twice the half angle: these are the body rates times the step.
+    rates = np.pad(turns[1:], ((0, 0), (1, 1))).T * flying[:, None]
     offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind))))
+    motion[:, BODY_RATES] = at(FELT, offset)
 
     thrusts = at(commands, offset)
     if commands is PWM:
@@ -104,15 +113,15 @@ def read_log(path: Path, step: float) -> Log:
     # Some logs are extrapolated after the radio was lost.
     flying &= np.isfinite(thrusts).all(axis=1)
     if flying.any():
-        force = np.gradient(velocity, step, axis=0) + [0.0, 0.0, 9.81]
-        x, y, z = np.einsum("nji,nj->ni", rotation, force)[flying].mean(axis=0)
-        quaternion = turned_on(quaternion, np.array([[-y / z, x / z, 0.0]]))
+        force = np.gradient(motion[:, VELOCITY], step, axis=0)
+        force[:, 2] += 9.81
+        in_body = np.einsum("nji,nj->ni", rotation_matrices(attitude), force)
+        x, y, z = in_body[flying].mean(axis=0)
+        motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
         mean = thrusts[flying].mean(axis=0)
         thrusts *= mean.mean() / mean
-    columns: Arrays = dict(zip(table, at([*table], offset).T, strict=True))
-    columns.update(position=position, quaternion=quaternion, velocity=velocity)
-    columns.update(body_rates=at(FELT, offset), thrusts=thrusts)
-    return Log(path.stem, columns, flying, offset)
+    columns = dict(zip(table, at(table, offset).T, strict=True))
+    return Log(path.stem, motion, thrusts, columns, flying, offset)
 
 
 def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
@@ -123,14 +132,6 @@ def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
     """
     thrusts = np.polynomial.polynomial.polyval(pwm / FULL_PWM * battery, THRUST_BY_VOLTAGE)
     return np.where((pwm > 0.0) & (pwm <= FULL_PWM), thrusts, np.nan)
-
-
-def turn_between(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return small rotations from attitudes to others, (n, 3, 3), as vectors in body axes, rad."""
-    between = np.einsum("nji,njk->nik", first, second)
-    rows = [2, 0, 1]
-    columns = [1, 2, 0]
-    return np.asarray(between[:, rows, columns] - between[:, columns, rows]) / 2.0
 
 
 def turned_on(quaternion: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -145,7 +146,7 @@ def open_loop(
     vehicle: Vehicle,
     stride: int = 1,
     before_step: Callable[[QuadcopterBatch], object] = id,
-) -> Iterator[tuple[float, list[Arrays], Arrays]]:
+) -> Iterator[tuple[float, list[FloatArray], FloatArray]]:
     """Fly recorded commands from recorded states.
 
     Each row from which a log flies on for long enough begins a window. Its rotors begin as the
@@ -155,64 +156,60 @@ def open_loop(
     :param stride: rows from a window to the next.
     :param before_step: called with the batch before each control step; it may set a wrench.
     :return: horizon by horizon: its s, the predictions in the order of ``HEADS``, and the record,
-        by quantity of the state, (windows, …).
+        each (windows, 13) as in ``Log.motion``.
     :raises ConfigError: no log flies for long enough, or the rotors do not lie as M1 to M4 do.
     """
     vehicle = first_vehicle(vehicle, "crazyflie")
     step = vehicle.control_step
     before = round(WARM_UP / step)
-    last = round(HORIZONS[-1] / step)
+    ends = [round(horizon / step) for horizon in HORIZONS]
     fit = []
     for log in logs:
+        fit.append(np.zeros(log.flying.size, bool))
         total = np.cumsum(log.flying)
-        # Rows so many of whose neighbours fly that all do.
-        whole = total[before + last :] - total[: -before - last] == before + last
-        fit.append(np.pad(whole, (before, log.flying.size - whole.size - before)))
+        length = before + ends[-1]
+        # All rows around it fly.
+        fit[-1][before : -ends[-1]] = total[length:] - total[:-length] == length
     rows = np.flatnonzero(np.concatenate(fit))[::stride]
     if rows.size == 0:
         raise ConfigError(f"no log flies above {LEAST_HEIGHT:g} m for {WARM_UP + HORIZONS[-1]:g} s")
-    record = {}
-    for name in ("position", "quaternion", "velocity", "body_rates", "thrusts"):
-        record[name] = np.concatenate([log.columns[name] for log in logs])
-    actions = vehicle.thrust_to_action(np.nan_to_num(record.pop("thrusts")))
-    start = {name: values[rows] for name, values in record.items()}
+    record = np.concatenate([log.motion for log in logs])
+    thrusts = np.concatenate([log.thrusts for log in logs])
+    actions = vehicle.thrust_to_action(np.nan_to_num(thrusts))
+    start = record[rows]
 
     settings = FlightSettings(vehicle=vehicle, noise=0.0)
     batch = QuadcopterBatch(rows.size, settings, seed=0, autoreset=False)
     batch.reset()
-    for now in range(-before, last):
+    motion = batch.state[: start.shape[1]]
+    for now in range(-before, ends[-1]):
         if now == 0:
-            for name, values in start.items():
-                batch.fix(name, values.T)
+            motion[:] = start.T
         before_step(batch)
         batch.step(actions[rows + now])
-        time = (now + 1) * step
-        if any(abs(time - horizon) < step / 2 for horizon in HORIZONS):
-            state = batch.true_state()
-            simulated = {name: getattr(state, name).copy() for name in start}
-            stays = {"position": start["position"] + start["velocity"] * time}
-            stays["quaternion"] = turned_on(start["quaternion"], start["body_rates"] * time)
-            end = {name: values[rows + now + 1] for name, values in record.items()}
-            yield time, [simulated, start, start | stays], end
+        if now + 1 in ends:
+            time = (now + 1) * step
+            stays = start.copy()
+            stays[:, POSITION] += start[:, VELOCITY] * time
+            stays[:, QUATERNION] = turned_on(start[:, QUATERNION], start[:, BODY_RATES] * time)
+            yield time, [motion.T.copy(), start, stays], record[rows + now + 1]
+
+
+def errors(prediction: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the root mean squares of the errors, in the order of ``QUANTITIES``, (4,)."""
+    gap = prediction - end
+    cosine = np.abs((prediction * end)[:, QUATERNION].sum(axis=1))
+    norms = [np.linalg.norm(gap[:, part], axis=1) for part in (POSITION, VELOCITY, BODY_RATES)]
+    norms.insert(2, np.degrees(2.0 * np.arccos(np.minimum(cosine, 1.0))))
+    return np.asarray(np.sqrt(np.square(norms).mean(axis=1)))
 
 
 def error_table(logs: Sequence[Log], vehicle: Vehicle) -> Table:
     """Return the errors of a vehicle in open loop, over all windows of all logs."""
-    rows: dict[str, list[str]] = {}
+    rows = []
     for time, predictions, end in open_loop(logs, vehicle):
-        for prediction in predictions:
-            for quantity, error in zip(QUANTITIES, errors(prediction, end), strict=True):
-                rows.setdefault(f"{quantity}, after {time:g} s", []).append(f"{error:.3g}")
-    title = f"{vehicle.name}: {len(end['position'])} windows of {len(logs)} logs, open loop"
-    return text_table(title, HEADS, [[name, *rows[name]] for name in sorted(rows)])
-
-
-def errors(prediction: Arrays, end: Arrays) -> Any:
-    """Return the root mean squares of the errors, in the order of ``QUANTITIES``, (4,)."""
-    one, other = (rotation_matrices(motion["quaternion"]) for motion in (prediction, end))
-    cosine = (np.einsum("nij,nij->n", one, other) - 1.0) / 2.0
-    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    names = ("position", "velocity", "body_rates")
-    norms = [np.linalg.norm(prediction[name] - end[name], axis=1) for name in names]
-    norms.insert(2, angle)
-    return np.sqrt(np.square(norms).mean(axis=1))
+        found = np.transpose([errors(prediction, end) for prediction in predictions])
+        for quantity, values in zip(QUANTITIES, found, strict=True):
+            rows.append([f"{quantity}, after {time:g} s", *(f"{value:.3g}" for value in values)])
+    title = f"{vehicle.name}: {len(end)} windows of {len(logs)} logs, open loop"
+    return text_table(title, HEADS, rows)
