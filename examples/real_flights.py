@@ -74,8 +74,11 @@ def main():
     better, spread = fit(fitted, vehicle, names)
     print(fit_text(better, spread, names))
     show(error_table(judged, better.model_copy(update={"name": "fitted"})))
-    show(moment_table(judged, better, fit_forces(fitted)[2] / 1000.0))
-    show(closed_loop_table(judged, vehicle))
+    _, drag, moment = fit_forces(fitted)
+    drag *= better.mass
+    better = better.model_copy(update={"drag": (drag, drag, better.drag[2])})
+    show(moment_table(judged, better, moment / 1000.0))
+    show(closed_loop_table(judged, load_vehicle(arguments.vehicle)))
 
 
 def show(table):
@@ -428,7 +431,7 @@ def moment_table(logs, vehicle, moment):
     for time, predictions, end in open_loop(logs, vehicle, before_step=push):
         for quantity, error in zip(QUANTITIES, errors(predictions[0], end), strict=True):
             rows[f"{quantity}, after {time:g} s"] = f"{error:.3g}"
-    title = f"{vehicle.name}, with a moment of {1000 * moment:.2g} mN m by m/s of airspeed"
+    title = f"drag {vehicle.drag[0]:.3f} N s/m, and {1000 * moment:.2g} mN m by m/s of airspeed"
     return text_table(title, ("open loop", "simulated"), [[k, rows[k]] for k in sorted(rows)])
 
 

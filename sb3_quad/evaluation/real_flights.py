@@ -212,4 +212,7 @@ def error_table(logs: Sequence[Log], vehicle: Vehicle) -> Table:
         for quantity, values in zip(QUANTITIES, found, strict=True):
             rows.append([f"{quantity}, after {time:g} s", *(f"{value:.3g}" for value in values)])
     title = f"{vehicle.name}: {len(end)} windows of {len(logs)} logs, open loop"
-    return text_table(title, HEADS, rows)
+    thrusts = np.concatenate([log.thrusts[log.flying] for log in logs])
+    clipped = (np.abs(vehicle.thrust_to_action(thrusts)) > 1.0).mean()
+    caption = f"{clipped:.1%} of the commands are beyond the rotors' limits, and clipped"
+    return text_table(title, HEADS, rows)._replace(caption=caption)
