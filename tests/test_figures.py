@@ -24,7 +24,11 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "docs/research/readme"
 NOTE = "docs/research/results.md"
 # Pages that show the PID's recoveries of other episodes, which they name.
-OTHER_EPISODES = ("docs/research/experts.md", "docs/research/vehicles.md")
+OTHER_EPISODES = (
+    "docs/research/experts.md",
+    "docs/research/reality.md",
+    "docs/research/vehicles.md",
+)
 
 
 def survival(metrics):
