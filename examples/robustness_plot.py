@@ -1,7 +1,8 @@
 r"""The picture of docs/agents.md: success and final error over what scenarios of a suite vary.
 
-    sb3-quad evaluate pid geometric itm-robust --suite robustness \
-        --scenario mass constant_force -o FOLDER
+    PYTHONPATH=examples sb3-quad evaluate PID=pid geometric "RL agent=itm-recovery" \
+        itm-robust RAPTOR=raptor:Raptor --suite robustness \
+        --scenario mass constant_force motor_gain delay noise wandering_gusts -o FOLDER
     python examples/robustness_plot.py FOLDER robustness.png
 
 A scenario that varies nothing, or two quantities at once, has no panel.
@@ -32,7 +33,7 @@ def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> N
     """
     (key,) = cells[0].cell
     for number, controller in enumerate(results.controllers):
-        colour = f"C{number}"
+        colour = results.colours[controller.label]
         style: dict[str, Any] = {
             "marker": MARKERS[number % len(MARKERS)],
             "markersize": 5,
