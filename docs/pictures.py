@@ -4,8 +4,8 @@ r"""Make the pictures of the pages anew, each by the commands that stand beside 
     make pictures ARGS="starts.png"     # only these
     make pictures-long                  # those of agents that are trained first, in hours
 
-The commands run in ``build/pictures/``. A folder of results that is there is used as it is, so that
-pictures share it, and an interrupted one goes on.
+The commands run in ``build/pictures/``. What is flown or trained there once is kept for later calls;
+``build/pictures/finished.txt`` lists these commands. Empty the folder to begin anew.
 """
 
 import argparse
@@ -19,6 +19,8 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 BUILD = ROOT / "build/pictures"
+FINISHED = BUILD / "finished.txt"
+KEPT = ("evaluate", "train", "sweep")  # whose folders later calls use
 
 # Agents and evaluations that several pictures show.
 CHAPTER_4 = """
@@ -193,14 +195,17 @@ def main() -> None:
     if unknown:
         parser.error(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(PICTURES)}")
     BUILD.mkdir(parents=True, exist_ok=True)
-    done: list[list[str]] = []
+    FINISHED.touch()
     for name in options.pictures or (LONG if options.long else SHORT):
         for words in commands(PICTURES[name]):
-            # What several pictures show is flown and trained once.
-            if words not in done:
-                print("$", shlex.join(words), flush=True)
-                run(words)
-                done.append(words)
+            line = shlex.join(words)
+            if line in FINISHED.read_text().splitlines():
+                continue
+            print("$", line, flush=True)
+            run(words)
+            if words[1] in KEPT:
+                with FINISHED.open("a") as file:
+                    print(line, file=file)
         options.into.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(BUILD / name, options.into / name)
         print(f"{options.into / name}", flush=True)

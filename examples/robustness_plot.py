@@ -20,7 +20,7 @@ from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
-COLUMNS = 3
+COLUMNS = 2
 MARKERS = "osD^vP"
 # m. The axis is logarithmic; smaller errors are drawn there.
 LEAST_ERROR = 1e-3
@@ -91,7 +91,7 @@ def draw(results: Results) -> Figure:
         )
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(4.2 * columns, 4.4 * rows), dpi=120, layout="constrained")
+    figure = Figure(figsize=(4.2 * columns, 3.9 * rows), dpi=120, layout="constrained")
     places = figure.subfigures(rows, columns, squeeze=False).flat
     for place, (part, cells) in enumerate(zip(places, groups.values(), strict=False)):
         top, bottom = part.subplots(2, 1, sharex=True)

@@ -103,7 +103,7 @@ def _draw_path(
     begins = acts & ~np.roll(acts, 1)
     force = track.wrench[begins, :3]
     direction = force / np.linalg.norm(force, axis=1, keepdims=True)
-    axes.quiver(*path[begins].T, *direction[:, plane].T, color=FORCE, scale=8, width=0.006)
+    axes.quiver(*path[begins].T, *direction[:, plane].T, color=FORCE, scale=12, width=0.006)
 
 
 @styled
