@@ -4,7 +4,7 @@ r"""Make the pictures of the pages anew, each by the commands that stand beside 
     make pictures ARGS="starts.png"     # only these
     make pictures-long                  # those of agents that are trained first, in hours
 
-The commands run in ``build/pictures/``. What is flown or trained there once is kept for later calls;
+The commands run in ``build/pictures/``. What is flown or trained there is kept for later calls;
 ``build/pictures/finished.txt`` lists these commands. Empty the folder to begin anew.
 """
 
@@ -128,12 +128,12 @@ sb3-quad plot "RL-agent=printed/ppo_bc/QuadStateRecovery-v0_1" --thesis state_re
 """,
     "reference_recovery_curves.png": PRINTED_PPO.format(env="QuadStateRecovery-v0")
     + """
-sb3-quad plot "PPO only=printed_ppo/ppo_bc/QuadStateRecovery-v0_1" --thesis state_recovery
+sb3-quad plot "PPO only, on recoveries=printed_ppo/ppo_bc/QuadStateRecovery-v0_1" --thesis state_recovery
     --show survival reward -o reference_recovery_curves.png
 """,
     "reference_tracking_curves.png": PRINTED_PPO.format(env="QuadTargetTracking-v0")
     + """
-sb3-quad plot "PPO only=printed_ppo/ppo_bc/QuadTargetTracking-v0_1" --thesis target_tracking
+sb3-quad plot "PPO only, on targets=printed_ppo/ppo_bc/QuadTargetTracking-v0_1" --thesis target_tracking
     --show survival reward -o reference_tracking_curves.png
 """,
     "cloning.png": """

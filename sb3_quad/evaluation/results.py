@@ -47,8 +47,8 @@ COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8
 NAMED = re.compile(
     r"""
     (pid(?:.expert)?) | (geometric(?:.expert)?) | (itm-robust | our.agent.\(itm-robust\))
-    | (rl.agent | itm-recovery | thesis-recovery) | (any.quadcopter)
-    | (il.agent | imitation.agent | itm-imitation | thesis-imitation) | (raptor | ppo.only)
+    | (rl.agent(?:,.second.half)? | itm-recovery | thesis-recovery) | (any.quadcopter)
+    | (il.agent | imitation.agent | itm-imitation | thesis-imitation) | (raptor | ppo.only.*)
     """,
     re.IGNORECASE | re.VERBOSE,
 )
