@@ -128,13 +128,13 @@ sb3-quad plot "RL-agent=printed/ppo_bc/QuadStateRecovery-v0_1" --thesis state_re
 """,
     "reference_recovery_curves.png": PRINTED_PPO.format(env="QuadStateRecovery-v0")
     + """
-sb3-quad plot "PPO only, on recoveries=printed_ppo/ppo_bc/QuadStateRecovery-v0_1" --thesis state_recovery
-    --show survival reward -o reference_recovery_curves.png
+sb3-quad plot "PPO only, on recoveries=printed_ppo/ppo_bc/QuadStateRecovery-v0_1"
+    --thesis state_recovery --show survival reward -o reference_recovery_curves.png
 """,
     "reference_tracking_curves.png": PRINTED_PPO.format(env="QuadTargetTracking-v0")
     + """
-sb3-quad plot "PPO only, on targets=printed_ppo/ppo_bc/QuadTargetTracking-v0_1" --thesis target_tracking
-    --show survival reward -o reference_tracking_curves.png
+sb3-quad plot "PPO only, on targets=printed_ppo/ppo_bc/QuadTargetTracking-v0_1"
+    --thesis target_tracking --show survival reward -o reference_tracking_curves.png
 """,
     "cloning.png": """
 sb3-quad train --algo dagger --env QuadTargetTracking-v0 -n 240000

@@ -149,7 +149,8 @@ def main() -> None:
         # With adaptive scaling, an agent has a lighter tone of its own colour.
         colours = colours_of([*plain])
         for label in plain:
-            light = [0.5 * (1.0 + part) for part in to_rgb(colours[label])]
+            red, green, blue = to_rgb(colours[label])
+            light = (0.5 + 0.5 * red, 0.5 + 0.5 * green, 0.5 + 0.5 * blue)
             colours[f"{label} (adaptive)"] = to_hex(light)
         write_bytes(options.output, arrivals_plot(scenario, metrics, colours).png)
 

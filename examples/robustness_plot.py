@@ -91,7 +91,7 @@ def draw(results: Results) -> Figure:
         )
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(4.2 * columns, 3.9 * rows), dpi=120, layout="constrained")
+    figure = Figure(figsize=(4.2 * columns, 4.3 * rows), dpi=120, layout="constrained")
     places = figure.subfigures(rows, columns, squeeze=False).flat
     for place, (part, cells) in enumerate(zip(places, groups.values(), strict=False)):
         top, bottom = part.subplots(2, 1, sharex=True)

@@ -60,10 +60,10 @@ def colours_of(names: Sequence[str]) -> dict[str, str]:
     A well-known controller has the same one everywhere. The others take what is left, in their
     order, and share colours where more than eight fly.
     """
-    colours = {}
+    colours = dict.fromkeys(names, "")
     for name in names:
-        known = NAMED.fullmatch(name)
-        colours[name] = COLOURS[known.lastindex - 1] if known and known.lastindex else ""
+        if known := NAMED.fullmatch(name):
+            colours[name] = COLOURS[(known.lastindex or 1) - 1]
     free = cycle([colour for colour in COLOURS if colour not in colours.values()] or COLOURS)
     return {name: colour or next(free) for name, colour in colours.items()}
 

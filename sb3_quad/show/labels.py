@@ -47,10 +47,9 @@ def with_header(
 
 
 def mark_lost(picture: Pillow.Image, text: str, size: int) -> Pillow.Image:
-    """Return a picture in grey, with a red text of ``size`` pixels in its middle."""
+    """Return a picture in grey, with a red text of ``size`` pixels in its upper left corner."""
     grey = picture.convert("L").convert("RGB")
-    middle = (0.5 * grey.width, 0.5 * grey.height)
-    ImageDraw.Draw(grey).text(middle, text, LOST, font(size, "DejaVuSans-Bold"), "mm")
+    ImageDraw.Draw(grey).text((size, size), text, LOST, font(size, "DejaVuSans-Bold"))
     return grey
 
 
