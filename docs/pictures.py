@@ -89,8 +89,8 @@ sb3-quad evaluate PID=pid geometric "RL agent=itm-recovery" itm-robust RAPTOR=ra
 python examples/robustness_plot.py robustness robustness.png
 """,
 }
-# The committed ones were drawn when the trainings ran. Since then, only their colours have changed, and
-# those of the printed recipe were cut to three rows.
+# The committed ones were drawn when the trainings ran. Since then, only their colours have changed,
+# and those of the printed recipe were cut to three rows.
 LONG = {
     "geometric_recovery_curves.png": GEOMETRIC
     + """
