@@ -25,6 +25,8 @@ static uint32_t longest;
 
 void vTaskDelay(uint32_t ticks) { exit((int)ticks); }
 uint64_t usecTimestamp(void) { return 0; }
+
+/* OWN_PID: the firmware's own one is linked. */
 #ifndef OWN_PID
 void controllerPidInit(void) {}
 bool controllerPidTest(void) { return true; }
@@ -42,7 +44,7 @@ int app_size(void) { return (int)sizeof app; }
 float app_thrust_max(void) { return THRUST_MAX; }
 float app_thrust_min(void) { return THRUST_MIN; }
 
-/* Call the controller PERIOD times with the same state. Motors: thrusts of the first and of the last call, N; -1 under the PID. */
+/* Call the controller PERIOD times with the same state. Motors: thrusts of the first and of the last call, N; -1 under a PID that is ours. */
 static void control_step(const row *in, int fly, const int mode[7], int velocity_body, float motors[2][4])
 {
     static stabilizerStep_t steps;
@@ -76,7 +78,10 @@ static void control_step(const row *in, int fly, const int mode[7], int velocity
         for (int i = 0; i < 4; ++i) {
             float *motor = &motors[call > 0][i];
 
-            *motor = control.controlMode == controlModeForce ? pwm.list[i] / 65535.0f * THRUST_MAX : -1.0f;
+            *motor = pwm.list[i] / 65535.0f * THRUST_MAX;
+#ifndef OWN_PID
+            *motor = control.controlMode == controlModeForce ? *motor : -1.0f;
+#endif
         }
     }
 }
