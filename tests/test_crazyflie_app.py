@@ -34,7 +34,7 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 HERE = Path(__file__).resolve().parent
 STUBS = HERE / "firmware_stubs"
 sys.path.insert(0, str(HERE.parent / "examples" / "microcontroller"))
-import measure  # noqa: E402
+import measure  # type: ignore[import-not-found]  # noqa: E402
 
 CRAZYFLIE = load_vehicle("crazyflie")
 FIRMWARE = os.environ.get("CRAZYFLIE_FIRMWARE")
@@ -330,7 +330,7 @@ def test_it_recovers_as_its_zip(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", ["crazyflie-recovery", "crazyflie-robust", "any-quadcopter"])
 def test_960_recoveries_of_the_app_and_of_its_zip(tmp_path, name):
     zipped, flown = success(name, tmp_path, 960)
@@ -355,7 +355,7 @@ def test_the_microcontroller_computes_the_same_as_the_agents(tmp_path, name):
 
 
 def check_on_arm(folder, exported, tmp_path):
-    """Forces within 1e-6 of THRUST_MAX, and no call longer than half of the firmware's."""
+    """Thrusts within 2e-7 N, and no call longer than half of the firmware's."""
     rows_of(states(1000)).astype(np.float32).tofile(tmp_path / "in.bin")
     folders, distribution = includes()
     sources = [STUBS / "run.c", distribution]
@@ -367,10 +367,11 @@ def check_on_arm(folder, exported, tmp_path):
     command = [COMPILER, "-O2", *flags[1:], *(f"-I{path}" for path in (*folders, folder / "src"))]
     subprocess.run([*command, *sources, "-lm", "-o", here], check=True)
     subprocess.run([here], cwd=tmp_path, check=True, capture_output=True)
-    error = np.abs(there - np.fromfile(tmp_path / "out.bin", np.float32)).max()
-    print(f"{calls} steps, {instructions} instructions, longest call {longest}, error {error:.1e}")
+    # The forces are fractions of THRUST_MAX.
+    error = 0.12 * np.abs(there - np.fromfile(tmp_path / "out.bin", np.float32)).max()
+    print(f"{calls} steps, {instructions} instructions, longest call {longest}, {error:.1e} N")
     assert int(calls) == 1000 and there.size == 4000 and there.std() > 0.05
-    assert error <= 1e-6
+    assert error <= 2e-7
     assert int(longest) < 84_000
     # What the file says of itself, and what the ten calls of the firmware add.
     thousands = int(exported.metadata["cost"].split(" thousand")[0].split()[-1])

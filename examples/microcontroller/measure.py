@@ -108,7 +108,7 @@ def make(layers, activation, sees):
     model = PPO("MlpPolicy", env, policy_kwargs=arguments, seed=0, device="cpu")
     with torch.no_grad():
         for parameter in model.policy.mlp_extractor.policy_net.parameters():
-            parameter *= 3.0
+            parameter.mul_(3.0)
     FlightSettings(**sees).write_into(model)
     with tempfile.TemporaryDirectory() as folder:
         model.save(Path(folder) / "network.zip")
