@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX, TorchScript, a C header or an app for the Crazyflie.
+"""Write a trained policy as ONNX, TorchScript, C, or an app for the Crazyflie.
 
 The exported policy takes 18 numbers in physical units: position relative to the
 target, m, world frame; rotation matrix from world to body, row by row;
