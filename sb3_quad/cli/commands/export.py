@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX, TorchScript or a C header.
+"""Write a trained policy as ONNX, TorchScript, C, or an app for the Crazyflie.
 
 The exported policy takes 18 numbers in physical units: position relative to the
 target, m, world frame; rotation matrix from world to body, row by row;
@@ -15,6 +15,8 @@ examples:
   # rotor speeds instead of thrusts, rad/s
   sb3-quad export agent.zip --format torchscript --output speeds
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
+  # a folder that the Crazyflie's firmware builds
+  sb3-quad export crazyflie-robust --format crazyflie -o my_app
 
 ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. The check
 of a C header needs a C compiler.
@@ -33,7 +35,18 @@ from sb3_quad.cli.parser import (
 from sb3_quad.controllers.pretrained import agent_path
 
 # Facts about an exported policy that are printed, in this order.
-FACTS = ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check")
+FACTS = (
+    "vehicle",
+    "scaling",
+    "network",
+    "observation",
+    "state",
+    "result",
+    "rotors",
+    "app",
+    "cost",
+    "check",
+)
 
 
 FLAGS: Flags = {
@@ -42,10 +55,11 @@ FLAGS: Flags = {
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     ),
-    "--format": ({"required": True}, "onnx, torchscript or c"),
+    "--format": ({"required": True}, "onnx, torchscript, c or crazyflie"),
     "-o FILE": (
         {"dest": "file"},
-        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
+        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder); "
+        "for crazyflie the folder of the app (MODEL_crazyflie)",
     ),
     "--output KIND": (
         str,
@@ -64,30 +78,33 @@ def run(options: Namespace) -> int:
     from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import ControllerSpec
     from sb3_quad.export.c_header import c_name
-    from sb3_quad.export.policy import FORMATS, export_policy
+    from sb3_quad.export.policy import FORMATS, HEADER, export_policy
 
     refuse_unknown("format", [options.format], FORMATS)
     model = Path(options.model)
+    is_app = options.format == "crazyflie"
     file = Path(options.file or "")
-    # Without a suffix it is a folder; without -o, this one.
-    if file.is_dir() or not file.suffix:
+    # Without a suffix it is a folder; without -o, this one. An app is a folder itself.
+    if not options.file or (not is_app and (file.is_dir() or not file.suffix)):
         file /= model.stem + FORMATS[options.format]
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
-    refuse_existing(file, options.overwrite)
+    refuse_existing(file / HEADER if is_app else file, options.overwrite)
     name = options.name
     if name is None:
-        name = c_name(file.stem)
-    elif options.format != "c":
+        name = c_name(model.stem if is_app else file.stem)
+    elif options.format not in ("c", "crazyflie"):
         raise ConfigError(f"--name {name}: only a C header has one (--format c)")
     if options.vehicle:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))
     exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
-    write_bytes(file, exported.content)
+    files = exported.files or {"": exported.content}
+    for path, content in files.items():
+        write_bytes(file / path, content)
     unknown_settings = "in neither the zip nor its folder; assumed: itm, the scaling of Table A.2"
     print(f"settings: {exported.settings or unknown_settings}")
     for fact in FACTS:
         if fact in exported.metadata:
             print(f"{fact}: {exported.metadata[fact]}")
-    print(f"saved {file} ({len(exported.content)} bytes)")
+    print(f"saved {file} ({sum(map(len, files.values()))} bytes)")
     return 0
