@@ -88,6 +88,10 @@ class Metrics(Frozen):
     """mean delay along the path, s"""
     heading_error: Estimate | None
     """mean root mean square, degrees; None: no heading is asked for"""
+    cut_by_supervisor: Estimate | None = None
+    """share that the firmware would have cut, see Supervisor; None: the vehicle has no supervisor"""
+    low_force_time: float | None = None
+    """longest time of any flight that the specific force along body z stayed below 0.5 g, s"""
     course: Course | None
     """only of scenarios with waypoints"""
 
@@ -96,6 +100,12 @@ def summarise(flights: Flights) -> Metrics:
     """Return the metrics of some flights, at least one."""
     survived = flights.survival
     error = flights.final_error[survived]
+    supervised = np.isfinite(flights.low_force_time)
+    cut = None
+    longest = None
+    if supervised.any():
+        cut = share(flights.cut_by_supervisor[supervised])
+        longest = float(flights.low_force_time[supervised].max())
     course = None
     if flights.waypoint_times.shape[1] > 0:
         reached = np.isfinite(flights.waypoint_times)
@@ -122,6 +132,8 @@ def summarise(flights: Flights) -> Metrics:
         recovery_time=_moment(flights.recovery_time),
         cross_track_error=mean(flights.cross_track_error[survived]),
         **{name: mean(getattr(flights, name)) for name in FOLLOWED},
+        cut_by_supervisor=cut,
+        low_force_time=longest,
         course=course,
     )
 

@@ -199,6 +199,31 @@ def undo_flight(b, passed, gradient, by_wanted, dt, substeps):
         undo_accelerate(b, passed[substep], passed[substep + 1], gradient, by_wanted)
 
 
+@compiled
+def undo_limits(b, by_speed):
+    """Undo :func:`.physics.limit_speeds`, in place.
+
+    :param b: a block with the speeds before it, ``command``, and after it, ``wanted_speeds``.
+    :param by_speed: (4, LANES), by the speeds after it.
+    """
+    for lane in range(LANES):
+        fastest = 0
+        for k in range(4):
+            if b.command[k, lane] > b.command[fastest, lane]:
+                fastest = k
+        greatest, shared = b.greatest_speed[lane], b.shared[lane]
+        if b.command[fastest, lane] <= greatest:
+            continue
+        taken = 0.0
+        for k in range(4):
+            # A shared excess that is taken off may leave nothing.
+            is_cut = b.command[k, lane] > greatest and shared == 0.0
+            if is_cut or b.wanted_speeds[k, lane] == 0.0:
+                by_speed[k, lane] = 0.0
+            taken += by_speed[k, lane]
+        by_speed[fastest, lane] -= shared * taken
+
+
 @compiled(fastmath=True)
 def undo_noise(b, by_feature):
     """Undo noise and scaling of the features (Eq. 3.16), in place.
