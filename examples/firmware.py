@@ -1,4 +1,4 @@
-"""What the firmware of a Crazyflie does with flights: whose motors it cuts, what a low battery costs.
+"""What the firmware of a Crazyflie does with flights: whom it cuts, what a low battery costs.
 
     python examples/firmware.py volts
     python examples/firmware.py supervisor crazyflie-robust my.zip -n 3840
@@ -122,6 +122,7 @@ def flown(arguments, agent, task, hooks=(), **changes) -> Flights:
 
 
 def print_supervisor(arguments) -> None:
+    """Print how many flights would be cut, by this package's rule and by the firmware's own."""
     for agent in arguments.agents:
         for task in TASKS:
             firmware = Firmware()
@@ -135,6 +136,7 @@ def print_supervisor(arguments) -> None:
 
 
 def print_battery(arguments) -> None:
+    """Print how flights go with a full and a low battery, by either saturation."""
     vehicle = load_vehicle(arguments.vehicle)
     shared = vehicle.model_copy(update={"saturation": "shared"})
     low = {"randomize": {"battery": arguments.lowest}}
@@ -158,6 +160,7 @@ def print_battery(arguments) -> None:
 
 
 def main() -> None:
+    """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=["volts", "supervisor", "battery"])
     parser.add_argument("agents", nargs="*")

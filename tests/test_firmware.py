@@ -133,9 +133,7 @@ def test_who_judges_a_vehicle_changes_nothing_else():
     least=st.floats(0.0, 0.06),
     seed=st.integers(0, 2**31),
 )
-def test_a_low_battery_limits_each_rotor_or_all_by_the_same_speed(
-    saturation, battery, least, seed
-):
+def test_a_low_battery_limits_each_rotor_or_all_by_the_same_speed(saturation, battery, least, seed):
     changes = {"saturation": saturation, "rotor_thrust_limits": [least, 0.1125]}
     vehicle = CRAZYFLIE.model_copy(update=changes)
     full, low = (

@@ -19,7 +19,12 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from typing_extensions import Self
 
 from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
-from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost, low_force_cost
+from sb3_quad.algorithms.flight_cost import (
+    FlownStates,
+    cost_and_gradients,
+    flight_cost,
+    low_force_cost,
+)
 from sb3_quad.algorithms.networks.gradients import Passes
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath

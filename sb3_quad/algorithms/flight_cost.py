@@ -19,8 +19,8 @@ HEADING = 0.1
 # Below this height, m, a flight is in danger.
 LOW = 1.5
 GRAVITY = 9.81  # m/s²
-# Mean specific force along body z that is to be reached, g, over how many seconds
-LEAST_FORCE = 0.55
+# How much the mean specific force along body z may lack of 1 g, and over how many seconds
+LACK = 0.45
 WINDOW = 0.8
 
 
@@ -127,4 +127,4 @@ def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
     sums = pad(lack, (0, 0, 1, 0)).cumsum(dim=0)
     window = round(WINDOW / control_step)
     mean = (sums - pad(sums, (0, 0, window, 0))[: len(sums)]) / window
-    return (mean - (1.0 - LEAST_FORCE)).clamp(min=0.0).square()
+    return (mean - LACK).clamp(min=0.0).square()

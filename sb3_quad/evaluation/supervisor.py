@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_quad.base.types import BoolArray
-from sb3_quad.simulation.state import P, QuadcopterState
+from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
+G = 9.81  # m/s^2, the unit of what follows
 # Specific forces in g, and the times in s that they may last
 LOW = 0.5
 LOW_TIME = 1.0
@@ -47,9 +48,9 @@ class Supervisor:
 
     def see(self, state: QuadcopterState, flying: BoolArray) -> None:
         """See the state after a control step; only the flights (n,) that continue count."""
-        if state.vehicles is None or not self._watched.any():
+        if not self._watched.any():
             return
-        force = state.specific_force / state.vehicles[P.gravity][:, None]
+        force = state.specific_force / G
         along_z = force[:, 2]
         falls = (np.abs(force) < FREE_FALL).all(axis=1)
         self._steps += 1.0

@@ -211,17 +211,19 @@ def undo_limits(b, by_speed):
         for k in range(4):
             if b.command[k, lane] > b.command[fastest, lane]:
                 fastest = k
-        greatest, shared = b.greatest_speed[lane], b.shared[lane]
+        greatest = b.greatest_speed[lane]
         if b.command[fastest, lane] <= greatest:
             continue
+        is_shared = b.shared[lane] > 0.0
         taken = 0.0
         for k in range(4):
-            # A shared excess that is taken off may leave nothing.
-            is_cut = b.command[k, lane] > greatest and shared == 0.0
-            if is_cut or b.wanted_speeds[k, lane] == 0.0:
+            # What is taken off all may stop a rotor.
+            stops = b.wanted_speeds[k, lane] == 0.0
+            if stops or (b.command[k, lane] > greatest and not is_shared):
                 by_speed[k, lane] = 0.0
             taken += by_speed[k, lane]
-        by_speed[fastest, lane] -= shared * taken
+        if is_shared:
+            by_speed[fastest, lane] -= taken
 
 
 @compiled(fastmath=True)
