@@ -58,7 +58,12 @@ def print_volts() -> None:
     """
     for name, (polynomial, largest) in MOTORS.items():
         thrust = np.polynomial.Polynomial(polynomial)
-        print(f"{name}, at most {largest} N a rotor:")
+        least = [root.real for root in (thrust - largest).roots() if abs(root.imag) < 1e-9]
+        slower = math.sqrt(thrust(0.9 * min(least)) / largest)
+        print(
+            f"{name}, at most {largest} N a rotor, at {min(least):.2f} V; with 90 % of that voltage"
+            f" it turns at {100 * slower:.0f} % of the speed:"
+        )
         for voltage in VOLTAGES:
             # Compensated, a command gets its thrust as long as the voltage suffices.
             most = min(thrust(voltage) / largest, 1.0)
@@ -128,7 +133,8 @@ def print_supervisor(arguments) -> None:
             firmware = Firmware()
             flights = flown(arguments, agent, task, [firmware])
             print(
-                f"{agent}, {task}: {flights.cut_by_supervisor.sum()} of {flights.n} cut, longest"
+                f"{agent}, {task}: {flights.success.sum()} succeed, settling time"
+                f" {np.nanmean(flights.settling_time[0.1]):.2f} s, {flights.cut_by_supervisor.sum()} of {flights.n} cut, longest"
                 f" {1000 * np.nanmax(flights.low_force_time):.0f} ms below 0.5 g; filtered and at"
                 f" 25 Hz, by phase: {firmware.cut.sum(axis=1).tolist()}",
                 flush=True,
