@@ -199,6 +199,33 @@ def undo_flight(b, passed, gradient, by_wanted, dt, substeps):
         undo_accelerate(b, passed[substep], passed[substep + 1], gradient, by_wanted)
 
 
+@compiled
+def undo_limits(b, by_speed):
+    """Undo :func:`.physics.limit_speeds`, in place.
+
+    :param b: a block with the speeds before it, ``command``, and after it, ``wanted_speeds``.
+    :param by_speed: (4, LANES), by the speeds after it.
+    """
+    for lane in range(LANES):
+        fastest = 0
+        for k in range(4):
+            if b.command[k, lane] > b.command[fastest, lane]:
+                fastest = k
+        greatest = b.greatest_speed[lane]
+        if b.command[fastest, lane] <= greatest:
+            continue
+        is_shared = b.shared[lane] > 0.0
+        taken = 0.0
+        for k in range(4):
+            # What is taken off all may stop a rotor.
+            stops = b.wanted_speeds[k, lane] == 0.0
+            if stops or (b.command[k, lane] > greatest and not is_shared):
+                by_speed[k, lane] = 0.0
+            taken += by_speed[k, lane]
+        if is_shared:
+            by_speed[fastest, lane] -= taken
+
+
 @compiled(fastmath=True)
 def undo_noise(b, by_feature):
     """Undo noise and scaling of the features (Eq. 3.16), in place.

@@ -9,6 +9,7 @@ on where in the batch it stands.
 """
 
 import inspect
+import math
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,7 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         # Both divided by kF
         "thrust_middle": (),
         "thrust_half_range": (),
+        "greatest_speed": (),  # of a rotor, with the battery as it is, rad/s
         "speed2": (),  # the larger of |v|² and |ω|²
         # limits and costs of the row's task
         "scored": len(SCORED),
@@ -137,6 +139,7 @@ def _block_type() -> Any:
         ("vehicle", "drag", P.drag_x, 3),
         ("vehicle", "lift", P.thrust_coefficient, ()),
         ("vehicle", "exact", P.exact_motors, ()),
+        ("vehicle", "shared", P.shared_saturation, ()),
         ("vehicle", "radius", P.collision_radius, ()),
         ("vehicle", "delay", P.delay, ()),
         # The moment of each rotor per thrust, by axis
@@ -445,6 +448,8 @@ def load_vehicles(b, vehicles, first, count, dt):
         b.motor[1, lane] = motor_factor(v[P.motor_gain_down, lane], exact, dt)
         b.thrust_middle[lane] = v[P.thrust_middle, lane] / lift
         b.thrust_half_range[lane] = v[P.thrust_half_range, lane] / lift
+        most = b.thrust_middle[lane] + b.thrust_half_range[lane]
+        b.greatest_speed[lane] = math.sqrt(most * v[P.battery, lane])
         b.velocity_gain[lane] = dt / v[P.mass, lane]
         b.fall[lane] = dt * v[P.gravity, lane]
         ixx, iyy, izz = vector(b.inertia, lane)

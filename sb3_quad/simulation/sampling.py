@@ -183,7 +183,7 @@ def _sample_vector(table, k, share, unit, u, out):
 @compiled
 def _randomize_vehicle(i, streams, table, vehicles):
     """Multiply the parameters of vehicle i by the factors of the row's episode, in place."""
-    u = uniforms(streams, i, 7, VEHICLE)
+    u = uniforms(streams, i, 8, VEHICLE)
     if u[0] >= table[R.share]:
         return
     v = vehicles[:, i]
@@ -205,6 +205,7 @@ def _randomize_vehicle(i, streams, table, vehicles):
     thrust = between(table, R.thrust, u[6], 1.0)
     v[P.thrust_middle] *= thrust
     v[P.thrust_half_range] *= thrust
+    v[P.battery] = between(table, R.battery, u[14], 1.0)
 
     # The arms are measured from the centre of mass: roll arms are y of the rotors, pitch arms -x.
     arm = between(table, R.arm, u[7], 1.0)

@@ -11,6 +11,7 @@ from sb3_quad.simulation.adjoint import (
     MOVING,
     undo_features,
     undo_flight,
+    undo_limits,
     undo_noise,
     undo_relation,
 )
@@ -24,7 +25,7 @@ from sb3_quad.simulation.kernel import (
     new_block,
 )
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features, with_noise
-from sb3_quad.simulation.physics import rotor_speed
+from sb3_quad.simulation.physics import limit_speeds, rotor_speed
 from sb3_quad.simulation.random import STEP, random_words, standard_normals
 from sb3_quad.simulation.state import STATE_SIZE, P
 from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
@@ -52,7 +53,8 @@ class FlightTape:
     def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
         n = batch.n
         self.substeps = batch.substeps if substeps is None else substeps
-        self.physics_step = batch.physics_step * batch.substeps / self.substeps
+        self.control_step = batch.physics_step * batch.substeps
+        self.physics_step = self.control_step / self.substeps
         self.batch = batch
         self.n_steps = n_steps
         # The states before each control step and after the last one
@@ -236,12 +238,15 @@ def undo(
                 acted = step - np.int64(b.delay[lane])
                 for k in range(4):
                     if acted >= 0:
-                        b.wanted_speeds[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
+                        b.command[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
                     else:
-                        b.wanted_speeds[k, lane] = queue[step, k, i]
+                        b.command[k, lane] = queue[step, k, i]
+                    b.wanted_speeds[k, lane] = b.command[k, lane]
+                limit_speeds(b, b.wanted_speeds, lane)
                 if step >= lengths[i]:
                     own[:, lane] = 0.0
             undo_flight(b, passed, own, by_wanted, physics_step, substeps)
+            undo_limits(b, by_wanted)
             for lane in range(count):
                 i = first + lane
                 for k in range(MOVING):
@@ -249,7 +254,7 @@ def undo(
                 acted = step - np.int64(b.delay[lane])
                 for k in range(4):
                     if acted >= 0 and abs(actions[acted, i, k]) < float32(1.0):
-                        slope = b.thrust_half_range[lane] / (2.0 * b.wanted_speeds[k, lane])
+                        slope = b.thrust_half_range[lane] / (2.0 * b.command[k, lane])
                         by_actions[acted, i, k] += slope * by_wanted[k, lane]
     atomic_add(control, DONE, taken)
     if leads:

@@ -40,6 +40,8 @@ PARAMETER_NAMES = (
     "hover_thrust",
     "thrust_middle",
     "thrust_half_range",
+    "battery",
+    "shared_saturation",
     "collision_radius",
     "delay",
     "roll_arm_0",
@@ -110,6 +112,11 @@ class Vehicle(Frozen):
     """the same in N"""
     rotor_speed_limits: Limits | None = Field(default=None, exclude=True)
     """the same as rotor speeds, rad/s"""
+    saturation: Literal["each", "shared"] = "each"
+    """where a low battery (randomize) does not give a command, each: this rotor turns as fast as it
+    can; shared: its missing speed is taken off all four, as Crazyflie's firmware does"""
+    supervisor: Literal["crazyflie"] | None = None
+    """whose firmware judges whether a flight would be cut, see evaluation/supervisor.py"""
     physics_step: PositiveFloat = Field(default=MAX_PHYSICS_STEP, le=MAX_PHYSICS_STEP)
     """s; at most 0.0025"""
     control_step: PositiveFloat = 0.01
@@ -244,8 +251,10 @@ class Vehicle(Frozen):
         return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
-        """Whether both have the same parameters; names and an expert's gains do not matter."""
-        unlike = {"name", *_FOUND}
+        """Whether both have the same parameters; names, an expert's gains and who judges their
+        flights do not matter.
+        """
+        unlike = {"name", "supervisor", *_FOUND}
         return self.model_dump(exclude=unlike) == other.model_dump(exclude=unlike)
 
     @property
@@ -365,6 +374,8 @@ class Vehicle(Frozen):
                 *self.drag,
                 self.hover_thrust,
                 *self._middle_and_half,
+                1.0,  # a full battery
+                self.saturation == "shared",
                 self.collision_radius,
                 self.delay,
                 *self.mixer[1:].flat,
