@@ -203,10 +203,12 @@ class Observer:
     def features(self, state):
         """Return the features without noise, in their units, (n, 18)."""
         to_body = rotation(state.quaternion).transpose(1, 2)
+        to_heading = self.from_heading.transpose(1, 2)
+        seen_in = to_heading if self.settings.features == "px4" else to_body
         parts = [
-            turn(self.from_heading.transpose(1, 2), state.position - self.target),
+            turn(to_heading, state.position - self.target),
             (to_body @ self.from_heading).flatten(1),
-            turn(to_body, state.velocity - self.target_velocity),
+            turn(seen_in, state.velocity - self.target_velocity),
             state.body_rates - turn(to_body, self.turning),
         ]
         return th.cat(parts, dim=1)
@@ -226,6 +228,10 @@ class Observer:
         """
         noisy = self.disturb(self.features(state), noise)
         scaled = (noisy - self.mean) / self.std
+        if self.settings.features == "px4":
+            shown = th.ones(OBSERVATION_SIZE)
+            shown[[5, 8, 11]] = 0.0
+            scaled = scaled * shown
         if self.settings.position_integral is not None:
             gain_dt, near2, slow2, limit = self.numbers.tolist()
             error, speed = noisy[:, 0:3], noisy[:, 12:15]

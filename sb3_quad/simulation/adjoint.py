@@ -219,6 +219,25 @@ def undo_noise(b, by_feature):
 
 
 @compiled(fastmath=True)
+def undo_turn(b, by_feature):
+    """Undo the turn of the velocity to world axes, in place.
+
+    :param b: a block whose features without noise are computed.
+    """
+    f = by_feature
+    for lane in range(LANES):
+        gx, gy, gz = vector(f[F.velocity :], lane)
+        vx, vy, vz = vector(b.feature[F.velocity :], lane)
+        for row in range(3):
+            k = F.rotation + 3 * row
+            x, y, z = vector(b.feature[k:], lane)
+            f[F.velocity + row, lane] = x * gx + y * gy + z * gz
+            # The velocity along this axis of the body, which the matrix turns.
+            v = x * vx + y * vy + z * vz
+            _add(f, k, lane, v * gx, v * gy, v * gz)
+
+
+@compiled(fastmath=True)
 def undo_relation(b, by_feature):
     """Undo what :func:`.observation.features` does for a reference that moves, in place."""
     f = by_feature

@@ -81,16 +81,19 @@ def turn_features(turn: Turn) -> FloatArray:
 
 
 @inlined
-def features(b, moves):
+def features(b, moves, for_px4):
     """Write the features of a loaded block, in the units of the table and without noise.
 
     They go to ``b.feature``, float32.
 
     :param moves: whether references move or have a heading; else the target rests.
+    :param for_px4: whether the velocity has world axes.
     """
     _features_at_rest(b)
     if moves:
         _relate(b)
+    if for_px4:
+        _turn_velocity(b)
 
 
 @fast
@@ -144,6 +147,19 @@ def _relate(b):
         out[F.position + 1, lane] = cosine * y - sine * x
 
 
+@fast
+def _turn_velocity(b):
+    """Turn the velocity from body to world axes, in place."""
+    out = b.feature
+    for lane in range(LANES):
+        vx, vy, vz = vector(out[F.velocity :], lane)
+        for k in range(3):
+            x = out[F.rotation + k, lane]
+            y = out[F.rotation + 3 + k, lane]
+            z = out[F.rotation + 6 + k, lane]
+            out[F.velocity + k, lane] = x * vx + y * vy + z * vz
+
+
 @inlined
 def with_noise(b, k, lane):
     """Return feature k of a lane with its noise, in its unit. Relative noise alone has its sign."""
@@ -174,12 +190,24 @@ def _disturb_and_scale(b):
 
 
 @inlined
-def observe(b, moves):
+def observe(b, moves, for_px4):
     """Write the scaled features of a loaded block with their noise to ``b.feature``.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
     """
-    features(b, moves)
+    features(b, moves, for_px4)
     random_words(b)
     standard_normals(b)
     _disturb_and_scale(b)
+    if for_px4:
+        clear_hidden(b.feature)
+
+
+@inlined
+def clear_hidden(values):
+    """Clear what PX4's module does not show, the last column of the rotation matrix.
+
+    :param values: by feature, (OBSERVATION_SIZE, LANES).
+    """
+    for row in range(3):
+        values[F.rotation + 3 * row + 2] = 0.0
