@@ -183,8 +183,8 @@ class FlightTape:
 @compiled
 def undo(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
-    moves, for_px4, ages, integrals, integral_numbers, by_observation, by_frames, by_integral, gradient,
-    by_actions, physics_step, substeps,
+    moves, for_px4, ages, integrals, integral_numbers, by_observation, by_frames, by_integral,
+    gradient, by_actions, physics_step, substeps,
 ):  # fmt: skip
     """Undo a control step and the observation after it; see :class:`FlightTape`.
 
