@@ -148,13 +148,14 @@ class Network(nn.Module):
         ]
 
 
-def build_network(reference: Reference, where: str = "model") -> Network:
+def build_network(reference: Reference, where: str = "model", features: str = "body") -> Network:
     """Build the network of an SB3 model with ``MlpPolicy``, on-policy, SAC's or TD3's, with its
     scaling and its rotors.
 
     :param where: the model in messages.
-    :raises ConfigError: an unknown output, other spaces than the quadcopter's, a policy that
-        :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
+    :param features: that it must have been trained with.
+    :raises ConfigError: an unknown output, other features or spaces than the quadcopter's, a policy
+        that :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
     """
     refuse_unknown("output", [reference.output], OUTPUTS)
@@ -170,6 +171,13 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     if model.action_space != ACTIONS:
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
+        )
+    seen = reference.observation.features
+    if seen != features:
+        way = "give --format px4" if seen == "px4" else "give --format onnx, torchscript or c"
+        raise ConfigError(
+            f"{where}: sees `features: {seen}`, not {features}; {way}, or train with --env-kwargs"
+            f" features:{features}"
         )
     # C knows these layers only.
     for layer in layers:

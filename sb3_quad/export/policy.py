@@ -3,6 +3,7 @@
 import hashlib
 import re
 import warnings
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -19,10 +20,12 @@ from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
+from sb3_quad.export.px4 import describe_px4, load_px4, px4_files, write_px4
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle
 
-FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
+# With the endings of their files
+FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h", "px4": ".tflite"}
 
 
 class Export(NamedTuple):
@@ -33,6 +36,7 @@ class Export(NamedTuple):
     max_error: float  # the largest difference to the policy, in `unit`
     unit: str  # N or rad/s
     settings: Path | None  # the file that vehicle and scaling came from, where they were not given
+    further: Mapping[str, bytes] = {}  # files beside it, by their endings
 
 
 def export_policy(
@@ -53,7 +57,8 @@ def export_policy(
     are those that :func:`agent_settings` finds in the zip or next to it, or else ``itm`` and Table
     A.2.
 
-    :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
+    :param file_format: ``onnx``, ``torchscript``, ``c`` or ``px4``.
+    :param output: ``thrusts`` or ``speeds``.
     :param vehicle: in whose body frame and order of the rotors the file speaks; its thrust limits,
         and for speeds its kF.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
@@ -70,14 +75,7 @@ def export_policy(
             f"--name {name!r}: must be a C identifier: "
             "letters, digits and underscores, a letter first"
         )
-    # Each format has a writer, and a reader for the check.
-    formats: StrDict = {
-        "onnx": (write_onnx, load.load_onnx),
-        "torchscript": (write_torchscript, load.load_torchscript),
-        "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
-    }
-    refuse_unknown("format", [file_format], formats)
-    write, read = formats[file_format]
+    refuse_unknown("format", [file_format], FORMATS)
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     settings, source = agent_settings(path)
@@ -90,9 +88,25 @@ def export_policy(
             "say with --vehicle which one's thrusts the file is to give"
         )
     flown = first_vehicle(given.vehicle)
+    # Each format has a writer, and a reader for the check.
+    formats: StrDict = {
+        "onnx": (write_onnx, load.load_onnx),
+        "torchscript": (write_torchscript, load.load_torchscript),
+        "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
+        "px4": (partial(write_px4, vehicle=flown), partial(load_px4, vehicle=flown)),
+    }
+    write, read = formats[file_format]
+    for_px4 = file_format == "px4"
     reference = Reference(model, settings, flown, output)
-    network = build_network(reference, f"model {path}")
+    network = build_network(reference, f"model {path}", "px4" if for_px4 else "body")
+    if for_px4 and (reference.clip or reference.turn.angle or output != "thrusts"):
+        raise ConfigError(
+            f"model {path}: --format px4 knows no normalize, no --output and no rotor_layout that "
+            "is turned; train without them"
+        )
     metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
+    if for_px4:
+        metadata |= describe_px4(flown)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
@@ -105,7 +119,8 @@ def export_policy(
             f"in {n_compared} observations of flights ({by})"
         )
         content = write(network, metadata)
-    return Export(content, metadata, error, network.unit, source)
+    further = px4_files(content, flown) if for_px4 else {}
+    return Export(content, metadata, error, network.unit, source, further)
 
 
 def _describe(

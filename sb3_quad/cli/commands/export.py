@@ -33,7 +33,18 @@ from sb3_quad.cli.parser import (
 from sb3_quad.controllers.pretrained import agent_path
 
 # Facts about an exported policy that are printed, in this order.
-FACTS = ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check")
+FACTS = (
+    "vehicle",
+    "scaling",
+    "network",
+    "observation",
+    "state",
+    "result",
+    "rotors",
+    "motors",
+    "parameters",
+    "check",
+)
 
 
 FLAGS: Flags = {
@@ -83,11 +94,18 @@ def run(options: Namespace) -> int:
     if options.vehicle:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))
     exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
-    write_bytes(file, exported.content)
+    files = {file: exported.content}
+    for suffix, content in exported.further.items():
+        beside = file.with_suffix(suffix)
+        refuse_existing(beside, options.overwrite)
+        files[beside] = content
+    for path, content in files.items():
+        write_bytes(path, content)
     unknown_settings = "in neither the zip nor its folder; assumed: itm, the scaling of Table A.2"
     print(f"settings: {exported.settings or unknown_settings}")
     for fact in FACTS:
         if fact in exported.metadata:
             print(f"{fact}: {exported.metadata[fact]}")
-    print(f"saved {file} ({len(exported.content)} bytes)")
+    for path, content in files.items():
+        print(f"saved {path} ({len(content)} bytes)")
     return 0
