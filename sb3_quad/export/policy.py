@@ -15,17 +15,25 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.tensors import ENDING
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.export.px4 import describe_px4, load_px4, px4_files, write_px4
+from sb3_quad.export.tensors import write_tensors
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle
 
 # With the endings of their files
-FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h", "px4": ".tflite"}
+FORMATS = {
+    "onnx": ".onnx",
+    "torchscript": ".pt",
+    "c": ".h",
+    "px4": ".tflite",
+    "safetensors": ENDING,
+}
 
 
 class Export(NamedTuple):
@@ -76,6 +84,15 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     refuse_unknown("format", [file_format], FORMATS)
+    if file_format == "safetensors":
+        _, source = agent_settings(path)
+        if vehicle is not None or output != "thrusts":
+            raise ConfigError(
+                "--format safetensors holds the agent as it is; give --vehicle and --output to"
+                " another format, or where it flies"
+            )
+        checked = {"check": "same weights, bit for bit, and so the same actions"}
+        return Export(write_tensors(path), checked, 0.0, "N", source)
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     settings, source = agent_settings(path)
