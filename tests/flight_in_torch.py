@@ -203,14 +203,15 @@ class Observer:
     def features(self, state):
         """Return the features without noise, in their units, (n, 18)."""
         to_body = rotation(state.quaternion).transpose(1, 2)
-        to_heading = self.from_heading.transpose(1, 2)
-        seen_in = to_heading if self.settings.features == "px4" else to_body
         parts = [
-            turn(to_heading, state.position - self.target),
+            turn(self.from_heading.transpose(1, 2), state.position - self.target),
             (to_body @ self.from_heading).flatten(1),
-            turn(seen_in, state.velocity - self.target_velocity),
+            turn(to_body, state.velocity - self.target_velocity),
             state.body_rates - turn(to_body, self.turning),
         ]
+        if self.settings.features == "px4":
+            error = state.position - self.target
+            parts = [error, to_body.flatten(1), state.velocity, state.body_rates]
         return th.cat(parts, dim=1)
 
     def disturb(self, features, noise):

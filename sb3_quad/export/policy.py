@@ -21,7 +21,7 @@ from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
-from sb3_quad.export.px4 import describe_px4, load_px4, px4_files, write_px4
+from sb3_quad.export.px4 import load_px4, motor_order, write_px4
 from sb3_quad.export.tensors import write_tensors
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle
@@ -85,14 +85,7 @@ def export_policy(
         )
     refuse_unknown("format", [file_format], FORMATS)
     if file_format == "safetensors":
-        _, source = agent_settings(path)
-        if vehicle is not None or output != "thrusts":
-            raise ConfigError(
-                "--format safetensors holds the agent as it is; give --vehicle and --output to"
-                " another format, or where it flies"
-            )
-        checked = {"check": "same weights, bit for bit, and so the same actions"}
-        return Export(write_tensors(path), checked, 0.0, "N", source)
+        return Export(write_tensors(path), {}, 0.0, "N", agent_settings(path)[1])
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     settings, source = agent_settings(path)
@@ -105,25 +98,18 @@ def export_policy(
             "say with --vehicle which one's thrusts the file is to give"
         )
     flown = first_vehicle(given.vehicle)
+    reference = Reference(model, settings, flown, output)
     # Each format has a writer, and a reader for the check.
     formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
         "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
-        "px4": (partial(write_px4, vehicle=flown), partial(load_px4, vehicle=flown)),
+        "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
     }
     write, read = formats[file_format]
     for_px4 = file_format == "px4"
-    reference = Reference(model, settings, flown, output)
     network = build_network(reference, f"model {path}", "px4" if for_px4 else "body")
-    if for_px4 and (reference.clip or reference.turn.angle or output != "thrusts"):
-        raise ConfigError(
-            f"model {path}: --format px4 knows no normalize, no --output and no rotor_layout that "
-            "is turned; train without them"
-        )
     metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
-    if for_px4:
-        metadata |= describe_px4(flown)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
@@ -136,7 +122,10 @@ def export_policy(
             f"in {n_compared} observations of flights ({by})"
         )
         content = write(network, metadata)
-    further = px4_files(content, flown) if for_px4 else {}
+    further = {}
+    for ending in (".params", ".cpp") * for_px4:
+        text = render("sb3_quad.export", f"px4{ending}.j2", vehicle=flown, content=content)
+        further[ending] = text.encode("ascii")
     return Export(content, metadata, error, network.unit, source, further)
 
 
@@ -155,6 +144,7 @@ def _describe(
         limits=reference.results([-1.0, 1.0]),
         features=FEATURES,
         places=GROUPS,
+        motors=motor_order(vehicle) if network.observation.features == "px4" else [],
         n_parameters=parameters_to_vector(network.parameters()).numel(),
         needs=network.observation.model_dump(mode="json", exclude={"preview"}),
     )

@@ -1,152 +1,140 @@
-"""A policy as PX4's module mc_nn_control computes it: a TensorFlow Lite file, the module's
-parameters, and the C++ file with the network that PX4 is built with.
+"""A policy as a TensorFlow Lite file for PX4's module mc_nn_control.
 
 What the module gives a network and makes of its results is in ``src/modules/mc_nn_control`` of
 PX4-Autopilot: ``PopulateInputTensor``, ``RegisterOps``, ``RescaleActions``.
 """
 
-import math
-import textwrap
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from torch import nn
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
-from sb3_quad.base.types import FloatArray, StrDict
+from sb3_quad.base.types import AnyArray, Float32Array, StrDict
+from sb3_quad.export.check import Reference
 from sb3_quad.export.load import Call
 from sb3_quad.export.network import Network
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
+from sb3_quad.simulation.observation import GROUPS, F
 from sb3_quad.vehicles.vehicle import Vehicle
 
 ARENA = 10 * 1024  # bytes that the module gives the interpreter
-WHERE = "--format px4"
-# The features behind the 15 inputs: the module shows target - position, then the rows of the
-# rotation from body to world, of which two columns of ours are the first two.
-SHOWN = [*range(F.position, F.position + 3)]
-SHOWN += [F.rotation + 3 * row + column for column in range(2) for row in range(3)]
-SHOWN += range(F.velocity, OBSERVATION_SIZE)
-SIGNS = np.repeat([-1.0, 1.0], [3, 12])
+# The features behind the 15 inputs. The module shows the first two rows of the rotation matrix from
+# body to world, which are columns of ours, and target - position.
+SHOWN = np.r_[
+    GROUPS["position"],
+    F.rotation : F.velocity : 3,
+    F.rotation + 1 : F.velocity : 3,
+    GROUPS["velocity"],
+    GROUPS["body_rates"],
+]
+SIGNS = np.repeat(np.float32([-1, 1]), [3, 12])
 # Motors 1 to 4 of PX4's quadcopter X: the signs of x (forward) and y (left)
-CORNERS = {(1, -1): "front right", (-1, 1): "back left", (1, 1): "front left"}
-CORNERS[-1, -1] = "back right"
-# MC_NN_THRST_COEF may be this, at most; the module divides it by _SCALE.
-_LARGEST = 5.0
-_SCALE = 1e5
-
-Layer = tuple[FloatArray, FloatArray, bool]
-"""Weights (outputs, inputs), bias (outputs,), and whether a ReLU follows."""
+CORNERS = [(1, -1), (-1, 1), (1, 1), (-1, -1)]
 
 
-def write_px4(network: Network, metadata: StrDict, vehicle: Vehicle) -> bytes:
-    """Return the TensorFlow Lite file: inputs float32 (1, 15), outputs (1, 4), the motors' actions.
+def write_px4(network: Network, metadata: StrDict, reference: Reference) -> bytes:
+    """Return the file: inputs float32 (1, 15), outputs (1, 4), the actions of PX4's motors.
 
-    :param network: that sees ``features: px4`` in the vehicle's own layout.
+    :param network: of ``reference``.
     :raises ConfigError: tflite is not installed; a network that the module cannot compute.
     """
-    tflite = require("tflite", "px4", WHERE)
-    builder = require("flatbuffers", "px4", WHERE).Builder(0)
+    tflite = require("tflite", "px4", "--format px4")
+    builder = require("flatbuffers", "px4", "--format px4").Builder()
+    _check(network, reference)
+    linear = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
+    weights = [layer.weight.numpy() for layer in linear]
+    biases = [layer.bias.numpy() for layer in linear]
+    # The first layer scales its inputs, the last one numbers the motors as PX4 does.
+    scaled = weights[0][:, SHOWN] * network.inverse_std.numpy()[SHOWN]
+    biases[0] = biases[0] - scaled @ network.mean.numpy()[SHOWN]
+    weights[0] = scaled * SIGNS
+    motors = motor_order(reference.vehicle)
+    weights[-1] = weights[-1][motors]
+    biases[-1] = biases[-1][motors]
 
-    def table(kind: str, **fields: Any) -> int:
+    def table(kind: str, **fields: Any) -> Any:
         getattr(tflite, f"{kind}Start")(builder)
         for name, value in fields.items():
             getattr(tflite, f"{kind}Add{name}")(builder, value)
-        return int(getattr(tflite, f"{kind}End")(builder))
+        return getattr(tflite, f"{kind}End")(builder)
 
-    def tables(offsets: list[int]) -> int:
-        builder.StartVector(4, len(offsets), 4)
-        for offset in reversed(offsets):
-            builder.PrependUOffsetTRelative(offset)
-        return int(builder.EndVector())
+    def vector(values: Sequence[Any], prepend: Callable[[Any], None], size: int = 4) -> Any:
+        # The interpreter reads numbers where they are, so all are aligned.
+        builder.StartVector(size, len(values), 16)
+        for value in reversed(values):
+            prepend(value)
+        return builder.EndVector()
 
-    def numbers(*values: int) -> int:
-        return int(builder.CreateNumpyVector(np.array(values, np.int32)))
+    def numbers(*values: int) -> Any:
+        return vector(values, builder.PrependInt32)
 
-    # The first buffer is empty, and belongs to the tensors that the network computes.
-    buffers = [table("Buffer")]
-    tensors: list[int] = []
-    operators = []
+    def tables(offsets: list[Any]) -> Any:
+        return vector(offsets, builder.PrependUOffsetTRelative)
 
-    def tensor(shape: tuple[int, ...], values: FloatArray | None = None) -> int:
-        buffer = 0
+    buffers: list[Any] = []
+    tensors: list[Any] = []
+
+    def tensor(shape: Sequence[int], values: AnyArray | None = None) -> int:
+        # What the network computes has an empty buffer. Float32 is the schema's default.
+        filled = {}
         if values is not None:
-            content = values.astype("<f4").tobytes()
-            # The interpreter reads the numbers where they are.
-            builder.StartVector(1, len(content), 16)
-            for byte in reversed(content):
-                builder.PrependByte(byte)
-            buffer = len(buffers)
-            buffers.append(table("Buffer", Data=builder.EndVector()))
-        dimensions = numbers(*shape)
-        tensors.append(
-            table("Tensor", Shape=dimensions, Type=tflite.TensorType.FLOAT32, Buffer=buffer)
-        )
+            filled["Data"] = vector(values.tobytes(), builder.PrependByte, 1)
+        buffers.append(table("Buffer", **filled))
+        tensors.append(table("Tensor", Shape=numbers(*shape), Buffer=len(tensors)))
         return len(tensors) - 1
 
+    operators = []
     last = tensor((1, len(SHOWN)))
-    for weights, bias, bends in _layers(network, vehicle):
-        inputs = numbers(last, tensor(weights.shape, weights), tensor(bias.shape, bias))
+    for shape, weight, bias in zip(network.shapes, weights, biases, strict=True):
+        bends = int(shape["activation"] == "relu")
+        inputs = numbers(last, tensor(weight.shape, weight), tensor(bias.shape, bias))
         last = tensor((1, len(bias)))
-        outputs = numbers(last)
-        options = table("FullyConnectedOptions", FusedActivationFunction=int(bends))
-        operators.append(
-            table(
-                "Operator",
-                Inputs=inputs,
-                Outputs=outputs,
-                BuiltinOptionsType=tflite.BuiltinOptions.FullyConnectedOptions,
-                BuiltinOptions=options,
-            )
-        )
+        operator = {
+            "Inputs": inputs,
+            "Outputs": numbers(last),
+            "BuiltinOptions": table("FullyConnectedOptions", FusedActivationFunction=bends),
+            "BuiltinOptionsType": tflite.BuiltinOptions.FullyConnectedOptions,
+        }
+        operators.append(table("Operator", **operator))
     kind = tflite.BuiltinOperator.FULLY_CONNECTED
-    codes = tables([table("OperatorCode", DeprecatedBuiltinCode=kind, BuiltinCode=kind, Version=1)])
+    code = table("OperatorCode", DeprecatedBuiltinCode=kind, BuiltinCode=kind, Version=1)
     graph = {
         "Tensors": tables(tensors),
         "Inputs": numbers(0),
         "Outputs": numbers(last),
         "Operators": tables(operators),
     }
-    graphs = tables([table("SubGraph", **graph)])
-    described = builder.CreateString(metadata["policy"])
-    model = {"OperatorCodes": codes, "Subgraphs": graphs, "Description": described}
-    builder.Finish(table("Model", Version=3, **model, Buffers=tables(buffers)), b"TFL3")
+    model = {
+        "OperatorCodes": tables([code]),
+        "Subgraphs": tables([table("SubGraph", **graph)]),
+        "Buffers": tables(buffers),
+        "Description": builder.CreateString(metadata["policy"]),
+    }
+    builder.Finish(table("Model", Version=3, **model), b"TFL3")
     return bytes(builder.Output())
 
 
-def _layers(network: Network, vehicle: Vehicle) -> list[Layer]:
-    """Return the layers from the module's inputs to its outputs, in PX4's order of the motors."""
-    if network.observation.is_extended or network.observation.preview:
-        raise ConfigError(
-            f"{WHERE}: PX4's module keeps no state and previews nothing; train without last_action,"
-            " history, position_integral and preview"
-        )
-    layers: list[Layer] = []
-    for layer in network.layers:
-        if isinstance(layer, nn.Linear):
-            layers.append((layer.weight.double().numpy(), layer.bias.double().numpy(), False))
-        elif type(layer) is nn.ReLU:
-            layers[-1] = (*layers[-1][:2], True)
-        else:
-            raise ConfigError(
-                f"{WHERE}: PX4's module computes FullyConnected, Relu and Add, not {layer}; train"
-                " with policy_kwargs of activation_fn=nn.ReLU"
-            )
-    # The first layer scales its inputs.
-    weights, bias, bends = layers[0]
-    scaled = (weights * network.inverse_std.numpy())[:, SHOWN]
-    bias = bias - scaled @ network.mean.numpy()[SHOWN]
-    layers[0] = scaled * SIGNS, bias, bends
-    # The module clips results to [-1, 1], takes -1 as no thrust and 1 as the greatest.
-    weights, bias, _ = layers[-1]
-    motors = motor_order(vehicle)
-    low, high = vehicle.thrust_range
-    layers[-1] = weights[motors], bias[motors], False
-    if low > 0.0:
-        # The least thrust, -1 of ours, is more than -1 of theirs.
-        layers[-1] = weights[motors], bias[motors] + 1.0, True
-        layers.append((np.eye(4) * (1.0 - low / high), np.full(4, 2.0 * low / high - 1.0), False))
-    return layers
+def _check(network: Network, reference: Reference) -> None:
+    kinds = {shape["activation"] for shape in network.shapes}
+    seen = network.observation
+    refusals = {
+        "keeps no state: train without last_action, history, position_integral and preview": (
+            seen.is_extended or seen.preview
+        ),
+        "computes linear layers and ReLU: train with policy_kwargs of activation_fn=nn.ReLU": (
+            "tanh" in kinds
+        ),
+        "takes -1 for no thrust: give the vehicle rotor_thrust_limits from 0, and train for it": (
+            reference.vehicle.thrust_range[0] > 0.0
+        ),
+        "takes actions as they are: train without normalize and a turned rotor_layout, and export"
+        " without --output": reference.clip or reference.turn.angle or network.output != "thrusts",
+    }
+    for refusal, holds in refusals.items():
+        if holds:
+            raise ConfigError(f"--format px4: PX4's module {refusal}")
 
 
 def motor_order(vehicle: Vehicle) -> list[int]:
@@ -154,65 +142,13 @@ def motor_order(vehicle: Vehicle) -> list[int]:
 
     :raises ConfigError: not one rotor in each corner.
     """
-    corners = [tuple(np.sign(place).astype(int)) for place in vehicle.rotor_positions]
+    corners = [tuple(signs) for signs in np.sign(vehicle.rotor_positions)]
     if {*corners} != {*CORNERS}:
         raise ConfigError(
-            f"{WHERE}: vehicle {vehicle.name} has not one rotor in each corner, as PX4's"
-            " quadcopter X has; export it for a vehicle of that layout with --vehicle"
+            f"--format px4: vehicle {vehicle.name} has not one rotor in each corner, as PX4's"
+            " quadcopter X has; give a vehicle that has"
         )
     return [corners.index(corner) for corner in CORNERS]
-
-
-def px4_parameters(vehicle: Vehicle) -> dict[str, str]:
-    """Return PX4's parameters for a vehicle, by name.
-
-    The motors' speeds follow from its thrust limits and its kF.
-    """
-    low, high = vehicle.thrust_range
-    fastest = math.sqrt(high / vehicle.thrust_coefficient) / (2.0 * math.pi)
-    # The action 1 is twice this coefficient times the square of the revolutions per second. Where
-    # PX4 does not take as much, all speeds are smaller, in proportion.
-    coefficient = min(2.0 * _SCALE / fastest**2, _LARGEST)
-    most = 60.0 * math.sqrt(2.0 * _SCALE / coefficient)
-    return {
-        "MC_NN_EN": "1",
-        "MC_NN_THRST_COEF": f"{coefficient:.5g}",
-        "MC_NN_MAX_RPM": f"{most:.0f}",
-        "MC_NN_MIN_RPM": f"{most * math.sqrt(low / high):.0f}",
-        "MC_NN_MANL_CTRL": "1",
-        "THR_MDL_FAC": "0.8",
-    }
-
-
-def describe_px4(vehicle: Vehicle) -> StrDict:
-    """Return what the user of the file must know, by the names of the other formats' facts."""
-    turns = {-1: "counter-clockwise", 1: "clockwise"}
-    motors = []
-    for rotor, corner in zip(motor_order(vehicle), CORNERS.values(), strict=True):
-        turn = turns[vehicle.rotor_directions[rotor]]
-        motors.append(f"{len(motors) + 1} {corner}, {turn} from above")
-    return {
-        "observation": "15 numbers of mc_nn_control: target - position, m, world frame; the first "
-        "two rows of the rotation matrix body to world; velocity, m/s, world frame; body rates, "
-        "rad/s; world: x east, y north, z up; body: x forward, y left, z up",
-        "result": "4 actions of PX4's motors, -1 no thrust, 1 "
-        f"{vehicle.thrust_range[1]:.6g} N each",
-        "motors": "; ".join(motors),
-        "parameters": ", ".join(f"{k} {v}" for k, v in px4_parameters(vehicle).items()),
-    }
-
-
-def px4_files(content: bytes, vehicle: Vehicle) -> dict[str, bytes]:
-    """Return what else PX4 needs, by the ending of the file: the parameters as commands of its
-    shell, and the source file that takes the place of the module's control_net.cpp.
-    """
-    commands = [f"param set {name} {value}\n" for name, value in px4_parameters(vehicle).items()]
-    table = "\n".join(textwrap.wrap(", ".join(map(str, content)), 100))
-    source = (
-        '#include <cstdint>\n#include "control_net.hpp"\n\n'
-        f"alignas(16) const unsigned char control_net_tflite[] = {{\n{table}\n}};\n"
-    )
-    return {".params": "".join(commands).encode(), ".cpp": source.encode()}
 
 
 def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, str]:
@@ -221,25 +157,17 @@ def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, s
 
     :raises ConfigError: tflite-micro is not installed; the network needs a larger arena.
     """
-    runtime = require("tflite_micro", "px4", WHERE).runtime
-    try:
+    runtime = require("tflite_micro", "px4", "--format px4").runtime
+    with raised_as(ConfigError, f"--format px4: needs more than {ARENA} bytes; train fewer layers"):
         interpreter = runtime.Interpreter.from_bytes(content, arena_size=ARENA)
-    except RuntimeError as error:
-        raise ConfigError(
-            f"{WHERE}: the network needs more than the {ARENA // 1024} KiB that PX4's module has "
-            f"({error}); train one with smaller layers"
-        ) from None
     motors = motor_order(vehicle)
-    _, high = vehicle.thrust_range
 
-    def call(rows: FloatArray, _: Any = None) -> Any:
-        thrusts = np.empty((len(rows), 4), np.float32)
-        inputs = (rows[:, SHOWN] * SIGNS).astype(np.float32)
-        for row in range(len(rows)):
-            interpreter.set_input(inputs[row : row + 1], 0)
+    def call(rows: Float32Array, state: Any = None) -> Any:
+        actions = np.empty((len(rows), 4))
+        for row, shown in enumerate(rows[:, SHOWN] * SIGNS):
+            interpreter.set_input(shown[None], 0)
             interpreter.invoke()
-            actions = interpreter.get_output(0)[0].clip(-1.0, 1.0)
-            thrusts[row, motors] = 0.5 * high * (actions + 1.0)
-        return thrusts, None
+            actions[row, motors] = interpreter.get_output(0)[0]
+        return vehicle.action_to_thrust(actions.clip(-1.0, 1.0)), state
 
     return call, "tflite-micro"

@@ -51,8 +51,8 @@ class ObservationSettings(Frozen):
     """The content of an observation; by default the 18 features alone."""
 
     features: Literal["body", "px4"] = "body"
-    """``body``: velocity in body axes; ``px4``: as PX4's mc_nn_control shows the state, velocity in
-    world axes and no world z axis in body axes, whose three features are zero"""
+    """``body``, or ``px4``: as PX4's mc_nn_control shows the state, with the velocity in world
+    axes, zeros for the world's z axis in body axes, and the reference's position alone"""
     last_action: bool = False
     """whether a frame ends with the action that led to it, clipped to [-1, 1]"""
     history: tuple[Age, ...] | None = None

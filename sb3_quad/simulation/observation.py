@@ -87,22 +87,21 @@ def features(b, moves, for_px4):
     They go to ``b.feature``, float32.
 
     :param moves: whether references move or have a heading; else the target rests.
-    :param for_px4: whether the velocity has world axes.
+    :param for_px4: whether the velocity has world axes, and nothing but the position is relative.
     """
-    _features_at_rest(b)
-    if moves:
+    _features_at_rest(b, for_px4)
+    if moves and not for_px4:
         _relate(b)
-    if for_px4:
-        _turn_velocity(b)
 
 
 @fast
-def _features_at_rest(b):
+def _features_at_rest(b, for_px4):
     out = b.feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
         vx, vy, vz = vector(b.velocity, lane)
-        vx, vy, vz = to_body(r, vx, vy, vz)
+        if not for_px4:
+            vx, vy, vz = to_body(r, vx, vy, vz)
         for k in range(3):
             out[F.position + k, lane] = float32(b.position[k, lane] - b.target[k, lane])
             out[F.body_rates + k, lane] = float32(b.body_rates[k, lane])
@@ -145,19 +144,6 @@ def _relate(b):
         x, y = out[F.position, lane], out[F.position + 1, lane]
         out[F.position, lane] = cosine * x + sine * y
         out[F.position + 1, lane] = cosine * y - sine * x
-
-
-@fast
-def _turn_velocity(b):
-    """Turn the velocity from body to world axes, in place."""
-    out = b.feature
-    for lane in range(LANES):
-        vx, vy, vz = vector(out[F.velocity :], lane)
-        for k in range(3):
-            x = out[F.rotation + k, lane]
-            y = out[F.rotation + 3 + k, lane]
-            z = out[F.rotation + 6 + k, lane]
-            out[F.velocity + k, lane] = x * vx + y * vy + z * vz
 
 
 @inlined

@@ -13,7 +13,6 @@ from sb3_quad.simulation.adjoint import (
     undo_flight,
     undo_noise,
     undo_relation,
-    undo_turn,
 )
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
@@ -234,11 +233,9 @@ def undo(
                 if for_px4:
                     clear_hidden(by_feature)
                 undo_noise(b, by_feature)
-                if for_px4:
-                    undo_turn(b, by_feature)
-                if moves:
+                if moves and not for_px4:
                     undo_relation(b, by_feature)
-                undo_features(b, by_feature, own)
+                undo_features(b, by_feature, own, for_px4)
 
             load_rows(states[step], first, count, b.state)
             load_rows(wrench, first, count, b.wrench)

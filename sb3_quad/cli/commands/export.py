@@ -42,7 +42,6 @@ FACTS = (
     "result",
     "rotors",
     "motors",
-    "parameters",
     "check",
 )
 
@@ -94,18 +93,16 @@ def run(options: Namespace) -> int:
     if options.vehicle:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))
     exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
-    files = {file: exported.content}
-    for suffix, content in exported.further.items():
-        beside = file.with_suffix(suffix)
-        refuse_existing(beside, options.overwrite)
-        files[beside] = content
-    for path, content in files.items():
-        write_bytes(path, content)
+    write_bytes(file, exported.content)
     unknown_settings = "in neither the zip nor its folder; assumed: itm, the scaling of Table A.2"
     print(f"settings: {exported.settings or unknown_settings}")
     for fact in FACTS:
         if fact in exported.metadata:
             print(f"{fact}: {exported.metadata[fact]}")
-    for path, content in files.items():
-        print(f"saved {path} ({len(content)} bytes)")
+    print(f"saved {file} ({len(exported.content)} bytes)")
+    for ending, content in exported.further.items():
+        beside = file.with_suffix(ending)
+        refuse_existing(beside, options.overwrite)
+        write_bytes(beside, content)
+        print(f"saved {beside}")
     return 0
