@@ -6,7 +6,7 @@ import warnings
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import stable_baselines3
 import torch as th
@@ -183,16 +183,15 @@ def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> No
                 f"{where}: holds variables that no algorithm has; "
                 f"known are {', '.join(sorted(_VARIABLES))}"
             )
-    asked = _count_parameters(data, where)
     # Half precision is the least that somebody may have saved.
-    if 2 * asked > archive.getinfo("policy.pth").file_size:
-        raise ConfigError(f"{where}: asks for {asked:,} parameters, policy.pth holds fewer")
+    _check_size(data, archive.getinfo("policy.pth").file_size // 2, where)
 
 
-def _count_parameters(data: StrDict, where: str) -> int:
-    """Return how many parameters a policy asks for, without making it.
+def _check_size(data: StrDict, most: int, where: str) -> None:
+    """Check how many parameters a policy asks for, without making it.
 
     :param data: the attributes of its model, unpickled.
+    :param most: that its file may hold.
     """
     walk([data.get(key) for key in _TO_FLY], held, _LARGEST)
     given = data["policy_kwargs"]
@@ -204,38 +203,32 @@ def _count_parameters(data: StrDict, where: str) -> int:
     sketch: Any = type("Sketch", (data["policy_class"],), {"device": meta})
     with meta:
         policy = sketch(data["observation_space"], data["action_space"], lambda _: 0.0, **keywords)
-    return sum(parameter.numel() for parameter in policy.parameters())
+    asked = sum(parameter.numel() for parameter in policy.parameters())
+    if asked > most:
+        raise ConfigError(f"{where}: asks for {asked:,} parameters, its file holds fewer")
 
 
-def _build_model(algorithm: type[BaseAlgorithm], path: StrPath, device: str) -> BaseAlgorithm:
-    """Return the model in a safetensors file.
+def _build_model(algorithm: Any, path: StrPath, device: str) -> Any:
+    """Return the model of a stock algorithm in a safetensors file.
 
     :raises ConfigError: see :func:`.read_tensors`; or settings and parameters that do not fit.
     """
-    where = f"model {path}"
     data, tensors = read_tensors(path)
-    with raised_as(ConfigError, f"{where}: cannot be loaded"):
-        stock: Any = algorithm
+    with raised_as(ConfigError, f"model {path}: cannot be loaded"):
         keywords = parse_mapping(data["policy_kwargs"], "policy_kwargs")
-        model = stock(
-            "MlpPolicy", None, policy_kwargs=keywords, device=device, _init_setup_model=False
-        )
+        model = algorithm("MlpPolicy", None, policy_kwargs=keywords, _init_setup_model=False)
+        model.device = th.device(device)
         # A policy cannot see more than its file holds weights.
         most = sum(tensor.numel() for tensor in tensors.values())
-        observations, actions = quadcopter_spaces(min(data["observation_size"], most))
-        model.observation_space = observations
-        model.action_space = actions
-        asked = _count_parameters(vars(model), where)
-        if asked > most:
-            raise ConfigError(f"{where}: asks for {asked:,} parameters, it holds fewer")
-        # Nothing is stored here.
-        model.buffer_size = 1
-        model.n_envs = 1
+        seen = min(data["observation_size"], most)
+        model.observation_space, model.action_space = quadcopter_spaces(seen)
+        _check_size(vars(model), most, f"model {path}")
+        model.n_envs = model.buffer_size = 1  # nothing is stored here
         model._setup_model()
         model.policy.load_state_dict(tensors)
     if KEY in data:
         setattr(model, KEY, data[KEY])
-    return cast(BaseAlgorithm, model)
+    return model
 
 
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:

@@ -172,12 +172,10 @@ def build_network(reference: Reference, where: str = "model", features: str = "b
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
         )
-    seen = reference.observation.features
-    if seen != features:
-        way = "give --format px4" if seen == "px4" else "give --format onnx, torchscript or c"
+    if reference.observation.features != features:
         raise ConfigError(
-            f"{where}: sees `features: {seen}`, not {features}; {way}, or train with --env-kwargs"
-            f" features:{features}"
+            f"{where}: does not see `features: {features}`; --format px4 needs and takes features:"
+            f" px4, all others body; train with --env-kwargs features:{features}"
         )
     # C knows these layers only.
     for layer in layers:

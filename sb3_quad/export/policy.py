@@ -15,15 +15,20 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.tensors import ENDING
-from sb3_quad.controllers.zips import load_model, saved_algorithm
+from sb3_quad.controllers.tensors import ENDING, write_tensors
+from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
-from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
+from sb3_quad.export.network import (
+    Network,
+    build_network,
+    write_onnx,
+    write_torchscript,
+)
 from sb3_quad.export.px4 import load_px4, motor_order, write_px4
-from sb3_quad.export.tensors import write_tensors
 from sb3_quad.simulation.observation import FEATURES, GROUPS
+from sb3_quad.simulation.settings import KEY
 from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle
 
 # With the endings of their files
@@ -84,15 +89,13 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     refuse_unknown("format", [file_format], FORMATS)
-    if file_format == "safetensors":
-        return Export(write_tensors(path), {}, 0.0, "N", agent_settings(path)[1])
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     settings, source = agent_settings(path)
     given = settings
     if vehicle is not None:
         given = settings.with_changes(vehicle=vehicle)
-    if given.vehicles is not None:
+    if given.vehicles is not None and file_format != "safetensors":
         raise ConfigError(
             f"model {path}: flies any vehicle; "
             "say with --vehicle which one's thrusts the file is to give"
@@ -106,10 +109,20 @@ def export_policy(
         "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
         "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
     }
-    write, read = formats[file_format]
-    for_px4 = file_format == "px4"
-    network = build_network(reference, f"model {path}", "px4" if for_px4 else "body")
+    features = "px4" if file_format == "px4" else "body"
+    if file_format == "safetensors":
+        features = settings.features
+    network = build_network(reference, f"model {path}", features)
+    if file_format == "safetensors":
+        if reference.clip or model.use_sde:
+            raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
+        data = saved_data(path)
+        if source is not None:
+            settings.write_into(model)
+            data[KEY] = getattr(model, KEY)
+        return Export(write_tensors(model, data), {}, 0.0, network.unit, source)
     metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
+    write, read = formats[file_format]
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
@@ -123,7 +136,7 @@ def export_policy(
         )
         content = write(network, metadata)
     further = {}
-    for ending in (".params", ".cpp") * for_px4:
+    for ending in (".params", ".cpp") * (file_format == "px4"):
         text = render("sb3_quad.export", f"px4{ending}.j2", vehicle=flown, content=content)
         further[ending] = text.encode("ascii")
     return Export(content, metadata, error, network.unit, source, further)

@@ -4,15 +4,14 @@ What the module gives a network and makes of its results is in ``src/modules/mc_
 PX4-Autopilot: ``PopulateInputTensor``, ``RegisterOps``, ``RescaleActions``.
 """
 
-from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-from torch import nn
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
-from sb3_quad.base.types import AnyArray, Float32Array, StrDict
+from sb3_quad.base.types import Float32Array, StrDict
 from sb3_quad.export.check import Reference
 from sb3_quad.export.load import Call
 from sb3_quad.export.network import Network
@@ -31,7 +30,7 @@ SHOWN = np.r_[
 ]
 SIGNS = np.repeat(np.float32([-1, 1]), [3, 12])
 # Motors 1 to 4 of PX4's quadcopter X: the signs of x (forward) and y (left)
-CORNERS = [(1, -1), (-1, 1), (1, 1), (-1, -1)]
+CORNERS = [[1, -1], [-1, 1], [1, 1], [-1, -1]]
 
 
 def write_px4(network: Network, metadata: StrDict, reference: Reference) -> bytes:
@@ -43,16 +42,14 @@ def write_px4(network: Network, metadata: StrDict, reference: Reference) -> byte
     tflite = require("tflite", "px4", "--format px4")
     builder = require("flatbuffers", "px4", "--format px4").Builder()
     _check(network, reference)
-    linear = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
-    weights = [layer.weight.numpy() for layer in linear]
-    biases = [layer.bias.numpy() for layer in linear]
-    # The first layer scales its inputs, the last one numbers the motors as PX4 does.
-    scaled = weights[0][:, SHOWN] * network.inverse_std.numpy()[SHOWN]
-    biases[0] = biases[0] - scaled @ network.mean.numpy()[SHOWN]
-    weights[0] = scaled * SIGNS
+    # Weights and biases in turn. The first layer scales its inputs, the last one numbers the motors
+    # as PX4 does.
+    values = [parameter.numpy() for parameter in network.layers.parameters()]
+    scaled = values[0][:, SHOWN] * network.inverse_std.numpy()[SHOWN]
+    values[1] = values[1] - scaled @ network.mean.numpy()[SHOWN]
+    values[0] = scaled * SIGNS
     motors = motor_order(reference.vehicle)
-    weights[-1] = weights[-1][motors]
-    biases[-1] = biases[-1][motors]
+    values[-2:] = values[-2][motors], values[-1][motors]
 
     def table(kind: str, **fields: Any) -> Any:
         getattr(tflite, f"{kind}Start")(builder)
@@ -60,59 +57,57 @@ def write_px4(network: Network, metadata: StrDict, reference: Reference) -> byte
             getattr(tflite, f"{kind}Add{name}")(builder, value)
         return getattr(tflite, f"{kind}End")(builder)
 
-    def vector(values: Sequence[Any], prepend: Callable[[Any], None], size: int = 4) -> Any:
+    def vector(content: Any, prepend: Any = builder.PrependInt32, size: int = 4) -> Any:
         # The interpreter reads numbers where they are, so all are aligned.
-        builder.StartVector(size, len(values), 16)
-        for value in reversed(values):
-            prepend(value)
+        builder.StartVector(size, len(content), 16)
+        for element in reversed(content):
+            prepend(element)
         return builder.EndVector()
 
-    def numbers(*values: int) -> Any:
-        return vector(values, builder.PrependInt32)
-
-    def tables(offsets: list[Any]) -> Any:
-        return vector(offsets, builder.PrependUOffsetTRelative)
-
+    tables = partial(vector, prepend=builder.PrependUOffsetTRelative)
     buffers: list[Any] = []
     tensors: list[Any] = []
 
-    def tensor(shape: Sequence[int], values: AnyArray | None = None) -> int:
+    def tensor(array: Any, constant: bool = True) -> int:
         # What the network computes has an empty buffer. Float32 is the schema's default.
-        filled = {}
-        if values is not None:
-            filled["Data"] = vector(values.tobytes(), builder.PrependByte, 1)
-        buffers.append(table("Buffer", **filled))
-        tensors.append(table("Tensor", Shape=numbers(*shape), Buffer=len(tensors)))
+        content = vector(array.tobytes() * constant, builder.PrependByte, 1)
+        buffers.append(table("Buffer", Data=content))
+        tensors.append(table("Tensor", Shape=vector(array.shape), Buffer=len(tensors)))
         return len(tensors) - 1
 
     operators = []
-    last = tensor((1, len(SHOWN)))
-    for shape, weight, bias in zip(network.shapes, weights, biases, strict=True):
+    last = tensor(SIGNS[None], False)
+    for shape, weights, bias in zip(network.shapes, values[::2], values[1::2], strict=True):
+        inputs = vector([last, tensor(weights), tensor(bias)])
+        last = tensor(bias[None], False)
+        outputs = vector([last])
         bends = int(shape["activation"] == "relu")
-        inputs = numbers(last, tensor(weight.shape, weight), tensor(bias.shape, bias))
-        last = tensor((1, len(bias)))
-        operator = {
-            "Inputs": inputs,
-            "Outputs": numbers(last),
-            "BuiltinOptions": table("FullyConnectedOptions", FusedActivationFunction=bends),
-            "BuiltinOptionsType": tflite.BuiltinOptions.FullyConnectedOptions,
-        }
-        operators.append(table("Operator", **operator))
+        operator = table(
+            "Operator",
+            Inputs=inputs,
+            Outputs=outputs,
+            BuiltinOptionsType=tflite.BuiltinOptions.FullyConnectedOptions,
+            BuiltinOptions=table("FullyConnectedOptions", FusedActivationFunction=bends),
+        )
+        operators.append(operator)
     kind = tflite.BuiltinOperator.FULLY_CONNECTED
-    code = table("OperatorCode", DeprecatedBuiltinCode=kind, BuiltinCode=kind, Version=1)
-    graph = {
-        "Tensors": tables(tensors),
-        "Inputs": numbers(0),
-        "Outputs": numbers(last),
-        "Operators": tables(operators),
-    }
-    model = {
-        "OperatorCodes": tables([code]),
-        "Subgraphs": tables([table("SubGraph", **graph)]),
-        "Buffers": tables(buffers),
-        "Description": builder.CreateString(metadata["policy"]),
-    }
-    builder.Finish(table("Model", Version=3, **model), b"TFL3")
+    code = table("OperatorCode", DeprecatedBuiltinCode=kind, BuiltinCode=kind)
+    graph = table(
+        "SubGraph",
+        Tensors=tables(tensors),
+        Inputs=vector([0]),
+        Outputs=vector([last]),
+        Operators=tables(operators),
+    )
+    model = table(
+        "Model",
+        Version=3,
+        OperatorCodes=tables([code]),
+        Subgraphs=tables([graph]),
+        Buffers=tables(buffers),
+        Description=builder.CreateString(metadata["policy"]),
+    )
+    builder.Finish(model, b"TFL3")
     return bytes(builder.Output())
 
 
@@ -142,13 +137,11 @@ def motor_order(vehicle: Vehicle) -> list[int]:
 
     :raises ConfigError: not one rotor in each corner.
     """
-    corners = [tuple(signs) for signs in np.sign(vehicle.rotor_positions)]
-    if {*corners} != {*CORNERS}:
-        raise ConfigError(
-            f"--format px4: vehicle {vehicle.name} has not one rotor in each corner, as PX4's"
-            " quadcopter X has; give a vehicle that has"
-        )
-    return [corners.index(corner) for corner in CORNERS]
+    corners = np.sign(vehicle.rotor_positions).tolist()
+    with raised_as(
+        ConfigError, f"--format px4: vehicle {vehicle.name}: needs a rotor in each corner"
+    ):
+        return [corners.index(corner) for corner in CORNERS]
 
 
 def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, str]:
