@@ -223,7 +223,9 @@ def _build_model(algorithm: Any, path: StrPath, device: str) -> Any:
         seen = min(data["observation_size"], most)
         model.observation_space, model.action_space = quadcopter_spaces(seen)
         _check_size(vars(model), most, f"model {path}")
-        model.n_envs = model.buffer_size = 1  # nothing is stored here
+        # Nothing is stored here, or trained.
+        model.n_envs = model.buffer_size = 1
+        model.target_entropy = 0.0
         model._setup_model()
         model.policy.load_state_dict(tensors)
     if KEY in data:

@@ -151,7 +151,8 @@ def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, s
     :raises ConfigError: tflite-micro is not installed; the network needs a larger arena.
     """
     runtime = require("tflite_micro", "px4", "--format px4").runtime
-    with raised_as(ConfigError, f"--format px4: needs more than {ARENA} bytes; train fewer layers"):
+    what = f"--format px4: needs more than {ARENA} bytes; train smaller layers"
+    with raised_as(ConfigError, what):
         interpreter = runtime.Interpreter.from_bytes(content, arena_size=ARENA)
     motors = motor_order(vehicle)
 

@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX, TorchScript or a C header.
+"""Write a trained policy as ONNX, TorchScript, a C header, or a network for PX4.
 
 The exported policy takes 18 numbers in physical units: position relative to the
 target, m, world frame; rotation matrix from world to body, row by row;
@@ -8,6 +8,10 @@ checked against the policy on 10,000 observations. A policy that observes
 earlier frames, its last action or the position integral also takes a state,
 and returns the next one.
 
+A network for PX4 takes the 15 numbers of its module mc_nn_control instead, and
+comes with the module's parameters (docs/export.md). A safetensors file is the
+agent itself, without a pickle, for the commands of this package.
+
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1 --format onnx
   # defines agent_policy(observation, thrust)
@@ -15,9 +19,11 @@ examples:
   # rotor speeds instead of thrusts, rad/s
   sb3-quad export agent.zip --format torchscript --output speeds
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
+  sb3-quad export x500-px4 --format px4
+  sb3-quad export agent.zip --format safetensors
 
-ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. The check
-of a C header needs a C compiler.
+ONNX needs onnx and onnxruntime, safetensors its package: pip install '.[export]'
+from a clone; PX4: pip install '.[px4]'. The check of a C header needs a C compiler.
 """
 
 from argparse import Namespace
@@ -52,10 +58,10 @@ FLAGS: Flags = {
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     ),
-    "--format": ({"required": True}, "onnx, torchscript or c"),
+    "--format": ({"required": True}, "onnx, torchscript, c, px4 or safetensors"),
     "-o FILE": (
         {"dest": "file"},
-        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
+        "file to write, or a folder for it (MODEL.onnx, .pt, .h, .tflite, … in this folder)",
     ),
     "--output KIND": (
         str,
@@ -105,4 +111,6 @@ def run(options: Namespace) -> int:
         refuse_existing(beside, options.overwrite)
         write_bytes(beside, content)
         print(f"saved {beside}")
+        if ending == ".params":
+            print(content.decode(), end="")
     return 0
