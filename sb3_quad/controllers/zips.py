@@ -247,6 +247,7 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     if name in _OURS:
         name, _ = _OURS[name]
     algorithm: type[BaseAlgorithm] = getattr(stable_baselines3, name)
+    model: BaseAlgorithm
     if str(path).endswith(ENDING):
         model = _build_model(algorithm, path, device)
     else:

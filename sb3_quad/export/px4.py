@@ -28,7 +28,7 @@ SHOWN = np.r_[
     GROUPS["velocity"],
     GROUPS["body_rates"],
 ]
-SIGNS = np.repeat(np.float32([-1, 1]), [3, 12])
+SIGNS = np.repeat([-1.0, 1.0], [3, 12]).astype(np.float32)
 # Motors 1 to 4 of PX4's quadcopter X: the signs of x (forward) and y (left)
 CORNERS = [[1, -1], [-1, 1], [1, 1], [-1, -1]]
 

@@ -22,8 +22,8 @@ examples:
   sb3-quad export x500-px4 --format px4
   sb3-quad export agent.zip --format safetensors
 
-ONNX needs onnx and onnxruntime, safetensors its package: pip install '.[export]'
-from a clone; PX4: pip install '.[px4]'. The check of a C header needs a C compiler.
+ONNX and safetensors: pip install '.[export]' from a clone; PX4: pip install
+'.[px4]'. The check of a C header needs a C compiler.
 """
 
 from argparse import Namespace
