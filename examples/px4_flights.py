@@ -6,7 +6,8 @@
 Without --rates, the TensorFlow Lite file of `sb3-quad export --format px4` flies beside its zip:
 in TensorFlow Lite Micro, in an arena of the module's size, with the inputs that the module fills
 and the outputs that it clips and orders. Both fly the same recoveries and targets, with the same
-noise. With --rates, the zip flies at these calls a second; a command acts one call later.
+noise. With --rates, the zip flies at these calls a second; a command acts one call later, or
+after --delay seconds.
 """
 
 import argparse
@@ -15,9 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_model
+from sb3_quad.evaluation.fleets import Fleet
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export.policy import export_policy
 from sb3_quad.export.px4 import load_px4
@@ -47,7 +50,8 @@ class Module:
 
     def __call__(self, observations: Any) -> Any:
         """Return the actions of observations, (n, 18) to (n, 4)."""
-        thrusts, _ = self.call(observations * self.std + self.mean)
+        features = observations * self.std + self.mean
+        thrusts, _ = self.call(features.astype(np.float32))
         return self.vehicle.thrust_to_action(thrusts)
 
 
@@ -64,6 +68,18 @@ def report(label: str, controller: Any, flights: int, seed: int, **settings: Any
         )
 
 
+def report_heading(zip_model: Any, settings: FlightSettings, flights: int, seed: int) -> None:
+    """Print where the x axis points after recoveries of 10 s."""
+    changed = settings.with_changes(task="state_recovery", task_kwargs=None, randomize=None)
+    fleet = Fleet(row_seeds(seed, flights), changed)
+    observation = fleet.begin({})
+    for _ in range(1000):
+        observation, _, _ = fleet.step(zip_model.predict(observation, deterministic=True)[0])
+    x_axis = fleet.true_state().rotation[:, :, 0]
+    headings = np.degrees(np.arctan2(x_axis[:, 1], x_axis[:, 0]))
+    print(f"zip, heading after 10 s: {headings.min():.1f} to {headings.max():.1f} degrees")
+
+
 def main(arguments: list[str]) -> None:
     """Read the command line, and fly."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -71,6 +87,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--flights", type=int, default=960, help="of each task (960)")
     parser.add_argument("--seed", type=int, default=61, help="(61)")
     parser.add_argument("--rates", type=float, nargs="+", help="calls a second of the zip")
+    parser.add_argument("--delay", type=float, default=0.0, help="s, at least one call (0)")
     options = parser.parse_args(arguments)
     settings, _ = agent_settings(options.agent)
     seen = {"features": settings.features, "noise": settings.noise}
@@ -80,10 +97,15 @@ def main(arguments: list[str]) -> None:
         controllers = {"zip": zip_model, "tflite-micro": Module(options.agent, settings)}
         for label, controller in controllers.items():
             report(label, controller, options.flights, options.seed, vehicle=vehicle, **seen)
+        report_heading(zip_model, settings, options.flights, options.seed)
         return
     for rate in options.rates:
         step = 1.0 / rate
-        steps = {"control_step": step, "physics_step": min(vehicle.physics_step, step), "delay": 1}
+        steps = {
+            "control_step": step,
+            "physics_step": min(vehicle.physics_step, step),
+            "delay": max(round(options.delay * rate), 1),
+        }
         report(
             f"{rate:g} Hz",
             zip_model,
