@@ -1,4 +1,4 @@
-r"""The picture of the README: success and final error over what each scenario of a suite varies.
+r"""The picture of docs/agents.md: success and final error over what scenarios of a suite vary.
 
     sb3-quad evaluate pid geometric itm-robust --suite robustness \
         --scenario mass constant_force -o FOLDER

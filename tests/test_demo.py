@@ -26,6 +26,7 @@ from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
+from sb3_quad.evaluation.flights import fly as fly_flights
 from sb3_quad.show.demo import page as page_module
 from sb3_quad.show.demo.page import (
     DEFAULT_AGENTS,
@@ -36,6 +37,7 @@ from sb3_quad.show.demo.page import (
     script,
 )
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import STATE_SIZE, X
 from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
@@ -82,14 +84,41 @@ for (let k = 0; k < job.steps; k++) {
 console.log(JSON.stringify(path));
 """
 
+# One step of the training's physics beside that of the page, its adjoint beside differences, or a
+# whole training.
+LEARNING = """
+const job = JSON.parse((await import("node:fs")).readFileSync(0, "utf8"));
+const p = new Training(job.vehicle, job.seed).p;
+const answers = {
+  advance() {
+    const [ours, theirs] = [Float64Array.from(job.state), Float64Array.from(job.state)];
+    advance(ours, 0, Float64Array.from(job.wanted), 0, p);
+    physicsStep(theirs, job.wanted, p, NO_WRENCH);
+    return [[...ours], [...theirs]];
+  },
+  undo() {
+    const moved = Float64Array.from(job.by), byWanted = new Float64Array(4);
+    undo(Float64Array.from(job.state), 0, Float64Array.from(job.wanted), byWanted, 0, moved, p);
+    return [...moved, ...byWanted];
+  },
+  learn() {
+    let last = [];
+    train(job, ({ numbers }) => (last = [...numbers]));
+    return last;
+  },
+};
+const text = JSON.stringify(answers[job.what]());
+await new Promise((done) => process.stdout.write(text, done));
+"""
+
 node = pytest.mark.skipif(NODE is None, reason="there is no node on this machine")
 chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
 
-def in_node(tmp_path, **job):
+def in_node(tmp_path, harness=HARNESS, **job):
     """What the page's model answers, without a browser."""
     file = tmp_path / "model.mjs"
-    file.write_text(script(MODEL) + HARNESS)
+    file.write_text(script(MODEL) + harness)
     done = subprocess.run(
         [NODE, str(file)], input=json.dumps(job), capture_output=True, text=True, check=False
     )
@@ -695,3 +724,65 @@ def test_everything_has_a_name_and_fits(browser, page, width, height):
     browser.wait_for(f"demo.frames() > {frames} + 5")
     assert browser.value("demo.fleet.entries[0].flight.time") == frozen
     assert not browser.errors
+
+
+def moving(vehicle, rng):
+    """A state in motion with all rotors turning, and speeds that are commanded."""
+    state = np.zeros(STATE_SIZE)
+    hover = math.sqrt(vehicle.mass * vehicle.gravity / 4 / vehicle.thrust_coefficient)
+    attitude = rng.normal(size=4)
+    state[X.position : X.position + 3] = rng.normal(size=3)
+    state[X.quaternion : X.quaternion + 4] = attitude / np.linalg.norm(attitude)
+    state[X.velocity : X.velocity + 3] = 3 * rng.normal(size=3)
+    state[X.body_rates : X.body_rates + 3] = 8 * rng.normal(size=3)
+    state[X.rotor_speeds : X.rotor_speeds + 4] = hover * rng.uniform(0.6, 1.4, 4)
+    return state, hover * rng.uniform(0.6, 1.4, 4)
+
+
+@node
+@pytest.mark.parametrize("changes", [{}, BREEZY], ids=["itm", "breezy"])
+def test_the_page_differentiates_its_physics(changes, tmp_path):
+    vehicle = load_vehicle("itm").model_copy(update=changes)
+    rng = np.random.default_rng(3)
+    state, wanted = moving(vehicle, rng)
+    inputs = np.concatenate([state[: X.rotor_speeds + 4], wanted])
+    by_result = rng.normal(size=X.rotor_speeds + 4)
+    job = {"vehicle": vehicle.model_dump(mode="json"), "seed": 0}
+
+    def step(values):
+        later = [*values[:-4], *state[values.size - 4 :]]
+        ours, theirs = in_node(
+            tmp_path, LEARNING, what="advance", state=later, wanted=values[-4:].tolist(), **job
+        )
+        np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=1e-13)
+        return by_result @ np.array(ours[: X.rotor_speeds + 4])
+
+    gradient = in_node(
+        tmp_path,
+        LEARNING,
+        what="undo",
+        state=state.tolist(),
+        wanted=wanted.tolist(),
+        by=by_result.tolist(),
+        **job,
+    )
+    # The derivative along a direction, by central differences
+    direction = rng.normal(size=inputs.size) * np.maximum(1.0, np.abs(inputs))
+    change = 1e-6 * direction
+    difference = (step(inputs + change) - step(inputs - change)) / 2e-6
+    assert np.dot(gradient, direction) == pytest.approx(difference, rel=1e-6)
+
+
+@node
+@pytest.mark.slow
+def test_a_network_trained_by_the_page_recovers(tmp_path):
+    vehicle = load_vehicle("itm").model_dump(mode="json")
+    numbers = in_node(tmp_path, LEARNING, what="learn", vehicle=vehicle, seed=0)
+    env = QuadcopterVecEnv(1, task="state_recovery", n_threads=1)
+    model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [64, 64]}, device="cpu")
+    policy = model.policy
+    layers = [policy.mlp_extractor.policy_net, policy.action_net]
+    parameters = [parameter for layer in layers for parameter in layer.parameters()]
+    torch.nn.utils.vector_to_parameters(torch.tensor(numbers), parameters)
+    flights = fly_flights(model, "state_recovery", 240, seed=5, noise=0.05)
+    assert flights.success.mean() > 0.9

@@ -1,7 +1,10 @@
 """The Python code of README and docs/ runs unchanged; the fast tests shorten its trainings."""
 
+import json
 import re
 import runpy
+import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import pytest
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_quad.algorithms.offset_correction
+from sb3_quad.cli import main
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
 
@@ -59,6 +63,8 @@ def run(page: str) -> dict[str, object]:
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    # The tutorial's reader has made it before.
+    shutil.copy(ROOT / "examples/my_quadcopter.yaml", tmp_path / "mine.yaml")
     return tmp_path
 
 
@@ -235,3 +241,47 @@ def test_the_worked_expert_flies_to_targets(module_folder):
     assert flights.final_error.max() < 0.02
     noisy = fly(lambda observation: expert.predict(observation)[0], "target_tracking", 16, 5)
     assert noisy.success.all()
+
+
+# What the walk below adds to lines, so that they are short and need no screen.
+SHORTER = {
+    "check-vehicle": ["-n", "2"],
+    "evaluate": ["--episodes", "2", "--no-report"],
+    "enjoy": ["-n", "20", "--no-render"],
+}
+INSTALLS = ("make install", ". .venv/bin/activate")
+
+
+@pytest.mark.slow
+def test_readme_and_tutorial_lead_to_an_own_agent_in_the_demo(folder, monkeypatch):
+    """Their blocks in order, in one folder, as a reader runs them; trainings have one rollout.
+
+    Lines that train are those of test_documented_lines.py.
+    """
+    shorten_trainings(monkeypatch)
+    (folder / "mine.yaml").unlink()
+    (folder / "examples").symlink_to(ROOT / "examples")
+    for page in ("README.md", "docs/tutorial.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        scope = {"__name__": page}
+        for language, block in re.findall(r"^```(python|bash)\n(.*?)^```", text, flags=re.S | re.M):
+            if language == "python":
+                exec(compile(block, page, "exec"), scope)
+                continue
+            for line in block.splitlines():
+                if line.startswith("#"):
+                    continue
+                program, *arguments = shlex.split(line, comments=True)
+                if program == "cp":
+                    shutil.copy(*arguments)
+                elif program == "sb3-quad" and arguments[0] != "train":
+                    assert main([*arguments, *SHORTER.get(arguments[0], [])]) == 0, line
+                else:
+                    assert program == "sb3-quad" or line.startswith(INSTALLS), line
+    data = re.search(
+        r'<script type="application/json" id="data">(.*?)</script>',
+        (folder / "mine.html").read_text(encoding="utf-8"),
+    )
+    agent, *experts = json.loads(data.group(1))["agents"]
+    assert (agent["label"], agent["vehicle"]) == ("mine", "my_quadcopter")
+    assert [expert["kind"] for expert in experts] == ["geometric", "pid"]

@@ -40,6 +40,7 @@ ELSEWHERE = {
     "$RUNS": "agents of a sweep of an hour and a half",
     "…": "an abbreviated line",
 }
+CONTINUED = re.compile(r"\\\n\s*")
 EVALUATED = ["--eval-env-kwargs", "max_episode_steps:100", "--no-progress"]
 # Flags that a command gets in addition to its own. Reports are written for the lines of `report`.
 SHORTER = {
@@ -77,9 +78,9 @@ def documented() -> list[str]:
             r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.S | re.M
         ):
             if language == "bash":
-                found += block.replace("\\\n", " ").splitlines()
+                found += CONTINUED.sub(" ", block).splitlines()
     for command in COMMANDS.values():
-        found += (command.__doc__ or "").replace("\\\n", " ").splitlines()
+        found += CONTINUED.sub(" ", command.__doc__ or "").splitlines()
     called = [
         re.match(r"(?:\w+=\S+ +)*\s*(?:sb3-quad|python -m sb3_quad\.cli) +(\w.*)", line)
         for line in found
@@ -95,7 +96,7 @@ LINES = [line for line in documented() if not any(part in line for part in ELSEW
 def folder(tmp_path_factory, trained_runs):
     """A folder with what the lines read: runs, agents, files of the reader."""
     place = tmp_path_factory.mktemp("documented")
-    for name in ("agent.zip", "path/to/agent.zip"):
+    for name in ("agent.zip", "path/to/agent.zip", "mine.zip"):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(pretrained("thesis-recovery"), place / name)
     for algo, env in (("dagger", "Tracking"), ("dagger", "Recovery"), ("ppo_bc", "Recovery")):

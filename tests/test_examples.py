@@ -35,8 +35,9 @@ def run(tmp_path, monkeypatch, capsys):
     return run_script
 
 
-def test_every_script_is_run_here_and_says_how_it_is_started():
-    tests = Path(__file__).read_text(encoding="utf-8")
+def test_every_script_is_run_and_says_how_it_is_started():
+    names = ("test_examples.py", "test_real_flights.py")
+    tests = "".join((Path(__file__).parent / name).read_text("utf-8") for name in names)
     for path in EXAMPLES.glob("*.py"):
         assert f'"{path.name}"' in tests
         assert f"python examples/{path.name}" in path.read_text(encoding="utf-8")
@@ -105,6 +106,45 @@ def test_a_cloned_lqr_gets_better_by_a_reward_of_energy(run):
     assert float(re.search(r"error ([\d.]+) m", output).group(1)) < 0.1
 
 
+def mean_rewards(output):
+    """By what flew, the mean rewards that an example on other environments prints."""
+    lines = re.findall(r"^(.+): mean reward (-?[\d.]+), worst -?\d+$", output, re.MULTILINE)
+    return {name: float(reward) for name, reward in lines}
+
+
+@pytest.mark.slow
+def test_a_pendulum_learns_from_its_expert_and_beyond_a_gentle_one(run):
+    found = mean_rewards(run("pendulum.py"))
+    assert found["DAgger"] > found["expert"] - 20.0
+    assert found["PPOBC from there"] > found["gentle expert"] + 40.0
+    assert found["PPOBC from there"] > max(found["DAgger from it"], found["PPO alone"]) + 40.0
+
+
+def test_pendulum_runs_with_short_trainings(run, tmp_path):
+    found = mean_rewards(run("pendulum.py", *SHORT, "--imitation-timesteps", "100"))
+    assert [*found][:4] == ["expert", "DAgger", "gentle expert", "DAgger from it"]
+    assert [*found][4:] == ["PPOBC from there", "PPO alone"]
+    assert found["gentle expert"] < found["expert"]
+    PPO.load(tmp_path / "pendulum_ppo_bc.zip", device="cpu")
+
+
+def test_lunar_lander_runs_with_a_short_training(tmp_path, monkeypatch, capsys):
+    """And its expert is the one that Gymnasium has for a single lander."""
+    pytest.importorskip("Box2D")
+    pytest.importorskip("pygame")
+    from gymnasium.envs.box2d.lunar_lander import LunarLander, heuristic
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lunar_lander.py", *SHORT])
+    script = runpy.run_path(str(EXAMPLES / "lunar_lander.py"), run_name="__main__")
+    assert [*mean_rewards(capsys.readouterr().out)] == ["expert", "DAgger"]
+    observations = np.random.default_rng(0).normal(size=(20, 8)).astype(np.float32)
+    observations[:, 6:] = 0.0
+    observations[10:, 6] = 1.0  # a leg touches the ground
+    expected = [heuristic(LunarLander(continuous=True), row) for row in observations]
+    np.testing.assert_allclose(script["land"](observations), expected, rtol=1e-5, atol=1e-5)
+
+
 def test_energy_reward_runs_with_short_trainings(run):
     output = run("energy_reward.py", *SHORT, "--imitation-timesteps", "100")
     assert re.findall(r"^(\w+): mean reward -", output, re.MULTILINE) == ["LQR", "DAgger", "PPOBC"]
@@ -116,6 +156,12 @@ def test_own_experts_and_vehicles_recover(run, name):
     found = shares(output)
     teacher = found["own expert" if name == "own_expert.py" else "geometric"]
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
+
+
+@pytest.mark.slow
+def test_a_nominal_policy_recovers_after_half_a_minute(run):
+    last = run("nominal_policy.py", "--seed", "0").splitlines()[-1]
+    assert float(re.search(r"([\d.]+)% of 3,840", last)[1]) > 98.5
 
 
 @pytest.mark.slow

@@ -165,7 +165,7 @@ def outputs(commands, factor):
 
 
 def parameters_of(exported):
-    lines = exported.further[".params"].decode().splitlines()
+    lines = exported.files["px4.params"].decode().splitlines()
     assert all(line.startswith("param set ") for line in lines)
     return {name: float(value) for _, _, name, value in map(str.split, lines)}
 
@@ -232,17 +232,19 @@ def test_it_holds_what_the_modules_resolver_registers(agent):
     assert model.Description().startswith(b"agent.zip (PPO), sha256 ")
 
 
-def test_the_command_writes_file_parameters_and_source(agent, tmp_path, capsys):
+def test_the_command_writes_file_parameters_and_sources(agent, tmp_path, capsys):
     pytest.importorskip("tflite_micro")
-    assert main(["export", agent, "--format", "px4", "-o", str(tmp_path / "out")]) == 0
+    out = tmp_path / "out"
+    assert main(["export", agent, "--format", "px4", "-o", str(out)]) == 0
     said = capsys.readouterr().out
     assert "motors: 1 front right, rotor 0 of the vehicle, counter-clockwise from above;" in said
-    content = (tmp_path / "out" / "agent.tflite").read_bytes()
-    source = (tmp_path / "out" / "agent.cpp").read_text()
+    content = (out / "control_net.tflite").read_bytes()
+    source = (out / "control_net.cpp").read_text()
     assert bytes(map(int, re.findall(r"\d+", source.partition("= {")[2]))) == content
-    assert "param set MC_NN_MAX_RPM 13034\n" in (tmp_path / "out" / "agent.params").read_text()
-    assert "param set MC_NN_MAX_RPM 13034\n" in said
-    assert main(["export", agent, "--format", "px4", "-o", str(tmp_path / "out")]) == 2
+    assert f"_tflite_size = {len(content)};" in (out / "control_net.hpp").read_text()
+    assert "param set MC_NN_MAX_RPM 13034\n" in (out / "px4.params").read_text()
+    assert "parameters: param set MC_NN_EN 1; param set MC_NN_THRST_COEF 4.2382; " in said
+    assert main(["export", agent, "--format", "px4", "-o", str(out)]) == 2
 
 
 PLUS = [(0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)]

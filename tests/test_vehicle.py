@@ -66,6 +66,7 @@ OF_OTHERS = {
     "rotorpy_hummingbird",
     "l2f_crazyflie",
     "x500",
+    "crazyflie_nanobench",
 }
 
 

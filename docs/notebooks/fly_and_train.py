@@ -41,10 +41,10 @@ REINFORCEMENT = 3_000_000  # timesteps of PPO
 # %% [markdown]
 # ## Fly
 #
-# A *state recovery* begins in any attitude, upside down included, with random velocity and body
-# rates. The controller has to level the quadcopter and bring it back to where it was let go. `fly`
-# flies any number of episodes side by side, and the same seed gives every controller the same
-# starts. A `Recorder` keeps the trajectories.
+# In a *state recovery* you let the quadcopter go in any attitude, upside down included, with random
+# velocity and body rates. The controller has to level it and bring it back to where you let it go.
+# `fly` flies as many episodes as you want, side by side. With the same seed you give every
+# controller the same starts. A `Recorder` keeps the trajectories.
 
 
 # %%
@@ -91,15 +91,15 @@ plot_recoveries(
 )
 
 # %% [markdown]
-# Each line is a flight, each cross a crash or a flight that got out of range. The PID controller
-# assumes small angles, and crashes on most flights that begin upside down. The agent has learnt to
-# turn over first.
+# Each line is a flight. Each cross is a crash, or a flight that got out of range. You see that the
+# PID controller crashes on most flights that begin upside down: it assumes small angles. The agent
+# has learnt to turn over first.
 #
 # ## Imitate
 #
-# `DAgger` lets the policy fly and asks the expert what it would have done in each state. You use it
-# like any algorithm of Stable-Baselines3. `QuadcopterVecEnv` flies all its quadcopters in one
-# compiled call.
+# Now you train an agent of your own. `DAgger` lets it fly and asks the expert what it would have
+# done in each state. You use it like any algorithm of Stable-Baselines3. `QuadcopterVecEnv` flies
+# all its quadcopters in one compiled call.
 
 # %%
 imitation = DAgger(
@@ -123,10 +123,10 @@ imitation.save("imitation")
 # %% [markdown]
 # ## Go beyond the expert
 #
-# `PPOBC` is PPO with a cloning term that keeps the policy near the expert. With
-# `bc_filter="agreement"` the term ignores states in which the agent recovers and the PID would do
-# something else. The callback records the mean reward of the last episodes, as any callback of
-# Stable-Baselines3 can.
+# So far your agent imitates. `PPOBC` takes it beyond its expert: it is PPO with a cloning term that
+# keeps the policy near the expert. With `bc_filter="agreement"` the term ignores states in which
+# the agent recovers and the PID would do something else. The callback records the mean reward of
+# the last episodes, as any callback of Stable-Baselines3 can.
 
 
 # %%
@@ -186,10 +186,10 @@ axes.set(
 plt.show()
 
 # %% [markdown]
-# The first points come from few and short episodes. In the first two rollouts only the critic
-# learns. Then the policy gets better.
+# Do not mind the first points: they come from few and short episodes. In the first two rollouts
+# only the critic learns. Then the policy gets better.
 #
-# A policy may hover at a small offset from its target. You can correct it without training:
+# Your agent may hover at a small offset from its target. You can correct that without training:
 # `correct_offset` measures the offset and takes it out of the first layer.
 
 # %%
@@ -199,7 +199,7 @@ agent.save("my_agent")
 # %% [markdown]
 # ## Who recovers
 #
-# All three fly the same fresh episodes. No training has seen them.
+# All three fly the same fresh episodes, which no training has seen.
 
 # %%
 controllers = {"PID expert": PIDExpert(), "imitation agent": imitation, "RL agent": agent}
@@ -236,6 +236,7 @@ plot_recoveries(controllers)
 # %% [markdown]
 # ## Further
 #
-# Stock `PPO` loads `my_agent.zip`. One command does both trainings with more timesteps,
-# evaluations, snapshots and a table at the end: `sb3-quad train --thesis`. `sb3-quad demo
-# my_agent.zip pid` writes a page on which you can throw your own agent.
+# - Stock `PPO` loads your `my_agent.zip`.
+# - `sb3-quad demo my_agent.zip pid` writes a page on which you can throw your own agent.
+# - `sb3-quad train --thesis` does both trainings with more timesteps, evaluations, snapshots and a
+#   table at the end.

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Your own expert and reward
 #
-# The experts of the package hurry. Suppose your quadcopter carries a cup of coffee: it should fly
-# slowly and hardly tilt. With your own expert you say so by example, with your own reward by a
-# price.
+# The experts of the package hurry. Suppose your quadcopter carries a cup of coffee, so it should
+# fly slowly and hardly tilt. You can say so in two ways: by example, with an expert of your own, or
+# by a price, with a reward of your own.
 
 # %%
 import matplotlib.pyplot as plt
@@ -43,9 +43,9 @@ REINFORCEMENT = 600_000  # timesteps that another learns from the reward
 # %% [markdown]
 # ## An expert
 #
-# An expert has `actions(state)`: for the true state of n vehicles it returns n rows of four rotor
-# thrusts in [-1, 1]. Here the geometric controller of the package does the work. It sees only a
-# target close ahead, and the nearer that target is, the slower it flies.
+# Your expert needs one method, `actions(state)`. It gets the true state of n vehicles and returns n
+# rows of four rotor thrusts in [-1, 1]. Here the geometric controller of the package does the work.
+# You only show it a target close ahead, and the nearer that target is, the slower it flies.
 
 
 # %%
@@ -69,7 +69,8 @@ class UnhurriedExpert(Expert):
 # %% [markdown]
 # ## Does it do what you want
 #
-# `fly` takes anything that flies: experts, models of Stable-Baselines3, functions.
+# Look at its flights before you train on it. `fly` takes anything that flies: experts, models of
+# Stable-Baselines3, functions.
 
 
 # %%
@@ -110,8 +111,8 @@ plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert}
 # %% [markdown]
 # ## An agent that imitates it
 #
-# The agent sees 18 noisy features instead of the true state. `beta` is the share of the flights
-# that the expert flies itself: all in the first rollout, fewer in each later one.
+# Your expert sees the true state, your agent only 18 noisy features. `beta` is the probability with
+# which the expert flies a control step itself: 1 in the first rollout, less in each later one.
 
 # %%
 agent = DAgger(
@@ -138,8 +139,8 @@ plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert,
 # ## A reward
 #
 # You can change the coefficients of the task's reward by name:
-# `task_kwargs={"tilt_cost": 0.004}` doubles the thesis's price of a tilt. For anything else write a
-# wrapper. This one charges for restless rotors, which spill coffee, too.
+# `task_kwargs={"tilt_cost": 0.004}` doubles the thesis's price of a tilt. For anything else you
+# write a wrapper. This one charges for restless rotors, which spill coffee, too.
 
 
 # %%
@@ -249,12 +250,15 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# The cost is quadratic. So the large changes on the way became smaller; the small ones at the
-# target matter little, and became larger.
+# Your cost is quadratic. So the large changes on the way became smaller. The small ones at the
+# target matter little, and they became larger.
 #
 # ## Further
 #
-# Put the expert into a module, `my_module.py`, and you can use it in every command: `sb3-quad train
-# --algo dagger --expert my_module:UnhurriedExpert`, `sb3-quad evaluate pid
-# my_module:UnhurriedExpert`. You can give coefficients of the reward there, too: `--env-kwargs
+# Put your expert into a module, `my_module.py`, and you can use it in every command:
+#
+# - `sb3-quad train --algo dagger --expert my_module:UnhurriedExpert`
+# - `sb3-quad evaluate pid my_module:UnhurriedExpert`
+#
+# On the command line you give coefficients of the reward with `--env-kwargs
 # "task_kwargs:dict(tilt_cost=0.004)"`.

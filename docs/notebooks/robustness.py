@@ -13,9 +13,9 @@
 # %% [markdown]
 # # How robust is your agent
 #
-# A quadcopter outdoors is heavier than in its data sheet, the wind blows, and its motors are late.
-# This notebook changes one thing after the other and shows who still arrives. Replace an agent
-# below by the path of your own zip.
+# Outdoors your quadcopter is heavier than in its data sheet, the wind blows, and the motors are
+# late. In this notebook you change one thing after the other and see who still arrives. To see it
+# for your own agent, replace one of those below by the path of your zip.
 
 # %%
 import tempfile
@@ -38,9 +38,10 @@ EPISODES = 60  # episodes of each controller in each scenario
 # %% [markdown]
 # ## Scenarios
 #
-# A scenario says where flights begin, where they go and what happens on the way. `vary` makes a
-# grid of scenarios from one. `itm-recovery` knows one vehicle, undisturbed. `itm-robust` was
-# trained with domain randomization: other vehicles, forces and gusts.
+# In a scenario you say where flights begin, where they go and what happens on the way. With `vary`
+# you make a grid of scenarios from one. You compare three controllers: the PID; `itm-recovery`,
+# which knows one vehicle, undisturbed; and `itm-robust`, which was trained with domain
+# randomization, that is with other vehicles, forces and gusts.
 
 # %%
 suite = parse_suite(
@@ -78,8 +79,9 @@ controllers = [
 # %% [markdown]
 # ## Flights
 #
-# All controllers fly the same episodes. `evaluate` writes a folder with all metrics, trajectories
-# and a table of the episodes. The command `sb3-quad evaluate` does the same and also writes a page.
+# All controllers fly the same episodes. `evaluate` gives you a folder with all metrics,
+# trajectories and a table of the episodes. The command `sb3-quad evaluate` does the same, and
+# writes a page, too.
 
 # %%
 folder = tempfile.mkdtemp()
@@ -128,15 +130,15 @@ def plot_grid(results):
 plot_grid(results)
 
 # %% [markdown]
-# A successful flight survives and ends within 0.1 m of its target. With another mass or a force the
-# PID and `itm-recovery` come to rest at an offset, since nothing in them integrates the error.
-# `itm-robust` has an integral and sees its last observations, from which it can estimate what it
-# flies. A delay of six control steps is too much for all three.
+# A successful flight survives and ends within 0.1 m of its target. You see that with another mass,
+# or a force, the PID and `itm-recovery` come to rest at an offset, since nothing in them integrates
+# the error. `itm-robust` has an integral. It also sees its last observations, from which it can
+# estimate what it flies. A delay of six control steps is too much for all three.
 #
 # ## Two things at once
 #
-# A grid over two keys is a map. This one shows recoveries by the tilt and the body rates at the
-# start, at 6 m/s in a random direction.
+# If you vary two keys, you get a map. This one shows recoveries by the tilt and the body rates at
+# the start, at 6 m/s in a random direction.
 
 # %%
 tumbling = parse_suite(
@@ -183,6 +185,6 @@ plt.show()
 # %% [markdown]
 # ## Further
 #
-# The suite `robustness` of the package varies more: inertia, motors, noise, gusts and hits. Try
-# `sb3-quad evaluate pid my_agent.zip --suite robustness --workers 2`. If your agent fails there,
-# train it with domain randomization: `sb3-quad train` does so by default.
+# The suite `robustness` of the package varies more: inertia, motors, noise, gusts and hits. Try it
+# with your agent: `sb3-quad evaluate pid my_agent.zip --suite robustness --workers 2`. If it fails
+# there, train it with domain randomization, as `sb3-quad train` does by default.

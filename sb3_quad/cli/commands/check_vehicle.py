@@ -9,6 +9,8 @@ examples:
   sb3-quad check-vehicle crazyflie
   # from the parameters alone, without flying
   sb3-quad check-vehicle my.yaml -n 0
+  # how far it departs from logs of real flights, beside predictions without a model
+  sb3-quad check-vehicle my.yaml --flights logs
 
 Exit code 1: the rotors cannot produce hover thrust. For the contents of a
 vehicle file, see docs/vehicles.md.
@@ -64,6 +66,11 @@ FLAGS: Flags = {
         480,
         "episodes of each task and expert, with the true state (480)",
     ),
+    "--flights FOLDER": (
+        str,
+        None,
+        "fly the motor commands of these logs instead (CSV; columns: docs/vehicles.md)",
+    ),
     "--seed N": (natural, 0, "seed of the episodes, which no search or training uses (0)"),
 }
 
@@ -93,7 +100,12 @@ def run(options: Namespace) -> int:
     console().print(text_table(vehicle.name, ("", ""), _parameters(vehicle), align="left"))
     for warning in warnings(vehicle):
         print(f"unusual: {warning}")
-    if options.episodes:
+    if options.flights is not None:
+        from sb3_quad.evaluation.real_flights import error_table, read_logs
+
+        logs = read_logs(options.flights, vehicle.control_step)
+        console().print(error_table(logs, vehicle))
+    elif options.episodes:
         derived = vehicle.geometric_gains is None
         gains = "derived from the parameters" if derived else "of its file"
         controllers = {

@@ -8,7 +8,7 @@ examples:
   sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
   # two agents and the expert's success and reward
   sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" \
-    --line expert:32.25:-16.1 --title "state recovery" -o curves.svg
+    --line expert:32.8:-16.0 --title "state recovery" -o curves.svg
   # with the thesis's results
   sb3-quad plot "PPO+BC=logs/ppo_bc/QuadStateRecovery-v0_*" \
     --thesis state_recovery --show survival reward losses
@@ -37,7 +37,7 @@ def _line(text: str) -> tuple[str, dict[str, float]]:
         return name, {"success": share, "survival": share, "reward": float(reward)}
     except ValueError:
         raise ArgumentTypeError(
-            f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.25:-16.1"
+            f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.8:-16.0"
         ) from None
 
 

@@ -6,6 +6,7 @@ import { Fleet } from "./fleet.js";
 import { listen } from "./hand.js";
 import { Player } from "./player.js";
 import { Scene } from "./scene.js";
+import { School } from "./school.js";
 import { unpackLayers } from "./weights.js";
 
 const SKY = ["zenith", "haze", "ground", "grid", "gridFar", "shadow"];
@@ -29,6 +30,7 @@ fleet.entries.forEach((entry, k) => (entry.active = k < (narrow.matches ? SHOWN.
 const player = new Player(fleet, camera);
 const board = new Board(fleet, (k) => controls.toggle(k));
 const controls = new Controls(player, board, data.vehicles, data.colours);
+const school = new School(controls, Date.now() % 65536);
 const hand = listen(canvas, camera, player);
 let frames = 0, last = 0;
 
@@ -43,7 +45,7 @@ function resize() {
   Object.assign(canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   Object.assign(camera, { width, height });
-  camera.inset = narrow.matches ? { top: 84, right: 8, bottom: 12, left: 8 } : { top: 90, right: 16, bottom: 76, left: 16 };
+  camera.inset = narrow.matches ? { top: 84, right: 8, bottom: 12, left: 8 } : { top: 90, right: 16, bottom: 104, left: 16 };
   camera.prepare();
 }
 
@@ -54,7 +56,10 @@ function draw(seconds) {
   const line = player.line, draws = player.tool === "draw" && !line.length;
   if (!hand.isHolding()) camera.follow([...seen, ...line], draws ? SHEET : MARGIN, seconds);
   scene.draw(bodies, fleet.vehicle, player.trails, line);
-  if (frames % 4 === 0) board.plot(scene.palette);
+  if (frames % 4 === 0) {
+    board.plot(scene.palette);
+    school.draw(scene.palette);
+  }
   if (frames % 6 === 0) board.show();
 }
 
@@ -73,7 +78,7 @@ player.onEnd = () => {
     const end = flight.arrival >= 0 ? `arrives after ${flight.arrival.toFixed(2)} s` : "survives";
     return `${agent.label} ${flight.lost ? "is lost" : end}`;
   });
-  if (!player.auto) say(outcomes.join("; "));
+  if (!player.auto && !$("status").classList.contains("wrong")) say(outcomes.join("; "));
 };
 readPalette();
 board.build();
@@ -88,4 +93,4 @@ requestAnimationFrame((now) => {
   frame(now);
 });
 /** For the console, and for tests. */
-Object.assign(window, { demo: { fleet, camera, player, controls, frames: () => frames, ready: performance.now() } });
+Object.assign(window, { demo: { fleet, camera, player, controls, school, frames: () => frames, ready: performance.now() } });

@@ -57,6 +57,7 @@ export class Controls {
 
   /** Begin a start that somebody asked for. @param {string} name */
   start(name) {
+    say("");
     this.player.takeOver();
     this.player.start(name);
   }
@@ -161,16 +162,22 @@ export class Controls {
     addEventListener("keydown", (event) => this.#key(event));
   }
 
+  /** A further agent flies from now on. @param {import("./flight.js").Agent} agent */
+  join(agent) {
+    const entry = this.fleet.add(agent, this.colours[this.fleet.entries.length % this.colours.length]);
+    this.#offerVehicles();
+    this.board.build();
+    this.start(this.player.startName || "random");
+    return entry;
+  }
+
   /** Read a zip and let its agent fly. @param {File} file */
   async take(file) {
     try {
       const { agent, vehicle } = await readAgent(file.name.replace(/\.zip$/, ""), await file.arrayBuffer());
       if (vehicle && agent.vehicle && !this.vehicles.some(({ name }) => name === vehicle.name)) this.vehicles.push(vehicle);
       while (this.fleet.entries.some((entry) => entry.agent.label === agent.label)) agent.label += "′";
-      const entry = this.fleet.add(agent, this.colours[this.fleet.entries.length % this.colours.length]);
-      this.#offerVehicles();
-      this.board.build();
-      this.start(this.player.startName || "random");
+      const entry = this.join(agent);
       const trained = agent.vehicle || (vehicle ? "random quadcopters" : "a vehicle that it does not name");
       say(entry.why || `${agent.label} flies, trained on ${trained}`, Boolean(entry.why));
     } catch (error) {

@@ -49,6 +49,7 @@ MODEL = [
     "course",
     "flight",
     "weights",
+    "gradient",
 ]
 VIEW = [
     "fleet",
@@ -60,6 +61,7 @@ VIEW = [
     "player",
     "board",
     "controls",
+    "school",
     "app",
 ]
 EXPERTS = ("pid", "geometric")
@@ -122,7 +124,8 @@ def make_page(
         __package__,
         "page.html.j2",
         data=text,
-        script=script(),
+        model=script(MODEL),
+        view=script(VIEW),
         rounded=rounded,
         version=__version__,
     )

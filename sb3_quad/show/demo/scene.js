@@ -214,11 +214,17 @@ export class Scene {
     /** @type {number[][]} */
     const taken = [];
     for (const body of bodies) {
-      const [x, y, depth] = camera.project(body.position);
+      let [x, y, depth] = camera.project(body.position);
       if (depth < 0.3) continue;
       const text = body.lost ? `${body.label}: ${body.lost === "collision" ? "crashed" : "out of range"}` : body.label;
       const width = g.measureText(text).width + 18;
       let top = y - (apart ? 54 : 62);
+      if (body.lost) {
+        // The camera does not follow what is lost: its label waits at the edge that it left by.
+        const { inset } = camera;
+        x = Math.min(Math.max(x, inset.left + width / 2), camera.width - inset.right - width / 2);
+        top = Math.min(Math.max(top, inset.top), camera.height - inset.bottom - 12);
+      }
       while (taken.some(([l, t, w]) => Math.abs(l - x) < (w + width) / 2 && Math.abs(t - top) < 22)) top -= 23;
       taken.push([x, top, width]);
       g.fillStyle = body.lost ? palette.lost : body.colour;

@@ -1,0 +1,218 @@
+"""How far a vehicle departs from real flights when it flies the commands that their motors got.
+
+A log is a CSV file with the columns of NanoBench (Ullah and Baca 2026, arXiv 2603.09908), which
+docs/vehicles.md lists. It is resampled to the vehicle's control step. Three things are calibrated
+by the whole flight: the clock of the vehicle's own columns, by the shift at which gyro and attitude
+agree best; how the markers of the motion capture are mounted, so that the mean specific force lies
+along z; and the motors against each other, so that the mean commands give no moment.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.types import Arrays, BoolArray, FloatArray, StrPath
+from sb3_quad.evaluation.tables import Table, text_table
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.physics import quaternion_product
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    VELOCITY,
+    rotation_matrices,
+)
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
+
+HORIZONS = (0.1, 0.2, 0.5)  # s
+# Commands before a window that turn the rotors, s.
+WARM_UP = 0.5
+# Below it rows do not count, since the ground changes the thrust, m.
+LEAST_HEIGHT = 0.3
+# Longer gaps between rows are not filled, s.
+LONGEST_GAP = 0.05
+# Differences of clocks that are tried, s.
+OFFSETS = np.arange(-0.1, 0.1005, 0.001)
+# Thrust of a motor, N, by powers of its voltage from the 0th: crazyflie-firmware 2025.12,
+# platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM / 65,535 of the battery's.
+THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
+FULL_PWM = 65_535.0
+# By the motion capture, in the order of the state's first rows
+SEEN = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
+FELT = ["imu_gyro_x", "imu_gyro_y", "imu_gyro_z"]
+THRUSTS = ["thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4"]
+PWM = ["motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4", "pwr_pm_vbat"]
+NEEDED = (
+    f"a log is a CSV file with the columns t, {', '.join(SEEN + FELT)}, and thrusts in N "
+    f"({', '.join(THRUSTS)}) or {', '.join(PWM)}"
+)
+QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
+HEADS = ("root mean square of the error", "simulated", "nothing changes", "velocity, rates stay")
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A flight of n rows, one for each control step, in SI units."""
+
+    name: str  #: of its file
+    #: (n, 13): position, quaternion, velocity and body rates, as the rows of the state have them
+    motion: FloatArray
+    thrusts: FloatArray  #: (n, 4), commanded, M1 to M4, N
+    columns: Arrays  #: all columns of the file, (n,), by the clock of the vehicle
+    flying: BoolArray  #: (n,), in the air
+    offset: float  #: s, by which the vehicle's clock was behind that of the motion capture
+
+
+def read_logs(folder: StrPath, step: float) -> list[Log]:
+    """Read the logs of a folder, with rows ``step`` s apart.
+
+    :raises ConfigError: no CSV file there, or one that cannot be read or lacks columns.
+    """
+    paths = sorted(Path(folder).glob("*.csv"))
+    if not paths:
+        raise ConfigError(f"{folder}: no CSV file there; {NEEDED}")
+    return [read_log(path, step) for path in paths]
+
+
+def read_log(path: Path, step: float) -> Log:
+    """Read one log, see :func:`read_logs`."""
+    try:
+        table = pd.read_csv(path).astype(float)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: not a table of numbers: {error}") from error
+    commands = THRUSTS if THRUSTS[0] in table else PWM
+    missing = {"t", *SEEN, *FELT, *commands} - {*table}
+    if missing:
+        raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
+    time = table["t"]
+    grid = np.arange(time.iloc[0], time.iloc[-1], step)
+
+    def at(names: Iterable[str], behind: float = 0.0) -> FloatArray:
+        return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
+
+    motion = at(SEEN + FELT)
+    attitude = motion[:, QUATERNION]
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    flying = motion[:, 2] > LEAST_HEIGHT
+    flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
+    inverse = (attitude[:-2] * [1.0, -1.0, -1.0, -1.0]).T
+    turns = quaternion_product.py_func(*inverse, *attitude[2:].T)
+    # Twice the step, and twice the half angle: these are the body rates times the step.
+    rates = np.pad(turns[1:], ((0, 0), (1, 1))).T * flying[:, None]
+    offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind))))
+    motion[:, BODY_RATES] = at(FELT, offset)
+
+    thrusts = at(commands, offset)
+    if commands is PWM:
+        thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
+    # Some logs are extrapolated after the radio was lost.
+    flying &= np.isfinite(thrusts).all(axis=1)
+    if flying.any():
+        force = np.gradient(motion[:, VELOCITY], step, axis=0)
+        force[:, 2] += 9.81
+        in_body = np.einsum("nji,nj->ni", rotation_matrices(attitude), force)
+        x, y, z = in_body[flying].mean(axis=0)
+        motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
+        mean = thrusts[flying].mean(axis=0)
+        thrusts *= mean.mean() / mean
+    columns = dict(zip(table, at(table, offset).T, strict=True))
+    return Log(path.stem, motion, thrusts, columns, flying, offset)
+
+
+def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
+    """Return the thrusts, N, that the Crazyflie's firmware expects of its commands.
+
+    :param pwm: (n, 4), 0 to 65,535; others and motors that stand become NaN.
+    :param battery: (n, 1), V.
+    """
+    thrusts = np.polynomial.polynomial.polyval(pwm / FULL_PWM * battery, THRUST_BY_VOLTAGE)
+    return np.where((pwm > 0.0) & (pwm <= FULL_PWM), thrusts, np.nan)
+
+
+def turned_on(quaternion: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Return attitudes, (n, 4), after rotations in body axes, (n, 3), rad."""
+    half = 0.5 * np.linalg.norm(rotation, axis=1)
+    axis = 0.5 * np.sinc(half / np.pi) * rotation.T
+    return np.stack(quaternion_product.py_func(*quaternion.T, np.cos(half), *axis), axis=1)
+
+
+def open_loop(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    stride: int = 1,
+    before_step: Callable[[QuadcopterBatch], object] = id,
+) -> Iterator[tuple[float, list[FloatArray], FloatArray]]:
+    """Fly recorded commands from recorded states.
+
+    Each row from which a log flies on for long enough begins a window. Its rotors begin as the
+    commands of the ``WARM_UP`` before have turned them.
+
+    :param logs: with rows at the vehicle's control step.
+    :param stride: rows from a window to the next.
+    :param before_step: called with the batch before each control step; it may set a wrench.
+    :return: horizon by horizon: its s, the predictions in the order of ``HEADS``, and the record,
+        each (windows, 13) as in ``Log.motion``.
+    :raises ConfigError: no log flies for long enough, or the rotors do not lie as M1 to M4 do.
+    """
+    vehicle = first_vehicle(vehicle, "crazyflie")
+    step = vehicle.control_step
+    before = round(WARM_UP / step)
+    ends = [round(horizon / step) for horizon in HORIZONS]
+    fit = []
+    for log in logs:
+        fit.append(np.zeros(log.flying.size, bool))
+        total = np.cumsum(log.flying)
+        length = before + ends[-1]
+        # All rows around it fly.
+        fit[-1][before : -ends[-1]] = total[length:] - total[:-length] == length
+    rows = np.flatnonzero(np.concatenate(fit))[::stride]
+    if rows.size == 0:
+        raise ConfigError(f"no log flies above {LEAST_HEIGHT:g} m for {WARM_UP + HORIZONS[-1]:g} s")
+    record = np.concatenate([log.motion for log in logs])
+    thrusts = np.concatenate([log.thrusts for log in logs])
+    actions = vehicle.thrust_to_action(np.nan_to_num(thrusts))
+    start = record[rows]
+
+    settings = FlightSettings(vehicle=vehicle, noise=0.0)
+    batch = QuadcopterBatch(rows.size, settings, seed=0, autoreset=False)
+    batch.reset()
+    motion = batch.state[: start.shape[1]]
+    for now in range(-before, ends[-1]):
+        if now == 0:
+            motion[:] = start.T
+        before_step(batch)
+        batch.step(actions[rows + now])
+        if now + 1 in ends:
+            time = (now + 1) * step
+            stays = start.copy()
+            stays[:, POSITION] += start[:, VELOCITY] * time
+            stays[:, QUATERNION] = turned_on(start[:, QUATERNION], start[:, BODY_RATES] * time)
+            yield time, [motion.T.copy(), start, stays], record[rows + now + 1]
+
+
+def errors(prediction: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the root mean squares of the errors, in the order of ``QUANTITIES``, (4,)."""
+    gap = prediction - end
+    cosine = np.abs((prediction * end)[:, QUATERNION].sum(axis=1))
+    norms = [np.linalg.norm(gap[:, part], axis=1) for part in (POSITION, VELOCITY, BODY_RATES)]
+    norms.insert(2, np.degrees(2.0 * np.arccos(np.minimum(cosine, 1.0))))
+    return np.asarray(np.sqrt(np.square(norms).mean(axis=1)))
+
+
+def error_table(logs: Sequence[Log], vehicle: Vehicle) -> Table:
+    """Return the errors of a vehicle in open loop, over all windows of all logs."""
+    rows = []
+    for time, predictions, end in open_loop(logs, vehicle):
+        found = np.transpose([errors(prediction, end) for prediction in predictions])
+        for quantity, values in zip(QUANTITIES, found, strict=True):
+            rows.append([f"{quantity}, after {time:g} s", *(f"{value:.3g}" for value in values)])
+    title = f"{vehicle.name}: {len(end)} windows of {len(logs)} logs, open loop"
+    thrusts = np.concatenate([log.thrusts[log.flying] for log in logs])
+    clipped = (np.abs(vehicle.thrust_to_action(thrusts)) > 1.0).mean()
+    caption = f"{clipped:.1%} of the commands are beyond the rotors' limits, and clipped"
+    return text_table(title, HEADS, rows)._replace(caption=caption)
