@@ -163,6 +163,7 @@ RANDOM = {
     "wind_gusts": st.just({"std": [0, 2]}),
 }
 SEEN = {
+    "features": st.just("px4"),
     "noise": st.sampled_from([0.0, 0.2, {"relative": 0.1, "additive": 0.05}, {"additive": 0.02}]),
     "last_action": st.just(True),
     "history": st.sampled_from([[0, 1], [0, 2, 5], [0, 1, 2, 3, 10]]),
@@ -203,6 +204,20 @@ DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
     steps=30,
     substeps=2,
     seed=0,
+)
+@example(
+    vehicle={},
+    randomize={},
+    seen={
+        "features": "px4",
+        "noise": {"relative": 0.1, "additive": 0.05},
+        "reference": {"curve": "random_smooth", "heading": "random", "heading_rate": 2.0},
+        "position_integral": {"gain": 3, "distance": 1, "speed": 4, "limit": 0.05},
+        "history": [0, 2],
+    },
+    steps=30,
+    substeps=2,
+    seed=2,
 )
 @example(
     vehicle={},

@@ -164,7 +164,6 @@ def test_a_nominal_policy_recovers_after_half_a_minute(run):
     assert float(re.search(r"([\d.]+)% of 3,840", last)[1]) > 98.5
 
 
-
 @pytest.mark.slow
 def test_learning_speed(run, tmp_path):
     method = "model's gradient from the clone"

@@ -266,10 +266,11 @@ def undo_relation(b, by_feature):
 
 
 @compiled(fastmath=True)
-def undo_features(b, by_feature, gradient):
+def undo_features(b, by_feature, gradient, for_px4):
     """Undo :func:`.observation.features`: add to the gradient by the state of a loaded block.
 
     :param by_feature: float64 (OBSERVATION_SIZE, LANES), by the features in their units.
+    :param for_px4: whether the velocity has world axes.
     """
     f = by_feature
     for lane in range(LANES):
@@ -277,11 +278,14 @@ def undo_features(b, by_feature, gradient):
         for k in range(3):
             gradient[X.position + k, lane] += f[F.position + k, lane]
             gradient[X.body_rates + k, lane] += f[F.body_rates + k, lane]
-        # The observed velocity is Rᵀ v.
+        # The observed velocity is Rᵀ v, or v itself, which the attitude does not turn.
         gx, gy, gz = vector(f[F.velocity :], lane)
-        x, y, z = to_world(r, gx, gy, gz)
+        x, y, z = gx, gy, gz
+        vx = vy = vz = 0.0
+        if not for_px4:
+            x, y, z = to_world(r, gx, gy, gz)
+            vx, vy, vz = vector(b.velocity, lane)
         _add(gradient, X.velocity, lane, x, y, z)
-        vx, vy, vz = vector(b.velocity, lane)
         # The observed matrix is Rᵀ, row by row: its columns are the rows of R.
         m = F.rotation
         _add_rotation(

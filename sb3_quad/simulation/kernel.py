@@ -169,7 +169,7 @@ def step(
     gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations,
-    moves, course, tracks, track_numbers, previews,
+    moves, for_px4, course, tracks, track_numbers, previews,
     physics_step, substeps, own_delays, autoreset,
 ):  # fmt: skip
     """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
@@ -209,6 +209,7 @@ def step(
     :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
     :param moves: whether targets move or have a heading; without it their rows of the state behind
         the position are not read.
+    :param for_px4: whether observations are those of ``features: px4``.
     :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, as for ``tracks`` and
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
@@ -274,7 +275,7 @@ def step(
             for lane in range(count):
                 streams[STEP, first + lane] += np.uint32(1)
             load_rows(streams, first, count, b.stream)
-            observe(b, moves)
+            observe(b, moves, for_px4)
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)
             if wind_gust.shape[1] > 0:
@@ -339,7 +340,7 @@ def step(
                 b.stream[k, lane] = streams[k, b.row[lane]]
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
-        observe(b, moves)
+        observe(b, moves, for_px4)
         _write_observations(
             b, count, integral, ages, frames, previews, course, tracks, track_numbers,
             observations,

@@ -24,7 +24,13 @@ from sb3_quad.simulation.kernel import (
     load_vehicles,
     new_block,
 )
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features, with_noise
+from sb3_quad.simulation.observation import (
+    OBSERVATION_SIZE,
+    F,
+    clear_hidden,
+    features,
+    with_noise,
+)
 from sb3_quad.simulation.physics import limit_speeds, rotor_speed
 from sb3_quad.simulation.random import STEP, random_words, standard_normals
 from sb3_quad.simulation.state import STATE_SIZE, P
@@ -159,6 +165,7 @@ class FlightTape:
             batch.vehicles,
             batch.scaling,
             batch.moves,
+            batch.for_px4,
             batch.ages,
             self._integrals,
             batch.integral_numbers,
@@ -177,8 +184,8 @@ class FlightTape:
 @compiled
 def undo(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
-    moves, ages, integrals, integral_numbers, by_observation, by_frames, by_integral, gradient,
-    by_actions, physics_step, substeps,
+    moves, for_px4, ages, integrals, integral_numbers, by_observation, by_frames, by_integral,
+    gradient, by_actions, physics_step, substeps,
 ):  # fmt: skip
     """Undo a control step and the observation after it; see :class:`FlightTape`.
 
@@ -218,17 +225,19 @@ def undo(
                 load_rows(states[step + 1], first, count, b.state)
                 load_rows(streams, first, count, b.stream)
                 b.stream[STEP] += np.uint32(step + 1)
-                features(b, moves)
+                features(b, moves, for_px4)
                 random_words(b)
                 standard_normals(b)
                 _undo_frames(
                     b, first, count, step + 1, lengths, actions, ages, integrals, integral_numbers,
                     by_observation, by_frames, by_integral, by_feature, by_actions,
                 )  # fmt: skip
+                if for_px4:
+                    clear_hidden(by_feature)
                 undo_noise(b, by_feature)
-                if moves:
+                if moves and not for_px4:
                     undo_relation(b, by_feature)
-                undo_features(b, by_feature, own)
+                undo_features(b, by_feature, own, for_px4)
 
             load_rows(states[step], first, count, b.state)
             load_rows(wrench, first, count, b.wrench)
