@@ -134,7 +134,8 @@ def print_supervisor(arguments) -> None:
             flights = flown(arguments, agent, task, [firmware])
             print(
                 f"{agent}, {task}: {flights.success.sum()} succeed, settling time"
-                f" {np.nanmean(flights.settling_time[0.1]):.2f} s, {flights.cut_by_supervisor.sum()} of {flights.n} cut, longest"
+                f" {np.nanmean(flights.settling_time[0.1]):.2f} s,"
+                f" {flights.cut_by_supervisor.sum()} of {flights.n} cut, longest"
                 f" {1000 * np.nanmax(flights.low_force_time):.0f} ms below 0.5 g; filtered and at"
                 f" 25 Hz, by phase: {firmware.cut.sum(axis=1).tolist()}",
                 flush=True,
