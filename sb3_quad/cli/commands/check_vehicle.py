@@ -38,9 +38,9 @@ PARAMETERS = """\
 can hover | yes: thrust-to-weight ratio {v.thrust_limits[1]:.2f}, least {v.thrust_limits[0]:.2f}
 mass, weight | {v.mass:g} kg, {weight:.4g} N
 rotor thrust | {v.thrust_range[0]:.4g} to {v.thrust_range[1]:.4g} N, \
-hover {v.hover_thrust:.4g} N (action {action:+g})
+hover {hover} N (action {action})
 rotor speed | {speeds[0]:.0f} to {speeds[1]:.0f} rad/s, hover {speeds[2]:.0f} rad/s \
-({rpm[0]:.0f} to {rpm[1]:.0f} rpm, hover {rpm[2]:.0f} rpm)
+({rpm[0]:.0f} to {rpm[1]:.0f} rpm, hover {rpm[2]:.0f} rpm){unknown}
 acceleration | up {up:.1f}, down while level {down:.1f}, \
 horizontal at constant height {horizontal:.1f} m/s²
 greatest moments | {v.greatest_moments[0]:.4g}, {v.greatest_moments[1]:.4g}, \
@@ -81,7 +81,7 @@ def run(options: Namespace) -> int:
     try:
         vehicle = load_vehicle(options.vehicle)
         # Limits in multiples of the hover thrust do not show that it hovers at all.
-        rpm = vehicle.hover_rotor_speed * RPM
+        rpm = vehicle.hover_rotor_speed * math.sqrt(max(vehicle.hover_shares)) * RPM
         if rpm > FASTEST_HOVER:
             raise CannotHover(
                 f"{options.vehicle}: mass {vehicle.mass:g} kg: no rotor reaches the {rpm:,.0f} rpm "
@@ -119,12 +119,20 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     from sb3_quad.experts.geometric_gains import command_lag
 
     least, most = vehicle.thrust_limits
+    shares = vehicle.hover_shares
+    # One number where the four are the same.
+    shown = 4 if np.ptp(shares) else 1
+    # Without a moment, the rotor that gives most or least in hover is the first at its limit.
+    most /= shares.max()
+    least /= shares.min()
     speeds = np.array([*vehicle.rotor_speed_range, vehicle.hover_rotor_speed])
     text = PARAMETERS.format(
         v=vehicle,
         weight=vehicle.mass * vehicle.gravity,
+        hover=", ".join(f"{thrust:.4g}" for thrust in vehicle.hover_thrusts[:shown]),
         # Adding 0.0 turns a negative zero into one without a sign.
-        action=round(vehicle.hover_action, 3) + 0.0,
+        action=", ".join(f"{a:+g}" for a in np.round(vehicle.hover_action[:shown], 3) + 0.0),
+        unknown="" if vehicle.thrust_coefficient else "; kF unknown: 1,000 rad/s stands for hover",
         speeds=speeds,
         rpm=speeds * RPM,
         up=vehicle.gravity * (most - 1.0),
