@@ -36,7 +36,7 @@ from sb3_quad.show.demo.page import (
     script,
 )
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.layout import find_turn
+from sb3_quad.vehicles.layout import NamedLayout, find_turn
 from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
 STEPS = 1000  # control steps
@@ -139,11 +139,11 @@ BREEZY = {
     "motor_integration": "exact",
 }
 WORLD = {"mass": 1.2, "motor_gain": 0.7, "thrust": 0.9}
-BATTERY = {"rotor_order": "px4", "arm_length": 0.24, "center_of_mass": [-0.03, 0.01]}
+BATTERY = NamedLayout(rotor_order="px4", arm_length=0.24, center_of_mass=(-0.03, 0.01)).rotors()
 
 
 def vehicle_called(name):
-    """A shipped vehicle, or ITM as it is not: in wind, in another world, with its battery elsewhere."""
+    """A shipped vehicle, or ITM in wind, in another world, or with its battery elsewhere."""
     if name in VEHICLES.names():
         return load_vehicle(name)
     changes = {"breezy": BREEZY, "battery": {**BATTERY, "thrust_coefficient": 0.0}}.get(name, {})

@@ -196,6 +196,13 @@ def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
     assert worst_difference(vehicle, folder, state, actions, wrench, wind).max() < 1e-9
 
 
+def test_flight_of_an_impossible_inertia_is_pybullets(tmp_path):
+    changes = {"inertia": (0.01, 0.01, 0.025), "allow_impossible_inertia": True}
+    vehicle, rng = ITM.model_copy(update=changes), np.random.default_rng(4)
+    state, actions = random_state(rng, vehicle), random_actions(rng, 400)
+    assert worst_difference(vehicle, tmp_path, state, actions, np.zeros(12)).max() < 1e-9
+
+
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "itm"])
 @pytest.mark.parametrize("seed", range(3))
 def test_flight_of_the_shipped_vehicles_is_pybullets(name, seed, tmp_path):

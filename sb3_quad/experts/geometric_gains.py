@@ -118,9 +118,8 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
     arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
     mixers = np.concatenate([np.ones_like(arms[:1]), arms])
     inverse = np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0)
-    # Shares of the thrust, rounded, so that they are alike where the rotors are symmetrical. A
-    # randomized centre of mass may lie beyond the rotors, whose shares would be negative.
-    inverse[:, 0] = np.maximum(np.round(inverse[:, 0], 12), 0.01)
+    # A randomized centre of mass may lie beyond the rotors: a share would be negative.
+    inverse[:, 0] = np.maximum(inverse[:, 0], 0.01)
     constants = (v, gains, command_lag(v, control_step), inverse)
     return LawConstants._make(np.array(values, order="C") for values in constants)
 

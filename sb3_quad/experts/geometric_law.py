@@ -33,7 +33,7 @@ def fly_geometric(state, constants, wrench, actions):
     """
     # Each vehicle's gains are copied, so that they lie side by side. One column stands for all.
     gains = np.empty(constants.gains.shape[0])
-    scratch = np.empty((2, 4))
+    tilting = np.empty(4)
     for i in range(actions.shape[0]):
         k = min(i, constants.gains.shape[1] - 1)
         j = min(i, wrench.shape[1] - 1)
@@ -78,7 +78,7 @@ def fly_geometric(state, constants, wrench, actions):
             constants.mixer_inverse[:, :, k],
             constants.vehicles[P.thrust_middle, k],
             constants.vehicles[P.thrust_half_range, k],
-            scratch,
+            tilting,
             actions[i],
         )
 
@@ -231,47 +231,40 @@ def turn_moments(b, omega, gains, inertia):
 
 
 @compiled
-def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, scratch, actions):
+def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, tilting, actions):
     """Write the actions of one vehicle that make a thrust, N, and moments, N m.
 
     Roll and pitch come before the thrust, and the thrust before yaw, all within the limits of every
     rotor, ``thrust_middle`` ± ``thrust_half_range``, N.
 
-    :param scratch: memory to work in, (2, 4).
+    :param tilting: scratch for what roll and pitch ask of the rotors, (4,), N.
     """
     low = thrust_middle - thrust_half_range
     high = thrust_middle + thrust_half_range
-    middle = (high + low) / 2
-    half = (high - low) / 2
 
-    # A rotor gives its share of the thrust, and what roll and pitch ask of it. Divided by its share,
-    # limits and parts bound the thrust of all four. Two rotors leave it least room.
-    wholes, tilting = scratch
-    more = 0
-    less = 0
+    # Rotors give their shares of the thrust, and what roll and pitch ask of them. All of it is in
+    # terms of the whole thrust: the rotor with the greatest share bounds it from above, and the one
+    # with the smallest from below. Scale what roll and pitch ask until it fits; then shift the
+    # thrust.
+    shares = mixer_inverse[:, 0]
+    least = 0.0
+    most = 0.0
     for rotor in range(4):
-        wholes[rotor] = 1.0 / mixer_inverse[rotor, 0]
-        moment = mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
-        tilting[rotor] = moment * wholes[rotor]
-        if high * (wholes[rotor] - wholes[more]) < tilting[rotor] - tilting[more]:
-            more = rotor
-        if low * (wholes[rotor] - wholes[less]) > tilting[rotor] - tilting[less]:
-            less = rotor
-    # Scale what roll and pitch ask until those two leave some room; then shift the thrust there.
+        part = mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
+        tilting[rotor] = part / shares[rotor]
+        least = min(least, tilting[rotor])
+        most = max(most, tilting[rotor])
+    highest = high / shares.max()
+    lowest = min(highest, low / shares.min())
     scale = 1.0
-    room = max(0.0, high * wholes[more] - low * wholes[less])
-    spread = tilting[more] - tilting[less]
-    if spread > room:
-        scale = room / spread
-    for rotor in range(4):
-        thrust = max(thrust, low * wholes[rotor] - scale * tilting[rotor])
-    for rotor in range(4):
-        thrust = min(thrust, high * wholes[rotor] - scale * tilting[rotor])
+    if most - least > highest - lowest:
+        scale = (highest - lowest) / (most - least)
+    thrust = min(highest - scale * most, max(lowest - scale * least, thrust))
 
     # The share of the yaw moment that every rotor has room for.
     share = 1.0
     for rotor in range(4):
-        without_yaw = mixer_inverse[rotor, 0] * (thrust + scale * tilting[rotor])
+        without_yaw = shares[rotor] * (thrust + scale * tilting[rotor])
         yaw = mixer_inverse[rotor, 3] * moments[2]
         room = without_yaw - low
         if yaw > 0.0:
@@ -282,5 +275,7 @@ def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, s
     # Eq. 3.18: actions are thrusts between the limits, as numbers from -1 to 1.
     for rotor in range(4):
         yaw = share * mixer_inverse[rotor, 3] * moments[2]
-        without_yaw = mixer_inverse[rotor, 0] * (thrust + scale * tilting[rotor])
-        actions[rotor] = min(1.0, max(-1.0, (without_yaw + yaw - middle) / half))
+        without_yaw = shares[rotor] * (thrust + scale * tilting[rotor])
+        actions[rotor] = min(
+            1.0, max(-1.0, (without_yaw + yaw - thrust_middle) / thrust_half_range)
+        )

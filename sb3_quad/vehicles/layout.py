@@ -53,12 +53,10 @@ class NamedLayout(Frozen):
         signs = np.array(ORDERS[self.rotor_order])
         arm = self.arm_length * np.array([math.cos(angle), math.sin(angle)])
         # A rotor that turns clockwise turns the body anticlockwise, which is positive.
-        directions = signs.prod(axis=1)
-        if self.props == "out":
-            directions = -directions
+        clockwise = 1 if self.props == "in" else -1
         return {
             "rotor_positions": (signs * arm - self.center_of_mass).tolist(),
-            "rotor_directions": directions.tolist(),
+            "rotor_directions": (clockwise * signs.prod(axis=1)).tolist(),
         }
 
 

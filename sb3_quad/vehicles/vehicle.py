@@ -71,17 +71,17 @@ NAME = r"^[^/\\<>\p{C}]{1,100}$"
 def _a_number(value: Any) -> Any:
     """Refuse true and false, which pydantic takes for 1 and 0."""
     if isinstance(value, bool):
-        raise ValueError(f"{str(value).lower()} is not a number")
+        raise ValueError("true and false are not numbers")
     return value
 
 
 # No quadcopter has larger numbers, and the square of one would overflow.
 LARGEST = 1e6
-PositiveFloat = Annotated[float, BeforeValidator(_a_number), Field(gt=0.0, le=LARGEST)]
-NonNegativeFloat = Annotated[float, BeforeValidator(_a_number), Field(ge=0.0, le=LARGEST)]
-Coordinate = Annotated[float, BeforeValidator(_a_number), Field(ge=-LARGEST, le=LARGEST)]
+Number = Annotated[float, BeforeValidator(_a_number), Field(le=LARGEST)]
+PositiveFloat = Annotated[Number, Field(gt=0.0)]
+NonNegativeFloat = Annotated[Number, Field(ge=0.0)]
 Limits = tuple[NonNegativeFloat, PositiveFloat]
-Place = tuple[Coordinate, Coordinate]
+Place = tuple[Number, Number]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 _NO_LIMITS = (0.0, 0.0)
@@ -150,27 +150,22 @@ class Vehicle(Frozen):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_motor_gain(cls, data: Any) -> Any:
-        """Take ``motor_gain`` for ``motor_gain_up`` and ``motor_gain_down``."""
-        if not isinstance(data, Mapping) or "motor_gain" not in data:
+    def _in_short(cls, data: Any) -> Any:
+        """Take ``motor_gain`` for that up and down, and ``rotor_order`` with what goes with it for
+        positions and directions.
+        """
+        if not isinstance(data, Mapping):
             return data
-        if data.keys() & MOTOR_GAINS:
-            raise ValueError("motor_gain: give it, or motor_gain_up and motor_gain_down")
         data = dict(data)
-        data.update(dict.fromkeys(MOTOR_GAINS, data.pop("motor_gain")))
-        return data
-
-    @model_validator(mode="before")
-    @classmethod
-    def _rotors_by_name(cls, data: Any) -> Any:
-        """Take ``rotor_order`` and what goes with it for positions and directions."""
-        if not isinstance(data, Mapping) or "rotor_order" not in data:
-            return data
-        given = {key: data[key] for key in data.keys() & NamedLayout.model_fields}
-        named = validate(NamedLayout, given, "rotor_order").rotors()
-        if data.keys() & named:
-            raise ValueError("rotor_order: give it, or rotor_positions and rotor_directions")
-        return {key: data[key] for key in data.keys() - given} | named
+        meant = {}
+        if "motor_gain" in data:
+            meant = dict.fromkeys(MOTOR_GAINS, data.pop("motor_gain"))
+        if "rotor_order" in data:
+            given = {key: data.pop(key) for key in NamedLayout.model_fields if key in data}
+            meant |= validate(NamedLayout, given, "rotor_order").rotors()
+        for key in sorted(data.keys() & meant):
+            raise ValueError(f"{key}: give it, or motor_gain or rotor_order, which stands for it")
+        return data | meant
 
     @model_validator(mode="after")
     def _limits_as_published(self) -> "Vehicle":
@@ -189,8 +184,7 @@ class Vehicle(Frozen):
         if name == "rotor_speed_limits":
             if self.thrust_coefficient == 0.0:
                 raise ValueError(
-                    "rotor_speed_limits: need thrust_coefficient, which this vehicle has not;"
-                    " or give rotor_thrust_limits or thrust_limits"
+                    "rotor_speed_limits: need thrust_coefficient; or give rotor_thrust_limits"
                 )
             thrusts = self.thrust_coefficient * thrusts**2
         limits = (thrusts / self.hover_thrust).tolist()
@@ -240,10 +234,10 @@ class Vehicle(Frozen):
         gain = max(self.motor_gain_up, self.motor_gain_down)
         most = LARGEST_STEP[self.motor_integration]
         if gain * self.physics_step > most:
-            step = self.control_step / math.ceil(self.control_step * gain / most)
             raise ValueError(
                 f"motor_gain {gain:g}: times physics_step it may not exceed {most:g} with "
-                f"motor_integration {self.motor_integration}; physics_step: {step:.6g} will do"
+                f"motor_integration {self.motor_integration}; make physics_step {most / gain:.3g} "
+                "or less"
             )
         return self
 
@@ -260,8 +254,6 @@ class Vehicle(Frozen):
         replaced: set[str] = set()
         if "motor_gain" in changes:
             replaced.update(MOTOR_GAINS)
-        if "rotor_order" in changes:
-            replaced.update(("rotor_positions", "rotor_directions"))
         if not changes.keys().isdisjoint(LIMITS):
             replaced.add("thrust_limits")
         return Vehicle.model_validate({**self.model_dump(exclude=replaced), **changes})

@@ -38,7 +38,8 @@ PARAMETERS = """\
 can hover | yes: thrust-to-weight ratio {v.thrust_limits[1]:.2f}, least {v.thrust_limits[0]:.2f}
 mass, weight | {v.mass:g} kg, {weight:.4g} N
 rotor thrust | {v.thrust_range[0]:.4g} to {v.thrust_range[1]:.4g} N, \
-hover {hover} N (action {action})
+hover {v.hover_thrust:.4g} N (action {action:+g})
+in hover | {shares} of that by the rotors
 rotor speed | {speeds[0]:.0f} to {speeds[1]:.0f} rad/s, hover {speeds[2]:.0f} rad/s \
 ({rpm[0]:.0f} to {rpm[1]:.0f} rpm, hover {rpm[2]:.0f} rpm){unknown}
 acceleration | up {up:.1f}, down while level {down:.1f}, \
@@ -81,7 +82,7 @@ def run(options: Namespace) -> int:
     try:
         vehicle = load_vehicle(options.vehicle)
         # Limits in multiples of the hover thrust do not show that it hovers at all.
-        rpm = vehicle.hover_rotor_speed * math.sqrt(max(vehicle.hover_shares)) * RPM
+        rpm = vehicle.hover_rotor_speed * RPM
         if rpm > FASTEST_HOVER:
             raise CannotHover(
                 f"{options.vehicle}: mass {vehicle.mass:g} kg: no rotor reaches the {rpm:,.0f} rpm "
@@ -120,8 +121,6 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
 
     least, most = vehicle.thrust_limits
     shares = vehicle.hover_shares
-    # One number where the four are the same.
-    shown = 4 if np.ptp(shares) else 1
     # Without a moment, the rotor that gives most or least in hover is the first at its limit.
     most /= shares.max()
     least /= shares.min()
@@ -129,9 +128,9 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     text = PARAMETERS.format(
         v=vehicle,
         weight=vehicle.mass * vehicle.gravity,
-        hover=", ".join(f"{thrust:.4g}" for thrust in vehicle.hover_thrusts[:shown]),
         # Adding 0.0 turns a negative zero into one without a sign.
-        action=", ".join(f"{a:+g}" for a in np.round(vehicle.hover_action[:shown], 3) + 0.0),
+        action=round(vehicle.hover_action.mean(), 3) + 0.0,
+        shares=shares.round(3).tolist(),
         unknown="" if vehicle.thrust_coefficient else "; kF unknown: 1,000 rad/s stands for hover",
         speeds=speeds,
         rpm=speeds * RPM,

@@ -190,17 +190,14 @@ function wantedTurn(b1, b2, b3, p, q, gains) {
  */
 function allocate(thrust, mx, my, mz, mixer, low, high, actions) {
   const middle = (high + low) / 2, half = (high - low) / 2;
-  // What a rotor's limits and its part of roll and pitch leave of the whole thrust, of which it gives a share.
-  const wholes = mixer.map(([share]) => 1 / (Math.round(1e12 * share) / 1e12));
-  const tilting = mixer.map((m, k) => (m[1] * mx + m[2] * my) * wholes[k]);
-  const first = (/** @type {(k: number) => number} */ key) => [0, 1, 2, 3].reduce((best, k) => (key(k) < key(best) ? k : best));
-  const more = first((k) => high * wholes[k] - tilting[k]), less = first((k) => tilting[k] - low * wholes[k]);
-  const spread = tilting[more] - tilting[less], room = max(0, high * wholes[more] - low * wholes[less]);
-  const scale = spread > room ? room / spread : 1;
-  const lowest = max(...wholes.map((whole, k) => low * whole - scale * tilting[k]));
-  const highest = min(...wholes.map((whole, k) => high * whole - scale * tilting[k]));
-  const whole = min(highest, max(lowest, thrust));
-  const parts = tilting.map((each, k) => (whole + scale * each) / wholes[k]);
+  // Rotors give shares of the thrust, and what roll and pitch ask of them, here in terms of the whole thrust.
+  const shares = mixer.map(([each]) => each);
+  const tilting = mixer.map((m, k) => (m[1] * mx + m[2] * my) / shares[k]);
+  const least = min(0, ...tilting), most = max(0, ...tilting);
+  const highest = high / max(...shares), lowest = min(highest, low / min(...shares));
+  const scale = most - least > highest - lowest ? (highest - lowest) / (most - least) : 1;
+  const whole = min(highest - scale * most, max(lowest - scale * least, thrust));
+  const parts = shares.map((each, k) => each * (whole + scale * tilting[k]));
   let share = 1;
   for (let k = 0; k < 4; k++) {
     const each = parts[k], yaw = mixer[k][3] * mz;
