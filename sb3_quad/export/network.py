@@ -68,6 +68,10 @@ class Network(nn.Module):
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
         limits = np.array(vehicle.thrust_range)
         if self.output == "speeds":
+            if not vehicle.thrust_coefficient:
+                raise ConfigError(
+                    f"output speeds: {vehicle.name} has no thrust_coefficient; export thrusts"
+                )
             limits /= vehicle.thrust_coefficient
         # The previewed accelerations follow the features.
         ahead = np.zeros(3 * len(observation.preview or ()))

@@ -94,9 +94,11 @@ def start_episode(
         velocity, rate = _normals(task[T.velocity_std], spin, u, 6 + 2 * axis)
         s[X.velocity + axis] = velocity
         s[X.body_rates + axis] = rate
-    hover = math.sqrt(vehicle[P.hover_thrust] / vehicle[P.thrust_coefficient])
-    s[X.rotor_speeds : X.target] = hover
-    queue[:, :, i] = hover
+    for rotor in range(4):
+        hover = vehicle[P.hover_share_0 + rotor] * vehicle[P.hover_thrust]
+        speed = math.sqrt(hover / vehicle[P.thrust_coefficient])
+        s[X.rotor_speeds + rotor] = speed
+        queue[:, rotor, i] = speed
 
 
 @inlined
