@@ -33,9 +33,7 @@ def main() -> None:
     report("after DAgger", imitation, time.process_time() - begun)
 
     halfway = time.process_time()
-    env = QuadcopterVecEnv(
-        ROWS, task=tasks, task_kwargs=HARDER_STARTS, seed=seed + 1, n_threads=1
-    )
+    env = QuadcopterVecEnv(ROWS, task=tasks, task_kwargs=HARDER_STARTS, seed=seed + 1, n_threads=1)
     agent = APG(
         "MlpPolicy",
         env,
