@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,7 @@ class FlightKeywords(TypedDict, total=False):
     noise: npt.ArrayLike | StrMapping | Noise
     observation_mean: npt.ArrayLike | None
     observation_std: npt.ArrayLike | None
+    features: Literal["body", "px4"]
     last_action: bool
     history: Sequence[int] | None
     position_integral: StrMapping | PositionIntegral | None

@@ -59,7 +59,7 @@ class LQR(Expert):
         velocity = in_heading_frame(state.velocity)
         tilt = np.stack([rotation[:, 2, 1], -rotation[:, 2, 0]], axis=1)
         x = np.concatenate([error, velocity, tilt, state.body_rates], axis=1)
-        thrust = self.vehicle.hover_thrust - x @ self.gain.T
+        thrust = self.vehicle.hover_thrusts - x @ self.gain.T
         return np.clip(self.vehicle.thrust_to_action(thrust), -1.0, 1.0).astype(np.float32)
 
 

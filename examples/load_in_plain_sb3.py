@@ -32,6 +32,8 @@ class Observation:
         self.ages = settings.get("history") or [0]
         self.last_action = settings.get("last_action", False)
         self.rule = settings.get("position_integral")
+        # Agents for PX4 see the velocity in the world frame, and no third column of the matrix.
+        self.for_px4 = settings.get("features") == "px4"
         # Control steps ahead in which the agent sees the acceleration of its reference.
         self.preview = settings.get("preview") or []
         self.control_step = settings["vehicle"]["control_step"]
@@ -64,7 +66,8 @@ class Observation:
         :param accelerations: of the reference in each control step of ``preview``, (previews, 3),
             world frame, m/s²; None: it rests.
         """
-        # All is relative to the reference, and the world is turned to its heading.
+        # All is relative to the reference, and the world is turned to its heading; give an agent
+        # for PX4 no heading, and the velocity itself.
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         velocity = rotation.T @ velocity
@@ -82,7 +85,11 @@ class Observation:
         features = np.concatenate(
             [position + self.integral, rotation.T.ravel(), velocity, body_rates]
         )
+        if self.for_px4:
+            features[12:15] = rotation @ velocity
         frame = (features - self.mean) / self.std
+        if self.for_px4:
+            frame[[5, 8, 11]] = 0.0
         if self.last_action:
             frame = np.concatenate([frame, np.clip(action, -1, 1)])
         self.frames = [frame, *self.frames[: self.ages[-1]]]

@@ -3,7 +3,7 @@
     python examples/real_flights.py FOLDER [--vehicle FILE] [--leave-out NAME …] [--control]
 
 FOLDER holds CSV files in the format of NanoBench: docs/vehicles.md lists their columns. What is
-printed, and what came out for eleven flights of a Crazyflie, is told in docs/research/reality.md.
+printed, and what came out for eleven flights of a Crazyflie, stands in docs/research/reality.md.
 ``--control`` flies a vehicle of known lag under the firmware's kind of controller instead, and
 shows what the same estimates make of it.
 """

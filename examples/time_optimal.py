@@ -84,14 +84,15 @@ def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
         problem.subject_to(ca.vec(turn - vehicle.motor_gain_down * (low - speeds)) >= 0)
 
     # From hover to within NEAR of the target, and from then on it stays there.
-    hover = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1])
+    hover_speeds = np.sqrt(vehicle.hover_shares)
+    hover = np.concatenate([[0, 0, 0, 1], np.zeros(9), hover_speeds])
     problem.subject_to(x[:, 0] == hover)
     problem.subject_to(problem.bounded(0.05, durations, [20.0, REST_TIME]))
     problem.subject_to(ca.vec(ca.sum1((x[:3, WAY:] - ca.repmat(way, 1, REST + 1)) ** 2)) <= NEAR**2)
     # At rest at the end: level, in any heading.
     problem.subject_to(x[4:6, -1] == 0)
     problem.subject_to(x[7:13, -1] == 0)
-    problem.subject_to(x[13:, -1] == 1)
+    problem.subject_to(x[13:, -1] == hover_speeds)
     problem.minimize(durations[0])
 
     guess, seconds = flight(vehicle, way)

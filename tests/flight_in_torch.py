@@ -111,13 +111,19 @@ class Vehicles:
         self.exact = some(P.exact_motors) > 0
         self.thrust_middle = some(P.thrust_middle)
         self.thrust_half_range = some(P.thrust_half_range)
+        self.battery = some(P.battery)
+        self.shared = some(P.shared_saturation)
         self.arms = some(P.roll_arm_0, 12).reshape(n, 3, 4)
         self.delay = some(P.delay)[:, 0].long()
 
     def commanded_speeds(self, actions):
         """Return the rotor speeds that actions command, (n, 4) (Eqs. 3.18 and 2.4)."""
         thrust = self.thrust_middle + self.thrust_half_range * actions.clamp(-1.0, 1.0)
-        return (thrust / self.lift).sqrt()
+        speeds = (thrust / self.lift).sqrt()
+        most = (self.thrust_middle + self.thrust_half_range) * self.battery
+        greatest = (most / self.lift).sqrt()
+        excess = (speeds.amax(dim=1, keepdim=True) - greatest).clamp(min=0.0)
+        return th.minimum(speeds - self.shared * excess, greatest).clamp(min=0.0)
 
     def physics_step(self, state, wanted_speeds, wrench, wind, dt):
         """Return the state after a physics step.
@@ -209,6 +215,9 @@ class Observer:
             turn(to_body, state.velocity - self.target_velocity),
             state.body_rates - turn(to_body, self.turning),
         ]
+        if self.settings.features == "px4":
+            error = state.position - self.target
+            parts = [error, to_body.flatten(1), state.velocity, state.body_rates]
         return th.cat(parts, dim=1)
 
     def disturb(self, features, noise):
@@ -226,6 +235,10 @@ class Observer:
         """
         noisy = self.disturb(self.features(state), noise)
         scaled = (noisy - self.mean) / self.std
+        if self.settings.features == "px4":
+            shown = th.ones(OBSERVATION_SIZE)
+            shown[[5, 8, 11]] = 0.0
+            scaled = scaled * shown
         if self.settings.position_integral is not None:
             gain_dt, near2, slow2, limit = self.numbers.tolist()
             error, speed = noisy[:, 0:3], noisy[:, 12:15]

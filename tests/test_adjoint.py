@@ -24,6 +24,7 @@ from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
 from sb3_quad.simulation.tape import FlightTape
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 # What each quantity of the state varies by, so that the parts of a cost weigh about the same.
 SCALE = np.concatenate([np.ones(13), np.full(4, 100.0)])
@@ -131,8 +132,9 @@ def record_and_compare(tape, actions, seed):
     return by_actions
 
 
+SHARED = load_vehicle("cf21B_500").model_copy(update={"saturation": "shared"})
 VEHICLES = {
-    "vehicle": st.sampled_from(["itm", "l2f_crazyflie", "cf21B_500", "rotorpy_hummingbird"])
+    "vehicle": st.sampled_from(["itm", "l2f_crazyflie", "cf21B_500", "rotorpy_hummingbird", SHARED])
 }
 RANDOM = {
     "mass": st.just([0.8, 1.2]),
@@ -140,6 +142,7 @@ RANDOM = {
     "motor_gain": st.just([0.5, 1.0]),
     "motor_gain_down": st.just([0.4, 0.9]),
     "thrust": st.just([0.9, 1.1]),
+    "battery": st.just([0.95, 1.0]),
     "center_of_mass": st.just([-0.01, 0.01]),
     "delay": st.sampled_from([[0, 4], [0, 1], [3, 3]]),
     "drag": st.just([0.1, 1.0]),
@@ -160,6 +163,7 @@ RANDOM = {
     "wind_gusts": st.just({"std": [0, 2]}),
 }
 SEEN = {
+    "features": st.just("px4"),
     "noise": st.sampled_from([0.0, 0.2, {"relative": 0.1, "additive": 0.05}, {"additive": 0.02}]),
     "last_action": st.just(True),
     "history": st.sampled_from([[0, 1], [0, 2, 5], [0, 1, 2, 3, 10]]),
@@ -203,6 +207,20 @@ DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
 )
 @example(
     vehicle={},
+    randomize={},
+    seen={
+        "features": "px4",
+        "noise": {"relative": 0.1, "additive": 0.05},
+        "reference": {"curve": "random_smooth", "heading": "random", "heading_rate": 2.0},
+        "position_integral": {"gain": 3, "distance": 1, "speed": 4, "limit": 0.05},
+        "history": [0, 2],
+    },
+    steps=30,
+    substeps=2,
+    seed=2,
+)
+@example(
+    vehicle={},
     randomize={"delay": [0, 3]},
     seen={
         "reference": {"curve": "random_smooth", "heading": "random", "heading_rate": 2.0},
@@ -221,6 +239,18 @@ def test_flights_and_gradients_are_those_of_autograd(
     tape = FlightTape(batch, steps, substeps)
     begin(tape, seed)
     record_and_compare(tape, random_actions(steps, batch.n, seed), seed)
+
+
+@pytest.mark.parametrize("saturation", ["each", "shared"])
+def test_gradients_go_through_a_battery_that_limits_every_rotor_and_stops_some(saturation):
+    changes = {"saturation": saturation, "rotor_thrust_limits": [0.001, 0.3]}
+    vehicle = load_vehicle("cf2x_L250").model_copy(update=changes)
+    batch = new_batch(64, 0, vehicle=vehicle, randomize={"battery": [0.3, 0.5], "delay": [0, 2]})
+    tape = FlightTape(batch, 12, 2)
+    begin(tape)
+    actions = random_actions(12, batch.n, 0)
+    record_and_compare(tape, actions, 0)
+    assert (batch.queue == 0.0).any() == (saturation == "shared")
 
 
 def test_rows_of_different_noise_have_the_gradients_of_their_own():

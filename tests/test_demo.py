@@ -38,7 +38,7 @@ from sb3_quad.show.demo.page import (
 )
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import STATE_SIZE, X
-from sb3_quad.vehicles.layout import find_turn
+from sb3_quad.vehicles.layout import NamedLayout, find_turn
 from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
 STEPS = 1000  # control steps
@@ -168,15 +168,22 @@ BREEZY = {
     "motor_integration": "exact",
 }
 WORLD = {"mass": 1.2, "motor_gain": 0.7, "thrust": 0.9}
+BATTERY = NamedLayout(rotor_order="px4", arm_length=0.24, center_of_mass=(-0.03, 0.01)).rotors()
+
+
+def vehicle_called(name):
+    """A shipped vehicle, or ITM in wind, in another world, or with its battery elsewhere."""
+    if name in VEHICLES.names():
+        return load_vehicle(name)
+    changes = {"breezy": BREEZY, "battery": {**BATTERY, "thrust_coefficient": 0.0}}.get(name, {})
+    return load_vehicle("itm").model_copy(update=changes)
 
 
 @node
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*VEHICLES.names(), "breezy", "other world"])
+@pytest.mark.parametrize("name", [*VEHICLES.names(), "breezy", "other world", "battery"])
 def test_given_actions_lead_to_where_python_flies(name, tmp_path):
-    vehicle = load_vehicle("itm" if " " in name or name == "breezy" else name)
-    if name == "breezy":
-        vehicle = vehicle.model_copy(update=BREEZY)
+    vehicle = vehicle_called(name)
     task = {"start_position": (0.0, 0.0, 5000.0), "max_distance": 1e6}
     random = (
         {key: [value, value] for key, value in {**WORLD, "delay": 3}.items()}
@@ -202,10 +209,10 @@ def test_given_actions_lead_to_where_python_flies(name, tmp_path):
 
 @node
 @pytest.mark.slow
-@pytest.mark.parametrize("name", VEHICLES.names())
+@pytest.mark.parametrize("name", [*VEHICLES.names(), "battery"])
 @pytest.mark.parametrize("expert", ["pid", "geometric", "derived"])
 def test_the_experts_fly_as_in_python(expert, name, tmp_path):
-    vehicle = load_vehicle(name)
+    vehicle = vehicle_called(name)
     if expert == "derived":
         vehicle = vehicle.model_copy(update={"geometric_gains": None})
     kind = "pid" if expert == "pid" else "geometric"

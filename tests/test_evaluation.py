@@ -234,6 +234,8 @@ def test_tables_say_how_many_arrived():
         recovery_time=np.array([1.0, 2.0, np.nan, 3.0]),
         cross_track_error=np.array([0.2, 0.4, 9.0, 0.6]),
         **dict.fromkeys(FOLLOWED, np.full(n, np.nan)),
+        cut_by_supervisor=np.zeros(n, bool),
+        low_force_time=np.full(n, np.nan),
         waypoint_times=np.zeros((n, 0)),
         start=np.zeros((n, 13)),
         target=np.zeros((n, 3)),

@@ -35,8 +35,9 @@ def run(tmp_path, monkeypatch, capsys):
     return run_script
 
 
-def test_every_script_is_run_here_and_says_how_it_is_started():
-    tests = Path(__file__).read_text(encoding="utf-8")
+def test_every_script_is_run_and_says_how_it_is_started():
+    names = ("test_examples.py", "test_real_flights.py")
+    tests = "".join((Path(__file__).parent / name).read_text("utf-8") for name in names)
     for path in EXAMPLES.glob("*.py"):
         assert f'"{path.name}"' in tests
         assert f"python examples/{path.name}" in path.read_text(encoding="utf-8")
@@ -155,6 +156,12 @@ def test_own_experts_and_vehicles_recover(run, name):
     found = shares(output)
     teacher = found["own expert" if name == "own_expert.py" else "geometric"]
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
+
+
+@pytest.mark.slow
+def test_a_nominal_policy_recovers_after_half_a_minute(run):
+    last = run("nominal_policy.py", "--seed", "0").splitlines()[-1]
+    assert float(re.search(r"([\d.]+)% of 3,840", last)[1]) > 98.5
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ import json
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from test_export import compiled, load, physical_features
 
 import sb3_quad
@@ -18,7 +20,7 @@ from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export.policy import export_policy
 from sb3_quad.vehicles.layout import find_turn
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 ITM, CRAZYFLIE = load_vehicle("itm"), load_vehicle("crazyflie")
 ORDERS = list(itertools.permutations(range(4)))
@@ -57,6 +59,72 @@ def test_thrusts_give_the_same_forces_and_moments_in_any_layout(turn):
         assert np.sign(known.mixer).tolist() == np.sign(ITM.mixer).tolist()
         assert abs(turned.angle) <= np.pi / 2 + 1e-9  # of both that fit, the smaller one
         np.testing.assert_array_equal(thrusts[[*turned.order]][turned.own], thrusts)
+
+
+# As each stack's own pages have motors 1 to 4: where they are, and whether they turn clockwise.
+MOTORS = {
+    "betaflight": "rear right cw, front right ccw, rear left ccw, front left cw",
+    "px4": "front right ccw, rear left ccw, front left cw, rear right cw",
+    "ardupilot": "front right ccw, rear left ccw, front left cw, rear right cw",
+    "crazyflie": "front right ccw, rear right cw, rear left ccw, front left cw",
+}
+
+
+def in_order(order, arm, **more):
+    named = {"rotor_order": order, "arm_length": arm, **more}
+    data = CRAZYFLIE.model_dump(exclude={"rotor_positions", "rotor_directions", "geometric_gains"})
+    return Vehicle.model_validate({**data, "name": order, **named})
+
+
+@pytest.mark.parametrize("order", MOTORS)
+def test_rotors_are_where_the_stack_has_them(order):
+    signs = {"front": 1, "rear": -1, "left": 1, "right": -1, "cw": 1, "ccw": -1}
+    motors = [[signs[word] for word in motor.split()] for motor in MOTORS[order].split(", ")]
+    vehicle = in_order(order, 0.1, arm_angle=30, center_of_mass=[-0.01, 0.02])
+    x, y = 0.1 * np.sqrt(3) / 2, 0.05
+    for motor, place, direction in zip(
+        motors, vehicle.rotor_positions, vehicle.rotor_directions, strict=True
+    ):
+        assert place == pytest.approx((motor[0] * x + 0.01, motor[1] * y - 0.02))
+        assert direction == motor[2]
+    outwards = in_order(order, 0.1, props="out").rotor_directions
+    assert outwards == tuple(-motor[2] for motor in motors)
+
+
+@given(
+    st.sampled_from([*MOTORS]),
+    st.floats(0.03, 0.5),
+    st.floats(30, 60),
+    st.sampled_from(["in", "out"]),
+    st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
+)
+def test_every_order_is_the_same_vehicle_renumbered(order, arm, angle, props, shift):
+    more = {"arm_angle": angle, "props": props, "center_of_mass": [arm * each for each in shift]}
+    base, other = in_order("betaflight", arm, **more), in_order(order, arm, **more)
+    turn = find_turn(other, base)
+    assert turn.angle == 0.0
+    order_of = [*turn.order]
+    np.testing.assert_allclose(np.array(other.rotor_positions)[order_of], base.rotor_positions)
+    np.testing.assert_allclose(other.hover_shares[order_of], base.hover_shares)
+    assert other.in_layout_of(base).rotor_directions == base.rotor_directions
+
+
+def test_an_agent_flies_all_orders_alike():
+    agent = sb3_quad.load_pretrained("any-quadcopter")
+    own = {k: v for k, v in sb3_quad.env_kwargs("any-quadcopter").items() if "vehicle" not in k}
+    own |= {"task": "state_recovery", "noise": 0.0}
+    shift = {"center_of_mass": [-0.003, 0.001]}
+    flown = [
+        fly(agent, n_flights=24, vehicle=[in_order(order, 0.046, **shift)], max_steps=400, **own)
+        for order in MOTORS
+    ]
+    for flights in flown:
+        assert flights.survival.all()
+        np.testing.assert_allclose(flights.final_error, flown[0].final_error, atol=1e-4)
+
+
+def test_an_exported_file_flies_a_vehicle_with_its_battery_at_the_back():
+    assert_it_flies("crazyflie-robust", in_order("px4", 0.046, center_of_mass=[-0.0046, 0.0]))
 
 
 def test_a_wider_vehicle_with_the_same_rotors_is_not_turned():

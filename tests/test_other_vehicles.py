@@ -116,6 +116,15 @@ def test_the_file_that_the_documentation_writes_flies(here, capsys):
     assert "unusual" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["five_inch", "my_quadcopter"])
+def test_the_files_of_the_examples_fly(name, capsys):
+    path = Path(__file__).resolve().parent.parent / "examples" / f"{name}.yaml"
+    assert main(["check-vehicle", str(path), "-n", "48"]) == 0
+    printed = capsys.readouterr().out
+    assert "unusual" not in printed
+    assert (name == "five_inch") == ("kF unknown" in printed)
+
+
 def test_the_path_of_a_vehicle_is_kept_whole_and_a_name_is_a_name(here):
     config = load_config("dagger", ENV, None, {"env_kwargs": {"vehicle": "my.yaml"}})
     assert (

@@ -44,7 +44,8 @@ class BulletReference:
         rates = self.rotation((x, y, z, w)) @ state[BODY_RATES]
         pybullet.resetBaseVelocity(self.body, state[VELOCITY], rates, **self.client)
         self.speeds = state[ROTOR_SPEEDS].copy()
-        self.waiting = [np.full(4, vehicle.hover_rotor_speed)] * vehicle.delay
+        hover = np.sqrt(vehicle.hover_thrusts / vehicle.lift)
+        self.waiting = [hover] * vehicle.delay
 
     @staticmethod
     def rotation(quaternion):
@@ -53,7 +54,7 @@ class BulletReference:
     def fly(self, action, wrench, wind):
         vehicle, body, client = self.vehicle, self.body, self.client
         thrust = vehicle.action_to_thrust(action.astype(np.float64))
-        self.waiting.append(np.sqrt(thrust / vehicle.thrust_coefficient))
+        self.waiting.append(np.sqrt(thrust / vehicle.lift))
         wanted = self.waiting.pop(0)
         for _ in range(vehicle.substeps):
             share = (
@@ -63,7 +64,7 @@ class BulletReference:
             before, exact = self.speeds, vehicle.motor_integration == "exact"
             share = share / (1 + share / 2 + share**2 / 12) if exact else share
             self.speeds = before + (wanted - before) * share
-            thrust = vehicle.thrust_coefficient * self.speeds * (before if exact else self.speeds)
+            thrust = vehicle.lift * self.speeds * (before if exact else self.speeds)
             lift, *moments = vehicle.mixer @ thrust
             centre, attitude = pybullet.getBasePositionAndOrientation(body, **client)
             airspeed = self.rotation(attitude).T @ (
@@ -148,23 +149,26 @@ def vehicles(draw):
     size = draw(st.floats(0.3, 3.0))
     spread = draw(st.tuples(st.floats(0.8, 1.2), st.floats(0.8, 1.2), st.floats(0.8, 1.2)))
     arm = 0.17 * size
-    least = draw(
-        st.just(0.0) | st.floats(0.01, 0.8)
-    )  # a rotor's speed is a root, which magnifies the rounding of almost 0
+    x, y = draw(st.just((0.0, 0.0)) | st.tuples(st.floats(-0.25, 0.25), st.floats(-0.25, 0.25)))
+    places = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) - (x, y)
+    # Hover takes from 1 - |x| - |y| to 1 + |x| + |y| of m g / 4. A rotor's speed is a root, which
+    # magnifies the rounding of almost 0.
+    off = abs(x) + abs(y)
+    least = draw(st.just(0.0) | st.floats(0.01, 0.8 * (1.0 - off)))
     return Vehicle(
         name="random",
         mass=1.7 * size**3,
         inertia=tuple(0.009 * size**5 * factor for factor in spread),
-        rotor_positions=((arm, arm), (arm, -arm), (-arm, -arm), (-arm, arm)),
+        rotor_positions=(arm * places).tolist(),
         rotor_directions=(1, -1, 1, -1),
         moment_thrust_ratio=draw(st.floats(0.005, 0.05)),
-        thrust_coefficient=draw(st.floats(1e-7, 1e-4)),
+        thrust_coefficient=draw(st.just(0.0) | st.floats(1e-7, 1e-4)),
         motor_gain_up=draw(st.floats(5.0, 60.0)),
         motor_gain_down=draw(st.floats(5.0, 60.0)),
         motor_integration=draw(st.sampled_from(["euler", "exact"])),
         drag=draw(st.just((0.0, 0.0, 0.0)) | st.tuples(*[st.floats(0.0, 1.0)] * 3)),
         gravity=draw(st.floats(1.6, 12.0)),
-        thrust_limits=(least, draw(st.floats(1.2, 1.5))),
+        thrust_limits=(least, draw(st.floats(1.2, 1.5)) + off),
         delay=draw(st.integers(0, 3)),
         collision_radius=0.1,
     )
@@ -190,6 +194,13 @@ def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
         <= 60.0
     )
     assert worst_difference(vehicle, folder, state, actions, wrench, wind).max() < 1e-9
+
+
+def test_flight_of_an_impossible_inertia_is_pybullets(tmp_path):
+    changes = {"inertia": (0.01, 0.01, 0.025), "allow_impossible_inertia": True}
+    vehicle, rng = ITM.model_copy(update=changes), np.random.default_rng(4)
+    state, actions = random_state(rng, vehicle), random_actions(rng, 400)
+    assert worst_difference(vehicle, tmp_path, state, actions, np.zeros(12)).max() < 1e-9
 
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "itm"])

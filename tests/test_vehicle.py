@@ -12,8 +12,11 @@ from pydantic import ValidationError
 
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.cli import main
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import ROTOR_SPEEDS
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
 
 ITM = load_vehicle("itm")
@@ -61,6 +64,8 @@ def write(path: Path, **changes: Any) -> Path:
 # Their gains are derived.
 OF_OTHERS = {
     "cf2x_L250",
+    "cf2x_P250",
+    "cf2x_T350",
     "cf21B_500",
     "rotorpy_crazyflie",
     "rotorpy_hummingbird",
@@ -176,9 +181,7 @@ def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
     assert vehicle.name == name
     assert (vehicle.geometric_gains is None) == (name in OF_OTHERS)
     assert vehicle.geometric_gains is None or vehicle.geometric_gains.measured is not None
-    assert float(vehicle.action_to_thrust(np.array(vehicle.hover_action))) == pytest.approx(
-        vehicle.hover_thrust
-    )
+    assert vehicle.action_to_thrust(vehicle.hover_action) == pytest.approx(vehicle.hover_thrust)
 
 
 @given(vehicles())
@@ -229,8 +232,28 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(
         ({"mass": float("inf")}, "mass: .*finite"),
         ({"inertia": [0.1, 0.1, 0.5]}, "inertia .*no rigid body"),
         (
-            {"rotor_positions": [[1, 1], [1, -1], [-1, -1], [-1, 0.5]]},
-            "rotor_positions: equal thrusts",
+            {"rotor_positions": [[1, 1], [1, -1], [-0.2, -1], [-0.2, 1]]},
+            "rotor_positions: hover about this centre of mass takes 0.333 to 1.67 of m g / 4",
+        ),
+        ({"mass": True}, "mass: true and false are not numbers .*kg"),
+        ({"inertia": [1e-2, True, 1e-2]}, "inertia.1: true and false are not numbers"),
+        ({"mass": 1e300}, "mass: .*less than or equal to 1000000.*kg"),
+        ({"rotor_positions": [[1e300, 1], [1, -1], [-1, -1], [-1, 1]]}, "rotor_positions.0.0: "),
+        ({"rotor_order": "px4"}, "rotor_order: arm_length: is missing"),
+        ({"rotor_order": "px5", "arm_length": 0.1}, "rotor_order: .*'betaflight', 'px4'"),
+        ({"rotor_order": "px4", "arm_length": 0.1}, "rotor_directions: give it, or .*rotor_order"),
+        ({"rotor_order": "px4", "arm_length": 0.1, "arm_angle": 120}, "arm_angle: .*less than 90"),
+        (
+            {"rotor_speed_limits": [9, 99], "thrust_limits": ..., "thrust_coefficient": ...},
+            "rotor_speed_limits: need thrust_coefficient",
+        ),
+        (
+            {"motor_gain_up": 500, "motor_integration": "euler"},
+            "motor_gain 500: .* may not exceed 1 with .* euler; make physics_step 0.002 or less",
+        ),
+        (
+            {"motor_gain_up": 1000, "motor_integration": "exact"},
+            "motor_gain 1000: .* may not exceed 2 with .* exact; make physics_step 0.002 or less",
         ),
         (
             {"rotor_positions": [[1, 0], [1, 0], [-1, 0], [-1, 0]]},
@@ -240,7 +263,7 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(
         ({"thrust_limits": [1.1, 1.5]}, "thrust_limits .*hover"),
         ({"control_step": 0.011}, "control_step .*whole multiple"),
         ({"motor_gain_down": 500}, "motor_gain"),
-        ({"motor_gain": 20}, "motor_gain: give it, or"),
+        ({"motor_gain": 20}, "motor_gain_down: give it, or motor_gain"),
         ({"drag": [0, 0, -1]}, "drag.2: .*greater than or equal to 0.*N s/m"),
         ({"delay": 1.5}, "delay"),
         ({"name": ""}, "name"),
@@ -264,6 +287,75 @@ def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
     with pytest.raises(ConfigError, match=r"bad\.yaml") as caught:
         load_vehicle(path)
     assert "\n" not in str(caught.value)
+
+
+def test_an_inertia_that_no_body_has_is_flown_where_its_file_says_so(
+    tmp_path: Path, capfd: Any
+) -> None:
+    """RotorS gives its Iris 0.0347563, 0.0458929 and 0.0977 kg m²."""
+    data = {"inertia": [0.0347563, 0.0458929, 0.0977], "geometric_gains": None}
+    path = write(tmp_path / "iris.yaml", **data)
+    assert main(["check-vehicle", str(path), "-n", "0"]) == 2
+    assert "allow_impossible_inertia: true flies it" in capfd.readouterr().err
+    path = write(tmp_path / "iris.yaml", **data, allow_impossible_inertia=True)
+    assert main(["check-vehicle", str(path), "-n", "0"]) == 0
+    assert "here by 21 %" in capfd.readouterr().err
+    assert load_vehicle(path).model_copy(update={"mass": 2.0}).inertia_fault
+
+
+def shifted(vehicle: Vehicle, x: float, y: float = 0.0) -> Vehicle:
+    """The vehicle with its centre of mass moved, by shares of its arm's length."""
+    place = np.array([x, y]) * vehicle.arm_length
+    return vehicle.model_copy(
+        update={"rotor_positions": (np.array(vehicle.rotor_positions) - place).tolist()}
+    )
+
+
+@given(vehicles(), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
+def test_hover_about_another_centre_of_mass_takes_four_thrusts(
+    vehicle: Vehicle, x: float, y: float
+) -> None:
+    changes = {"thrust_limits": (0.0, 5.0)}
+    moved = shifted(vehicle.model_copy(update=changes), x, y)
+    weight = moved.mass * moved.gravity
+    wrench = moved.mixer @ moved.hover_thrusts
+    np.testing.assert_allclose(wrench, [weight, 0, 0, 0], atol=1e-10 * weight)
+    np.testing.assert_allclose(moved.action_to_thrust(moved.hover_action), moved.hover_thrusts)
+    values = dict(zip(PARAMETER_NAMES, moved.parameters(), strict=True))
+    assert [values[f"hover_share_{k}"] for k in range(4)] == moved.hover_shares.tolist()
+
+
+def test_a_centre_of_mass_about_which_it_cannot_hover_is_refused() -> None:
+    assert shifted(ITM, -0.34).hover_shares.max() < 1.5
+    with pytest.raises(ValidationError, match=r"takes 0\.491 to 1\.51 of m g / 4"):
+        shifted(ITM, -0.36)
+
+
+def test_episodes_begin_in_hover_about_any_centre_of_mass() -> None:
+    vehicle = shifted(ITM, -0.2, 0.1)
+    batch = QuadcopterBatch(3, FlightSettings(vehicle=vehicle, noise=0.0), seed=0)
+    batch.reset()
+    speeds = np.sqrt(vehicle.hover_thrusts / vehicle.lift)
+    np.testing.assert_allclose(batch.state[ROTOR_SPEEDS].T, np.tile(speeds, (3, 1)))
+    start = batch.state[:17].copy()
+    for _ in range(200):
+        batch.step(np.tile(vehicle.hover_action, (3, 1)))
+    # Actions are float32.
+    assert np.abs(batch.state[:17] - start).max() < 1e-3
+
+
+def test_an_unknown_coefficient_changes_rotor_speeds_alone(tmp_path: Path, capsys: Any) -> None:
+    path = write(tmp_path / "v.yaml", thrust_coefficient=..., geometric_gains=None)
+    unknown = load_vehicle(path)
+    assert unknown.hover_rotor_speed == 1000.0 and unknown.thrust_coefficient == 0.0
+    assert main(["check-vehicle", str(path), "-n", "0"]) == 0
+    assert "kF unknown" in capsys.readouterr().out
+    known = ITM.model_copy(update={"geometric_gains": None})
+    flown = [fly(GeometricExpert(each), vehicle=each, n_flights=4) for each in (known, unknown)]
+    np.testing.assert_allclose(flown[0].final_error, flown[1].final_error, atol=1e-9)
+    agent = ["export", "itm-imitation", "--format", "torchscript", "--vehicle", str(path)]
+    assert main([*agent, "--output", "speeds", "-o", str(tmp_path / "a.pt")]) == 2
+    assert "has no thrust_coefficient" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("excess", [0.001, 0.049, 0.06])

@@ -19,7 +19,12 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from typing_extensions import Self
 
 from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
-from sb3_quad.algorithms.flight_cost import FlownStates, cost_and_gradients, flight_cost
+from sb3_quad.algorithms.flight_cost import (
+    FlownStates,
+    cost_and_gradients,
+    flight_cost,
+    low_force_cost,
+)
 from sb3_quad.algorithms.networks.gradients import Passes
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
@@ -99,6 +104,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         again.
     :param cost: The cost of each control step, (steps, n), as a function of
         :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved.
+    :param low_force_coef: Weight of
+        :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which is added to the cost: for
+        vehicles whose firmware takes a thrust that stays low for a crash.
     :param substeps: Physics steps in a control step of the training; None: those of the vehicle.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a gradient that is not finite, in every environment.
@@ -126,6 +134,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         max_row_ratio: float | None = None,
         carry_on: bool = False,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
+        low_force_coef: float = 0.0,
         substeps: int | None = 2,
         _init_setup_model: bool = True,
     ):
@@ -156,6 +165,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.max_row_ratio = max_row_ratio
         self.carry_on = carry_on
         self.cost = cost
+        self.low_force_coef = low_force_coef
         self.substeps = substeps
 
         if _init_setup_model:
@@ -190,6 +200,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
             )
         self._tape = env.record(self.n_steps, self.substeps)
+        if self.low_force_coef and not hasattr(self._tape, "control_step"):
+            raise ConfigError(
+                f"{type(env).__name__}: low_force_coef is a cost of quadcopters; remove it"
+            )
         self._passes = Passes(self.policy, self.n_steps, self.n_envs)
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
@@ -233,7 +247,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         # Layers such as dropout act as they did in the recorded flight.
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
-        cost = self._tape.begin(partial(cost_and_gradients, self.cost))
+        cost = self._tape.begin(partial(cost_and_gradients, self._whole_cost))
 
         # What the critic or an earlier update has left; autograd adds to it.
         self.policy.optimizer.zero_grad()
@@ -254,6 +268,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self._n_updates += 1
 
         self._log_update({"cost": [cost], "gradient_norm": [float(norm)]})
+
+    def _whole_cost(self, flown: FlownStates) -> th.Tensor:
+        cost = self.cost(flown)
+        if self.low_force_coef:
+            tape: Any = self._tape
+            cost = cost + self.low_force_coef * low_force_cost(flown, tape.control_step)
+        return cost
 
     def _limited(self, gradients: FloatArray) -> FloatArray:
         """Return gradients (n, a), the longest shortened to ``max_row_ratio`` times the median."""

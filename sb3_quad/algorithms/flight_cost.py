@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch as th
+from torch.nn.functional import pad
 
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.state import STATE
@@ -17,6 +18,10 @@ CALM = 0.03
 HEADING = 0.1
 # Below this height, m, a flight is in danger.
 LOW = 1.5
+GRAVITY = 9.81  # m/s²
+# How much the mean specific force along body z may lack of 1 g, and over how many seconds
+LACK = 0.45
+WINDOW = 0.8
 
 
 class FlownStates(NamedTuple):
@@ -102,3 +107,24 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     beyond = flown.actions - flown.actions.clamp(-1.0, 1.0)
     cost = cost + 0.01 * beyond.square().sum(dim=-1)
     return cost + 0.5 * (LOW - flown.position[..., 2]).clamp(min=0.0)
+
+
+def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
+    """Return the cost of a specific force along body z that stays low, (steps, n).
+
+    It is the square of what the mean force of the last 0.8 s lacks of 0.55 g, in g; before the
+    flight it counts as 1 g. While each such mean is above 0.5 g, no force stays below 0.5 g for the
+    second after which a Crazyflie's firmware cuts the motors
+    (:class:`~sb3_quad.evaluation.supervisor.Supervisor`).
+
+    :param control_step: s.
+    """
+    w, x, y, z = flown.quaternion.unbind(dim=-1)
+    up = th.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), flown.r33], dim=-1)
+    acceleration = flown.velocity.diff(dim=0) / (GRAVITY * control_step)
+    # What each force lacks of 1 g; nothing is known of the first one.
+    lack = 1.0 - flown.r33[1:] - (acceleration * up[1:]).sum(dim=-1)
+    sums = pad(lack, (0, 0, 1, 0)).cumsum(dim=0)
+    window = round(WINDOW / control_step)
+    mean = (sums - pad(sums, (0, 0, window, 0))[: len(sums)]) / window
+    return (mean - LACK).clamp(min=0.0).square()

@@ -7,6 +7,7 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError, ExpertError, raised_as, unknown
 from sb3_quad.base.imports import import_name
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
+from sb3_quad.controllers.tensors import AGENTS
 from sb3_quad.controllers.zips import load_model, refuse_settings
 from sb3_quad.vehicles.vehicle import VehicleSource, first_vehicle
 
@@ -29,8 +30,9 @@ def resolve_expert(
 ) -> Any:
     """Return the expert that ``spec`` names.
 
-    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name
-        of a policy that comes with the package (:func:`sb3_quad.pretrained`);
+    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model or of a
+        safetensors file, or the name of a policy that comes with the package
+        (:func:`sb3_quad.pretrained`);
         ``"package.module:factory"``, where ``factory(vehicle)`` returns an expert; or an expert
         itself, returned as it is.
     :param vehicle: the vehicle that a named expert is designed for; of several, the first.
@@ -45,7 +47,7 @@ def resolve_expert(
     text = str(spec)
     # A policy of the package and a run folder stand for a zip.
     path = agent_path(text)
-    if path.endswith(".zip"):
+    if path.endswith(AGENTS):
         refuse_settings(path)
         return load_model(path)
     factory = import_factory(text, kind)

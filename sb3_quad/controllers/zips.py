@@ -14,12 +14,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import trusted
 from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.statistics import STATISTICS
+from sb3_quad.controllers.tensors import ENDING, read_tensors
 from sb3_quad.controllers.unpickle import WAY_OUT, held, unpickle
+from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.simulation.settings import KEY
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
@@ -58,7 +61,8 @@ _WITHOUT_SIZE = ("device", "optimizer_class", "optimizer_kwargs", "squash_output
 
 
 def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
-    """Return the attributes of the model in an SB3 ``.zip``, as its JSON has them.
+    """Return the attributes of the model in an SB3 ``.zip``, or in a safetensors file, as its JSON
+    has them.
 
     Attributes that are pickled there stay pickled.
 
@@ -66,6 +70,8 @@ def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
     :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
     """
     where = where or f"model {path}"
+    if str(path).endswith(ENDING):
+        return read_tensors(str(path))[0]
     if not isinstance(path, io.BytesIO):
         if Path(path).is_dir():
             raise ConfigError(f"{where}: no run with an agent in this folder")
@@ -177,6 +183,16 @@ def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> No
                 f"{where}: holds variables that no algorithm has; "
                 f"known are {', '.join(sorted(_VARIABLES))}"
             )
+    # Half precision is the least that somebody may have saved.
+    _check_size(data, archive.getinfo("policy.pth").file_size // 2, where)
+
+
+def _check_size(data: StrDict, most: int, where: str) -> None:
+    """Check how many parameters a policy asks for, without making it.
+
+    :param data: the attributes of its model, unpickled.
+    :param most: that its file may hold.
+    """
     walk([data.get(key) for key in _TO_FLY], held, _LARGEST)
     given = data["policy_kwargs"]
     keywords = {key: given[key] for key in given if key not in _WITHOUT_SIZE}
@@ -188,13 +204,37 @@ def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> No
     with meta:
         policy = sketch(data["observation_space"], data["action_space"], lambda _: 0.0, **keywords)
     asked = sum(parameter.numel() for parameter in policy.parameters())
-    # Half precision is the least that somebody may have saved.
-    if 2 * asked > archive.getinfo("policy.pth").file_size:
-        raise ConfigError(f"{where}: asks for {asked:,} parameters, policy.pth holds fewer")
+    if asked > most:
+        raise ConfigError(f"{where}: asks for {asked:,} parameters, its file holds fewer")
+
+
+def _build_model(algorithm: Any, path: StrPath, device: str) -> Any:
+    """Return the model of a stock algorithm in a safetensors file.
+
+    :raises ConfigError: see :func:`.read_tensors`; or settings and parameters that do not fit.
+    """
+    data, tensors = read_tensors(path)
+    with raised_as(ConfigError, f"model {path}: cannot be loaded"):
+        keywords = parse_mapping(data["policy_kwargs"], "policy_kwargs")
+        model = algorithm("MlpPolicy", None, policy_kwargs=keywords, _init_setup_model=False)
+        model.device = th.device(device)
+        # A policy cannot see more than its file holds weights.
+        most = sum(tensor.numel() for tensor in tensors.values())
+        seen = min(data["observation_size"], most)
+        model.observation_space, model.action_space = quadcopter_spaces(seen)
+        _check_size(vars(model), most, f"model {path}")
+        # Nothing is stored here, or trained.
+        model.n_envs = model.buffer_size = 1
+        model.target_entropy = 0.0
+        model._setup_model()
+        model.policy.load_state_dict(tensors)
+    if KEY in data:
+        setattr(model, KEY, data[KEY])
+    return model
 
 
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
-    """Return the model in an SB3 ``.zip``, ready for ``predict``.
+    """Return the model in an SB3 ``.zip``, or in a safetensors file, ready for ``predict``.
 
     It may be of PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, or of this package. Its
     ``vec_normalize`` are the statistics of VecNormalize that it was trained with, if any.
@@ -207,7 +247,11 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     if name in _OURS:
         name, _ = _OURS[name]
     algorithm: type[BaseAlgorithm] = getattr(stable_baselines3, name)
-    model = load_zip(algorithm, path, to_fly=True, device=device)
+    model: BaseAlgorithm
+    if str(path).endswith(ENDING):
+        model = _build_model(algorithm, path, device)
+    else:
+        model = load_zip(algorithm, path, to_fly=True, device=device)
     for parameter, tensor in model.policy.state_dict().items():
         if not th.isfinite(tensor).all():
             raise ConfigError(

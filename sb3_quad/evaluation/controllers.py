@@ -13,6 +13,7 @@ from sb3_quad.base.types import StrDict
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory
+from sb3_quad.controllers.tensors import AGENTS, ENDING
 from sb3_quad.controllers.zips import saved_algorithm
 from sb3_quad.evaluation.flights import OwnReward, Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
@@ -33,8 +34,8 @@ class ControllerSpec:
 
     @property
     def is_zip(self) -> bool:
-        """Whether it is an agent in a zip."""
-        return self.spec.endswith(".zip")
+        """Whether it is an agent in a zip or a safetensors file."""
+        return self.spec.endswith(AGENTS)
 
     @property
     def kind(self) -> Literal["expert", "model", "factory"]:
@@ -140,7 +141,8 @@ def _parse(text: str) -> ControllerSpec:
     label, equals, spec = text.partition("=")
     # An equals sign after a slash belongs to the path.
     if not equals or {"/", "\\"} & {*label}:
-        return ControllerSpec(Path(text).name.removesuffix(".zip"), agent_path(text))
+        label = Path(text).name.removesuffix(".zip").removesuffix(ENDING)
+        return ControllerSpec(label, agent_path(text))
     if not label or not spec:
         raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
     return ControllerSpec(label, agent_path(spec))

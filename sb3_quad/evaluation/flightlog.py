@@ -13,6 +13,7 @@ from sb3_quad.base.files import read_arrays
 from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, StrPath
 from sb3_quad.evaluation.flights import Flights, Hook
 from sb3_quad.evaluation.following import FOLLOWED
+from sb3_quad.evaluation.supervisor import SUPERVISED
 from sb3_quad.simulation.state import (
     FORCE_BODY,
     FORCE_WORLD,
@@ -39,6 +40,7 @@ EPISODES = (
     "recovery_time",
     "cross_track_error",
     *FOLLOWED,
+    *SUPERVISED,
     "overshoot",
 )
 

@@ -22,6 +22,7 @@ from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.scenarios.sample import Plan
+from sb3_quad.evaluation.supervisor import Supervisor
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings, known_layout
 from sb3_quad.simulation.state import TARGET, QuadcopterState
@@ -80,6 +81,10 @@ class Flights:
     path_error: FloatArray  #: (n,), root mean square of its part across the target's velocity, m
     lag: FloatArray  #: (n,), how late the flight is on its path, s, see Following
     heading_error: FloatArray  #: (n,), root mean square, degrees; NaN where no heading is asked for
+    cut_by_supervisor: BoolArray  #: (n,), whether the firmware would have cut it, see Supervisor
+    #: (n,), longest time that the specific force along body z stayed below 0.5 g, s; NaN where the
+    #: vehicle has no supervisor
+    low_force_time: FloatArray
     #: (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
     waypoint_times: FloatArray
     #: (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
@@ -248,6 +253,7 @@ def _fly_fleet(
     arrivals = Arrivals(tolerances, course.to_last(distance))
     motion = Motion(start, vehicle.control_step)
     following = Following(fleet.n, vehicle.control_step)
+    supervisor = Supervisor(fleet.vehicle_list)
     if len(plan.waypoints):
         # A course has no single straight line to deviate from.
         motion.cross_track_error[:] = np.nan
@@ -296,6 +302,7 @@ def _fly_fleet(
         # From here on, only the flights that continue count.
         flying &= fleet.outcome["truncated"]
         motion.see(step, state, flying)
+        supervisor.see(state, flying)
         if fleet.moves:
             following.see(step, state, flying)
         for hook in hooks:
@@ -332,6 +339,8 @@ def _fly_fleet(
         recovery_time=motion.recovery_time,
         cross_track_error=np.where(following.moves, np.nan, motion.cross_track_error),
         **following.errors(flying),
+        cut_by_supervisor=supervisor.cut,
+        low_force_time=supervisor.longest,
         waypoint_times=course.times,
         start=start.array[:13].T,
         target=start.target,

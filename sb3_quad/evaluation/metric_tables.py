@@ -18,6 +18,8 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 # The rows, without their cells:
 SUCCESS = Row("success", "%")
 SURVIVAL = Row("survival", "%")
+CUT = Row("cut by the supervisor", "%")
+LOW_FORCE = Row("longest time below 0.5 g", "s")
 REWARD = Row("mean reward")
 OWN_REWARD = Row("mean own reward")
 FLOWN = Row("time flown", "s")
@@ -44,6 +46,8 @@ COURSE_TIME = Row("time of the course", "s", verb="complete")
 ROWS = {
     "success": SUCCESS,
     "survival": SURVIVAL,
+    "cut_by_supervisor": CUT,
+    "low_force_time": LOW_FORCE,
     "reward": REWARD,
     "own_reward": OWN_REWARD,
     "flown": FLOWN,
@@ -251,7 +255,7 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 
 def _rows_of(scenario: Scenario) -> list[Row]:
     """The rows that mean something in a scenario."""
-    shares = [SUCCESS, SURVIVAL]
+    shares = [SUCCESS, SURVIVAL, CUT, LOW_FORCE]
     if scenario.target.waypoints is not None:
         return [*shares, REACHED, COMPLETED, COURSE_TIME]
     if len(scenario.cell) > 1:

@@ -8,7 +8,7 @@ from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.following import FOLLOWED
-from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
+from sb3_quad.evaluation.statistics import Estimate, Statistic, bootstrap, mean, share
 
 
 class Moment(Frozen):
@@ -88,6 +88,10 @@ class Metrics(Frozen):
     """mean delay along the path, s"""
     heading_error: Estimate | None
     """mean root mean square, degrees; None: no heading is asked for"""
+    cut_by_supervisor: Estimate | None = None
+    """share that the firmware would have cut, see Supervisor; None: it has no supervisor"""
+    low_force_time: float | None = None
+    """longest time of any flight that the specific force along body z stayed below 0.5 g, s"""
     course: Course | None
     """only of scenarios with waypoints"""
 
@@ -96,6 +100,10 @@ def summarise(flights: Flights) -> Metrics:
     """Return the metrics of some flights, at least one."""
     survived = flights.survival
     error = flights.final_error[survived]
+    cut = None
+    supervised = np.isfinite(flights.low_force_time)
+    if supervised.any():
+        cut = share(flights.cut_by_supervisor[supervised])
     course = None
     if flights.waypoint_times.shape[1] > 0:
         reached = np.isfinite(flights.waypoint_times)
@@ -114,14 +122,16 @@ def summarise(flights: Flights) -> Metrics:
         own_reward=mean(flights.own_reward),
         flown=bootstrap(flights.flown),
         arrivals=[_arrival(flights, tolerance) for tolerance in sorted(flights.time_to)],
-        overshoot=_median(flights.overshoot),
+        overshoot=_one(flights.overshoot),
         path=mean(flights.path_length[survived]),
         final_error=mean(error),
-        final_error_median=_median(error),
+        final_error_median=_one(error),
         final_error_95=mean(error, partial(np.quantile, q=0.95)),
         recovery_time=_moment(flights.recovery_time),
         cross_track_error=mean(flights.cross_track_error[survived]),
         **{name: mean(getattr(flights, name)) for name in FOLLOWED},
+        cut_by_supervisor=cut,
+        low_force_time=_one(flights.low_force_time, np.max),
         course=course,
     )
 
@@ -142,6 +152,6 @@ def _moment(times: FloatArray) -> Moment:
     return Moment(share=share(np.isfinite(times)), time=mean(times))
 
 
-def _median(values: FloatArray) -> float | None:
+def _one(values: FloatArray, statistic: Statistic = np.median) -> float | None:
     finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else None
+    return float(statistic(finite)) if finite.size else None

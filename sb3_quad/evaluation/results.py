@@ -24,6 +24,7 @@ from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
+from sb3_quad.evaluation.supervisor import SUPERVISED
 
 RESULTS = "results.json"
 EPISODES = "episodes.csv"
@@ -32,7 +33,7 @@ FLIGHTS = "flights"
 WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
 # Columns of episodes.csv that are one array each, and those that are several numbers.
 _FLOWN = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
-_COLUMNS = (*_FLOWN, *FOLLOWED)
+_COLUMNS = (*_FLOWN, *FOLLOWED, *SUPERVISED)
 _AXES = {
     "target": "x y z",
     "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",

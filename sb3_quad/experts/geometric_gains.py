@@ -70,9 +70,11 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
     turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
     rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
 
-    # In hover thrusts. Worn motors and a low battery may not even lift the vehicle.
-    least = (v[P.thrust_middle] - v[P.thrust_half_range]) / v[P.hover_thrust]
-    most = (v[P.thrust_middle] + v[P.thrust_half_range]) / v[P.hover_thrust]
+    # In hover thrusts of the rotor that has least room. Worn motors and a low battery may not even
+    # lift the vehicle.
+    hovers = v[P.hover_share_0 : P.hover_share_0 + 4] * v[P.hover_thrust]
+    least = (v[P.thrust_middle] - v[P.thrust_half_range]) / hovers.min(axis=0)
+    most = (v[P.thrust_middle] + v[P.thrust_half_range]) / hovers.max(axis=0)
     most = np.maximum(most, 1.01)
     sideways = np.sqrt(most**2 - 1.0)
     upwards = gravity * (most - 1.0)
@@ -116,6 +118,8 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
     arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
     mixers = np.concatenate([np.ones_like(arms[:1]), arms])
     inverse = np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0)
+    # A randomized centre of mass may lie beyond the rotors: a share would be negative.
+    inverse[:, 0] = np.maximum(inverse[:, 0], 0.01)
     constants = (v, gains, command_lag(v, control_step), inverse)
     return LawConstants._make(np.array(values, order="C") for values in constants)
 

@@ -237,32 +237,34 @@ def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, t
     Roll and pitch come before the thrust, and the thrust before yaw, all within the limits of every
     rotor, ``thrust_middle`` ± ``thrust_half_range``, N.
 
-    :param tilting: scratch for the rotors' shares of the roll and pitch moments, (4,), N.
+    :param tilting: scratch for what roll and pitch ask of the rotors, (4,), N.
     """
     low = thrust_middle - thrust_half_range
     high = thrust_middle + thrust_half_range
-    middle = (high + low) / 2
-    half = (high - low) / 2
 
-    # Scale the differences for roll and pitch until they fit; then shift the common thrust.
+    # Rotors give their shares of the thrust, and what roll and pitch ask of them. All of it is in
+    # terms of the whole thrust: the rotor with the greatest share bounds it from above, and the one
+    # with the smallest from below. Scale what roll and pitch ask until it fits; then shift the
+    # thrust.
+    shares = mixer_inverse[:, 0]
     least = 0.0
     most = 0.0
     for rotor in range(4):
-        share = mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
-        tilting[rotor] = share
-        least = min(least, share)
-        most = max(most, share)
-    largest = max(most, -least)
+        part = mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
+        tilting[rotor] = part / shares[rotor]
+        least = min(least, tilting[rotor])
+        most = max(most, tilting[rotor])
+    highest = high / shares.max()
+    lowest = min(highest, low / shares.min())
     scale = 1.0
-    if largest > half:
-        scale = half / largest
-    common = min(high, max(low, thrust / 4))
-    common = min(high - scale * most, max(low - scale * least, common))
+    if most - least > highest - lowest:
+        scale = (highest - lowest) / (most - least)
+    thrust = min(highest - scale * most, max(lowest - scale * least, thrust))
 
     # The share of the yaw moment that every rotor has room for.
     share = 1.0
     for rotor in range(4):
-        without_yaw = common + scale * tilting[rotor]
+        without_yaw = shares[rotor] * (thrust + scale * tilting[rotor])
         yaw = mixer_inverse[rotor, 3] * moments[2]
         room = without_yaw - low
         if yaw > 0.0:
@@ -273,5 +275,7 @@ def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, t
     # Eq. 3.18: actions are thrusts between the limits, as numbers from -1 to 1.
     for rotor in range(4):
         yaw = share * mixer_inverse[rotor, 3] * moments[2]
-        rotor_thrust = common + scale * tilting[rotor] + yaw
-        actions[rotor] = min(1.0, max(-1.0, (rotor_thrust - middle) / half))
+        without_yaw = shares[rotor] * (thrust + scale * tilting[rotor])
+        actions[rotor] = min(
+            1.0, max(-1.0, (without_yaw + yaw - thrust_middle) / thrust_half_range)
+        )

@@ -68,6 +68,10 @@ class Network(nn.Module):
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
         limits = np.array(vehicle.thrust_range)
         if self.output == "speeds":
+            if not vehicle.thrust_coefficient:
+                raise ConfigError(
+                    f"output speeds: {vehicle.name} has no thrust_coefficient; export thrusts"
+                )
             limits /= vehicle.thrust_coefficient
         # The previewed accelerations follow the features.
         ahead = np.zeros(3 * len(observation.preview or ()))
@@ -148,13 +152,14 @@ class Network(nn.Module):
         ]
 
 
-def build_network(reference: Reference, where: str = "model") -> Network:
+def build_network(reference: Reference, where: str = "model", features: str = "body") -> Network:
     """Build the network of an SB3 model with ``MlpPolicy``, on-policy, SAC's or TD3's, with its
     scaling and its rotors.
 
     :param where: the model in messages.
-    :raises ConfigError: an unknown output, other spaces than the quadcopter's, a policy that
-        :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
+    :param features: that it must have been trained with.
+    :raises ConfigError: an unknown output, other features or spaces than the quadcopter's, a policy
+        that :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
     """
     refuse_unknown("output", [reference.output], OUTPUTS)
@@ -170,6 +175,11 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     if model.action_space != ACTIONS:
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
+        )
+    if reference.observation.features != features:
+        raise ConfigError(
+            f"{where}: does not see `features: {features}`; --format px4 needs and takes features:"
+            f" px4, all others body; train with --env-kwargs features:{features}"
         )
     # C knows these layers only.
     for layer in layers:

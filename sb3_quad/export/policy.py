@@ -14,15 +14,30 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.zips import load_model, saved_algorithm
+from sb3_quad.controllers.tensors import ENDING, write_tensors
+from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
+from sb3_quad.export.cost import cost_of
+from sb3_quad.export.crazyflie import describe_app, write_app
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
+from sb3_quad.export.px4 import load_px4, motor_order, write_px4
 from sb3_quad.simulation.observation import FEATURES, GROUPS
-from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle
+from sb3_quad.simulation.settings import KEY
+from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle, load_vehicle
 
-FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
+# With the endings of their files, or of their folders.
+FORMATS = {
+    "onnx": ".onnx",
+    "torchscript": ".pt",
+    "c": ".h",
+    "crazyflie": "_crazyflie",
+    "px4": "_px4",
+    "safetensors": ENDING,
+}
+# Those that are folders, with the file that holds the policy.
+FOLDERS = {"crazyflie": "src/policy.h", "px4": "control_net.tflite"}
 
 
 class Export(NamedTuple):
@@ -33,6 +48,7 @@ class Export(NamedTuple):
     max_error: float  # the largest difference to the policy, in `unit`
     unit: str  # N or rad/s
     settings: Path | None  # the file that vehicle and scaling came from, where they were not given
+    files: dict[str, bytes] | None  # all files of an app, by their paths in its folder
 
 
 def export_policy(
@@ -53,7 +69,8 @@ def export_policy(
     are those that :func:`agent_settings` finds in the zip or next to it, or else ``itm`` and Table
     A.2.
 
-    :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
+    :param file_format: ``onnx``, ``torchscript``, ``c``, ``crazyflie``, which is an app around the
+        C header, ``px4`` or ``safetensors``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: in whose body frame and order of the rotors the file speaks; its thrust limits,
         and for speeds its kF.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
@@ -61,6 +78,7 @@ def export_policy(
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are
         not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle,
         and none is given; a vehicle whose rotors cannot be brought to where the policy knows them;
+        an app for another vehicle than a Crazyflie, of speeds, or of a policy that is too slow;
         a package or a C compiler that is not installed.
     :raises ExportError: the file computes something else than the policy, or does not compile.
     """
@@ -70,42 +88,75 @@ def export_policy(
             f"--name {name!r}: must be a C identifier: "
             "letters, digits and underscores, a letter first"
         )
-    # Each format has a writer, and a reader for the check.
-    formats: StrDict = {
-        "onnx": (write_onnx, load.load_onnx),
-        "torchscript": (write_torchscript, load.load_torchscript),
-        "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
-    }
-    refuse_unknown("format", [file_format], formats)
-    write, read = formats[file_format]
+    refuse_unknown("format", [file_format], FORMATS)
+    is_app = file_format == "crazyflie"
+    if is_app and output != "thrusts":
+        raise ConfigError("--format crazyflie: the firmware takes thrusts; remove --output")
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     settings, source = agent_settings(path)
     given = settings
     if vehicle is not None:
         given = settings.with_changes(vehicle=vehicle)
-    if given.vehicles is not None:
+    if given.vehicles is not None and file_format != "safetensors":
         raise ConfigError(
             f"model {path}: flies any vehicle; "
             "say with --vehicle which one's thrusts the file is to give"
         )
     flown = first_vehicle(given.vehicle)
+    if is_app:
+        # Axes and rotors as the firmware has them.
+        flown = flown.in_layout_of(load_vehicle("crazyflie"))
     reference = Reference(model, settings, flown, output)
-    network = build_network(reference, f"model {path}")
+    # Each format has a writer, and a reader for the check.
+    header = (partial(write_header, name=prefix), partial(load.load_header, name=prefix))
+    formats: StrDict = {
+        "onnx": (write_onnx, load.load_onnx),
+        "torchscript": (write_torchscript, load.load_torchscript),
+        "c": header,
+        "crazyflie": header,
+        "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
+    }
+    features = "px4" if file_format == "px4" else "body"
+    if file_format == "safetensors":
+        features = settings.features
+    network = build_network(reference, f"model {path}", features)
+    if file_format == "safetensors":
+        if reference.clip or model.use_sde:
+            raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
+        data = saved_data(path)
+        if source is not None:
+            settings.write_into(model)
+            data[KEY] = getattr(model, KEY)
+        return Export(write_tensors(model, data), {}, 0.0, network.unit, source, None)
     metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
+    write, read = formats[file_format]
+    if write is header[0]:
+        metadata["cost"] = cost_of(network).describe(flown.control_step)
+    if is_app:
+        metadata["app"] = describe_app(network, reference)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
         # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata), network.state_size)
-        error, n_compared = compare(reference, call, by, n_observations, relates=file_format == "c")
+        error, n_compared = compare(reference, call, by, n_observations, relates=write is header[0])
         metadata["check"] = (
             f"largest error {error:.2g} {network.unit} "
             f"in {n_compared} observations of flights ({by})"
         )
         content = write(network, metadata)
-    return Export(content, metadata, error, network.unit, source)
+    files = None
+    if is_app:
+        files = {FOLDERS[file_format]: content, **write_app(network, metadata, prefix, reference)}
+    if file_format == "px4":
+        files = {FOLDERS[file_format]: content}
+        for name in ("control_net.cpp", "control_net.hpp", "px4.params"):
+            text = render("sb3_quad.export", f"{name}.j2", vehicle=flown, content=content)
+            files[name] = text.encode("ascii")
+        metadata["parameters"] = "; ".join(text.splitlines())
+    return Export(content, metadata, error, network.unit, source, files)
 
 
 def _describe(
@@ -123,6 +174,7 @@ def _describe(
         limits=reference.results([-1.0, 1.0]),
         features=FEATURES,
         places=GROUPS,
+        motors=motor_order(vehicle) if network.observation.features == "px4" else [],
         n_parameters=parameters_to_vector(network.parameters()).numel(),
         needs=network.observation.model_dump(mode="json", exclude={"preview"}),
     )

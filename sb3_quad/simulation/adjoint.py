@@ -199,6 +199,33 @@ def undo_flight(b, passed, gradient, by_wanted, dt, substeps):
         undo_accelerate(b, passed[substep], passed[substep + 1], gradient, by_wanted)
 
 
+@compiled
+def undo_limits(b, by_speed):
+    """Undo :func:`.physics.limit_speeds`, in place.
+
+    :param b: a block with the speeds before it, ``command``, and after it, ``wanted_speeds``.
+    :param by_speed: (4, LANES), by the speeds after it.
+    """
+    for lane in range(LANES):
+        fastest = 0
+        for k in range(4):
+            if b.command[k, lane] > b.command[fastest, lane]:
+                fastest = k
+        greatest = b.greatest_speed[lane]
+        if b.command[fastest, lane] <= greatest:
+            continue
+        is_shared = b.shared[lane] > 0.0
+        taken = 0.0
+        for k in range(4):
+            # What is taken off all may stop a rotor.
+            stops = b.wanted_speeds[k, lane] == 0.0
+            if stops or (b.command[k, lane] > greatest and not is_shared):
+                by_speed[k, lane] = 0.0
+            taken += by_speed[k, lane]
+        if is_shared:
+            by_speed[fastest, lane] -= taken
+
+
 @compiled(fastmath=True)
 def undo_noise(b, by_feature):
     """Undo noise and scaling of the features (Eq. 3.16), in place.
@@ -239,10 +266,11 @@ def undo_relation(b, by_feature):
 
 
 @compiled(fastmath=True)
-def undo_features(b, by_feature, gradient):
+def undo_features(b, by_feature, gradient, for_px4):
     """Undo :func:`.observation.features`: add to the gradient by the state of a loaded block.
 
     :param by_feature: float64 (OBSERVATION_SIZE, LANES), by the features in their units.
+    :param for_px4: whether the velocity has world axes.
     """
     f = by_feature
     for lane in range(LANES):
@@ -250,11 +278,14 @@ def undo_features(b, by_feature, gradient):
         for k in range(3):
             gradient[X.position + k, lane] += f[F.position + k, lane]
             gradient[X.body_rates + k, lane] += f[F.body_rates + k, lane]
-        # The observed velocity is Rᵀ v.
+        # The observed velocity is Rᵀ v, or v itself, which the attitude does not turn.
         gx, gy, gz = vector(f[F.velocity :], lane)
-        x, y, z = to_world(r, gx, gy, gz)
+        x, y, z = gx, gy, gz
+        vx = vy = vz = 0.0
+        if not for_px4:
+            x, y, z = to_world(r, gx, gy, gz)
+            vx, vy, vz = vector(b.velocity, lane)
         _add(gradient, X.velocity, lane, x, y, z)
-        vx, vy, vz = vector(b.velocity, lane)
         # The observed matrix is Rᵀ, row by row: its columns are the rows of R.
         m = F.rotation
         _add_rotation(

@@ -9,6 +9,7 @@ on where in the batch it stands.
 """
 
 import inspect
+import math
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,7 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         # Both divided by kF
         "thrust_middle": (),
         "thrust_half_range": (),
+        "greatest_speed": (),  # of a rotor, with the battery as it is, rad/s
         "speed2": (),  # the larger of |v|² and |ω|²
         # limits and costs of the row's task
         "scored": len(SCORED),
@@ -137,6 +139,7 @@ def _block_type() -> Any:
         ("vehicle", "drag", P.drag_x, 3),
         ("vehicle", "lift", P.thrust_coefficient, ()),
         ("vehicle", "exact", P.exact_motors, ()),
+        ("vehicle", "shared", P.shared_saturation, ()),
         ("vehicle", "radius", P.collision_radius, ()),
         ("vehicle", "delay", P.delay, ()),
         # The moment of each rotor per thrust, by axis
@@ -166,7 +169,7 @@ def step(
     gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations,
-    moves, course, tracks, track_numbers, previews,
+    moves, for_px4, course, tracks, track_numbers, previews,
     physics_step, substeps, own_delays, autoreset,
 ):  # fmt: skip
     """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
@@ -206,6 +209,7 @@ def step(
     :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
     :param moves: whether targets move or have a heading; without it their rows of the state behind
         the position are not read.
+    :param for_px4: whether observations are those of ``features: px4``.
     :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, as for ``tracks`` and
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
@@ -271,7 +275,7 @@ def step(
             for lane in range(count):
                 streams[STEP, first + lane] += np.uint32(1)
             load_rows(streams, first, count, b.stream)
-            observe(b, moves)
+            observe(b, moves, for_px4)
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)
             if wind_gust.shape[1] > 0:
@@ -336,7 +340,7 @@ def step(
                 b.stream[k, lane] = streams[k, b.row[lane]]
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
-        observe(b, moves)
+        observe(b, moves, for_px4)
         _write_observations(
             b, count, integral, ages, frames, previews, course, tracks, track_numbers,
             observations,
@@ -445,6 +449,8 @@ def load_vehicles(b, vehicles, first, count, dt):
         b.motor[1, lane] = motor_factor(v[P.motor_gain_down, lane], exact, dt)
         b.thrust_middle[lane] = v[P.thrust_middle, lane] / lift
         b.thrust_half_range[lane] = v[P.thrust_half_range, lane] / lift
+        most = b.thrust_middle[lane] + b.thrust_half_range[lane]
+        b.greatest_speed[lane] = math.sqrt(most * v[P.battery, lane])
         b.velocity_gain[lane] = dt / v[P.mass, lane]
         b.fall[lane] = dt * v[P.gravity, lane]
         ixx, iyy, izz = vector(b.inertia, lane)

@@ -81,25 +81,27 @@ def turn_features(turn: Turn) -> FloatArray:
 
 
 @inlined
-def features(b, moves):
+def features(b, moves, for_px4):
     """Write the features of a loaded block, in the units of the table and without noise.
 
     They go to ``b.feature``, float32.
 
     :param moves: whether references move or have a heading; else the target rests.
+    :param for_px4: whether the velocity has world axes, and nothing but the position is relative.
     """
-    _features_at_rest(b)
-    if moves:
+    _features_at_rest(b, for_px4)
+    if moves and not for_px4:
         _relate(b)
 
 
 @fast
-def _features_at_rest(b):
+def _features_at_rest(b, for_px4):
     out = b.feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
         vx, vy, vz = vector(b.velocity, lane)
-        vx, vy, vz = to_body(r, vx, vy, vz)
+        if not for_px4:
+            vx, vy, vz = to_body(r, vx, vy, vz)
         for k in range(3):
             out[F.position + k, lane] = float32(b.position[k, lane] - b.target[k, lane])
             out[F.body_rates + k, lane] = float32(b.body_rates[k, lane])
@@ -174,12 +176,24 @@ def _disturb_and_scale(b):
 
 
 @inlined
-def observe(b, moves):
+def observe(b, moves, for_px4):
     """Write the scaled features of a loaded block with their noise to ``b.feature``.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
     """
-    features(b, moves)
+    features(b, moves, for_px4)
     random_words(b)
     standard_normals(b)
     _disturb_and_scale(b)
+    if for_px4:
+        clear_hidden(b.feature)
+
+
+@inlined
+def clear_hidden(values):
+    """Clear what PX4's module does not show, the last column of the rotation matrix.
+
+    :param values: by feature, (OBSERVATION_SIZE, LANES).
+    """
+    for row in range(3):
+        values[F.rotation + 3 * row + 2] = 0.0

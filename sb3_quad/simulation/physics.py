@@ -79,6 +79,7 @@ def command_rotors(b):
     for lane in range(LANES):
         for k in range(4):
             b.command[k, lane] = rotor_speed(b, lane, b.command[k, lane])
+        limit_speeds(b, b.command, lane)
 
 
 @inlined
@@ -86,6 +87,21 @@ def rotor_speed(b, lane, action):
     """Return the rotor speed that an action commands, rad/s (Eqs. 3.18 and 2.4)."""
     bounded = min(max(action, -1.0), 1.0)
     return math.sqrt(b.thrust_middle[lane] + b.thrust_half_range[lane] * bounded)
+
+
+@inlined
+def limit_speeds(b, speeds, lane):
+    """Keep the commanded rotor speeds of a lane, (4, LANES), to what its battery allows, in place.
+
+    With a saturation of each, a rotor takes the greatest speed alone. With a shared one, what the
+    fastest command exceeds it by is taken off all four, down to zero: their differences, and so the
+    moments, stay.
+    """
+    greatest = b.greatest_speed[lane]
+    s0, s1, s2, s3 = four(speeds, lane)
+    excess = max(max(max(s0, s1), max(s2, s3)) - greatest, 0.0) * b.shared[lane]
+    for k in range(4):
+        speeds[k, lane] = max(min(speeds[k, lane] - excess, greatest), 0.0)
 
 
 @inlined

@@ -86,6 +86,7 @@ MAX_WEIGHTS = 100.0  # the greatest force or torque in multiples of a weight
 # N, N m or m/s, or multiples of a weight
 Magnitude = Range[Annotated[float, Field(ge=0, le=1e4)]]
 Offset = Range[Annotated[float, Field(ge=-1, le=1)]]  # m
+Battery = Range[Annotated[float, Field(ge=0.1, le=1)]]
 Delay = Range[Annotated[float, Field(ge=0, le=MAX_DELAY, multiple_of=1)]]
 
 
@@ -204,6 +205,9 @@ class Randomization(Frozen):
     """another factor, of rotors that slow down"""
     thrust: Factor | None = None
     """factor of the thrust of a command, such as that of an old battery"""
+    battery: Battery | None = None
+    """factor of the greatest rotor thrust alone, such as [0.85, 1]: a battery that the firmware
+    compensates, until its voltage does not suffice; see saturation of Vehicle"""
     arm: Factor | None = None
     """factor of the rotors' distances from the centre of mass"""
     center_of_mass: Offset | None = None
@@ -254,11 +258,12 @@ class Randomization(Frozen):
         least, most = vehicle.thrust_limits
         mass = self.mass or UNCHANGED
         thrust = self.thrust or UNCHANGED
+        greatest = thrust.low * (self.battery or UNCHANGED).low
         gain = (self.motor_gain or UNCHANGED).high
         up = gain * (self.motor_gain_up or UNCHANGED).high
         down = gain * (self.motor_gain_down or UNCHANGED).high
         changes = {
-            "thrust_limits": (least * thrust.high / mass.low, most * thrust.low / mass.high),
+            "thrust_limits": (least * thrust.high / mass.low, most * greatest / mass.high),
             "motor_gain_up": vehicle.motor_gain_up * up,
             "motor_gain_down": vehicle.motor_gain_down * down,
         }

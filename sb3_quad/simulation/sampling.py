@@ -94,9 +94,11 @@ def start_episode(
         velocity, rate = _normals(task[T.velocity_std], spin, u, 6 + 2 * axis)
         s[X.velocity + axis] = velocity
         s[X.body_rates + axis] = rate
-    hover = math.sqrt(vehicle[P.hover_thrust] / vehicle[P.thrust_coefficient])
-    s[X.rotor_speeds : X.target] = hover
-    queue[:, :, i] = hover
+    for rotor in range(4):
+        hover = vehicle[P.hover_share_0 + rotor] * vehicle[P.hover_thrust]
+        speed = math.sqrt(hover / vehicle[P.thrust_coefficient])
+        s[X.rotor_speeds + rotor] = speed
+        queue[:, rotor, i] = speed
 
 
 @inlined
@@ -183,7 +185,7 @@ def _sample_vector(table, k, share, unit, u, out):
 @compiled
 def _randomize_vehicle(i, streams, table, vehicles):
     """Multiply the parameters of vehicle i by the factors of the row's episode, in place."""
-    u = uniforms(streams, i, 7, VEHICLE)
+    u = uniforms(streams, i, 8, VEHICLE)
     if u[0] >= table[R.share]:
         return
     v = vehicles[:, i]
@@ -205,6 +207,7 @@ def _randomize_vehicle(i, streams, table, vehicles):
     thrust = between(table, R.thrust, u[6], 1.0)
     v[P.thrust_middle] *= thrust
     v[P.thrust_half_range] *= thrust
+    v[P.battery] = between(table, R.battery, u[14], 1.0)
 
     # The arms are measured from the centre of mass: roll arms are y of the rotors, pitch arms -x.
     arm = between(table, R.arm, u[7], 1.0)

@@ -150,6 +150,18 @@ class QuadcopterState:
         return rotation_matrices(self.quaternion)
 
     @property
+    def specific_force(self) -> FloatArray:
+        """What an accelerometer at the centre of mass shows, shape (n, 3), body frame, m/s^2: all
+        forces but the weight, by the mass. ``vehicles`` and ``wrench`` must be known.
+        """
+        assert self.vehicles is not None and self.wrench is not None
+        force = np.einsum("nji,jn->ni", self.rotation, self.wrench[FORCE_WORLD])
+        force += self.wrench[FORCE_BODY].T
+        squares = np.square(self.rotor_speeds).sum(axis=1)
+        force[:, 2] += self.vehicles[P.thrust_coefficient] * squares
+        return np.asarray(force / self.vehicles[P.mass][:, None])
+
+    @property
     def distance(self) -> FloatArray:
         """|r - r_T|, shape (n,), m."""
         error = self.array[POSITION] - self.array[TARGET]

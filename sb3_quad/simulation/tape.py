@@ -11,6 +11,7 @@ from sb3_quad.simulation.adjoint import (
     MOVING,
     undo_features,
     undo_flight,
+    undo_limits,
     undo_noise,
     undo_relation,
 )
@@ -23,8 +24,14 @@ from sb3_quad.simulation.kernel import (
     load_vehicles,
     new_block,
 )
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, F, features, with_noise
-from sb3_quad.simulation.physics import rotor_speed
+from sb3_quad.simulation.observation import (
+    OBSERVATION_SIZE,
+    F,
+    clear_hidden,
+    features,
+    with_noise,
+)
+from sb3_quad.simulation.physics import limit_speeds, rotor_speed
 from sb3_quad.simulation.random import STEP, random_words, standard_normals
 from sb3_quad.simulation.state import STATE_SIZE, P
 from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
@@ -52,7 +59,8 @@ class FlightTape:
     def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
         n = batch.n
         self.substeps = batch.substeps if substeps is None else substeps
-        self.physics_step = batch.physics_step * batch.substeps / self.substeps
+        self.control_step = batch.physics_step * batch.substeps
+        self.physics_step = self.control_step / self.substeps
         self.batch = batch
         self.n_steps = n_steps
         # The states before each control step and after the last one
@@ -157,6 +165,7 @@ class FlightTape:
             batch.vehicles,
             batch.scaling,
             batch.moves,
+            batch.for_px4,
             batch.ages,
             self._integrals,
             batch.integral_numbers,
@@ -175,8 +184,8 @@ class FlightTape:
 @compiled
 def undo(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
-    moves, ages, integrals, integral_numbers, by_observation, by_frames, by_integral, gradient,
-    by_actions, physics_step, substeps,
+    moves, for_px4, ages, integrals, integral_numbers, by_observation, by_frames, by_integral,
+    gradient, by_actions, physics_step, substeps,
 ):  # fmt: skip
     """Undo a control step and the observation after it; see :class:`FlightTape`.
 
@@ -216,17 +225,19 @@ def undo(
                 load_rows(states[step + 1], first, count, b.state)
                 load_rows(streams, first, count, b.stream)
                 b.stream[STEP] += np.uint32(step + 1)
-                features(b, moves)
+                features(b, moves, for_px4)
                 random_words(b)
                 standard_normals(b)
                 _undo_frames(
                     b, first, count, step + 1, lengths, actions, ages, integrals, integral_numbers,
                     by_observation, by_frames, by_integral, by_feature, by_actions,
                 )  # fmt: skip
+                if for_px4:
+                    clear_hidden(by_feature)
                 undo_noise(b, by_feature)
-                if moves:
+                if moves and not for_px4:
                     undo_relation(b, by_feature)
-                undo_features(b, by_feature, own)
+                undo_features(b, by_feature, own, for_px4)
 
             load_rows(states[step], first, count, b.state)
             load_rows(wrench, first, count, b.wrench)
@@ -236,12 +247,15 @@ def undo(
                 acted = step - np.int64(b.delay[lane])
                 for k in range(4):
                     if acted >= 0:
-                        b.wanted_speeds[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
+                        b.command[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
                     else:
-                        b.wanted_speeds[k, lane] = queue[step, k, i]
+                        b.command[k, lane] = queue[step, k, i]
+                    b.wanted_speeds[k, lane] = b.command[k, lane]
+                limit_speeds(b, b.wanted_speeds, lane)
                 if step >= lengths[i]:
                     own[:, lane] = 0.0
             undo_flight(b, passed, own, by_wanted, physics_step, substeps)
+            undo_limits(b, by_wanted)
             for lane in range(count):
                 i = first + lane
                 for k in range(MOVING):
@@ -249,7 +263,7 @@ def undo(
                 acted = step - np.int64(b.delay[lane])
                 for k in range(4):
                     if acted >= 0 and abs(actions[acted, i, k]) < float32(1.0):
-                        slope = b.thrust_half_range[lane] / (2.0 * b.wanted_speeds[k, lane])
+                        slope = b.thrust_half_range[lane] / (2.0 * b.command[k, lane])
                         by_actions[acted, i, k] += slope * by_wanted[k, lane]
     atomic_add(control, DONE, taken)
     if leads:

@@ -46,7 +46,7 @@ from sb3_quad.training.algorithms import (
 from sb3_quad.training.options import JobOptions
 from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 
-_FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis", "value_based")
+_FOLDERS = ("any_quadcopter", "nominal", "px4", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind = Literal["batch", "dummy", "subproc"]

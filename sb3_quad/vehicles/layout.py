@@ -2,21 +2,62 @@
 
 import itertools
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field, PositiveFloat
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import FloatArray
+from sb3_quad.base.types import FloatArray, StrDict
+from sb3_quad.base.validate import Frozen
 
 if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import Vehicle
 
-# Rotors in the same place may differ by this angle, seen from the centre of mass.
+# Rotors in the same place may differ by this angle, seen from the middle of the rotors.
 TOLERANCE = math.radians(20.0)
 # Angles that differ by less are equal, since published positions are rounded.
 _SLACK = math.radians(1.0)
 _EIGHTH = math.pi / 4
+# Signs of x and y
+FRONT_LEFT = (1, 1)
+FRONT_RIGHT = (1, -1)
+REAR_LEFT = (-1, 1)
+REAR_RIGHT = (-1, -1)
+ORDERS = {
+    "betaflight": (REAR_RIGHT, FRONT_RIGHT, REAR_LEFT, FRONT_LEFT),
+    "px4": (FRONT_RIGHT, REAR_LEFT, FRONT_LEFT, REAR_RIGHT),
+    "ardupilot": (FRONT_RIGHT, REAR_LEFT, FRONT_LEFT, REAR_RIGHT),
+    "crazyflie": (FRONT_RIGHT, REAR_RIGHT, REAR_LEFT, FRONT_LEFT),
+}
+"""Where a flight stack has its motors 1 to 4 of an X; sources in docs/vehicles.md."""
+
+
+class NamedLayout(Frozen):
+    """The rotors of an X, numbered as a flight stack numbers them."""
+
+    rotor_order: Literal["betaflight", "px4", "ardupilot", "crazyflie"]
+    """the flight stack whose motors 1 to 4 these are"""
+    props: Literal["in", "out"] = "in"
+    """in: the front left rotor turns clockwise seen from above, as all four have it; out: not"""
+    arm_length: PositiveFloat
+    """from the middle of the rotors to each, m"""
+    arm_angle: Annotated[float, Field(gt=0.0, lt=90.0)] = 45.0
+    """from forward to the front arms, degrees; above 45 the rotors are wider apart than long"""
+    center_of_mass: tuple[float, float] = (0.0, 0.0)
+    """x and y of the centre of mass from the middle of the rotors, m: [-0.01, 0] is behind it"""
+
+    def rotors(self) -> StrDict:
+        """Return ``rotor_positions`` and ``rotor_directions`` of a vehicle."""
+        angle = math.radians(self.arm_angle)
+        signs = np.array(ORDERS[self.rotor_order])
+        arm = self.arm_length * np.array([math.cos(angle), math.sin(angle)])
+        # A rotor that turns clockwise turns the body anticlockwise, which is positive.
+        clockwise = 1 if self.props == "in" else -1
+        return {
+            "rotor_positions": (signs * arm - self.center_of_mass).tolist(),
+            "rotor_directions": (clockwise * signs.prod(axis=1)).tolist(),
+        }
 
 
 class Turn(NamedTuple):
@@ -48,9 +89,11 @@ def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
 
     :raises ConfigError: no turn does that.
     """
-    # Places in the plane as complex numbers: a turn is a factor.
+    # Places in the plane, seen from their middle, as complex numbers: a turn is a factor.
     places = np.dot(own.rotor_positions, (1.0, 1.0j))
+    places = places - places.mean()
     goals = np.dot(other.rotor_positions, (1.0, 1.0j))
+    goals = goals - goals.mean()
     fits = {}
     for order in itertools.permutations(range(4)):
         if tuple(own.rotor_directions[k] for k in order) != other.rotor_directions:

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.base.process import print_once
@@ -13,13 +13,18 @@ from sb3_quad.base.types import FloatArray, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.vehicles.gains import GeometricGains
-from sb3_quad.vehicles.layout import Turn, find_turn
+from sb3_quad.vehicles.layout import NamedLayout, Turn, find_turn
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 # Physics steps in a control step.
 MAX_SUBSTEPS = 1000
 # Published moments of inertia are inaccurate: the largest may be this many times the other two.
 INACCURACY = 1.05
+# Where kF is unknown, this is the speed of a rotor that gives m g / 4, rad/s.
+HOVER_SPEED = 1000.0
+# What gain times physics step may be: Eq. 4.1 overshoots beyond 1; of the exponential, what
+# turn_rotors takes for it is 1 % short at 2, and worse beyond.
+LARGEST_STEP = {"euler": 1.0, "exact": 2.0}
 # Up to this step, s, the compiled rotation is exact.
 MAX_PHYSICS_STEP = 0.0025
 # What the compiled kernel needs of a vehicle: the rows of an array (parameters, n), in the order of
@@ -40,6 +45,8 @@ PARAMETER_NAMES = (
     "hover_thrust",
     "thrust_middle",
     "thrust_half_range",
+    "battery",
+    "shared_saturation",
     "collision_radius",
     "delay",
     "roll_arm_0",
@@ -54,11 +61,29 @@ PARAMETER_NAMES = (
     "yaw_arm_1",
     "yaw_arm_2",
     "yaw_arm_3",
+    "hover_share_0",
+    "hover_share_1",
+    "hover_share_2",
+    "hover_share_3",
 )
 # A name is a part of file names, and of what reports and exported files say.
 NAME = r"^[^/\\<>\p{C}]{1,100}$"
+
+
+def _a_number(value: Any) -> Any:
+    """Refuse true and false, which pydantic takes for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("true and false are not numbers")
+    return value
+
+
+# No quadcopter has larger numbers, and the square of one would overflow.
+LARGEST = 1e6
+Number = Annotated[float, BeforeValidator(_a_number), Field(le=LARGEST)]
+PositiveFloat = Annotated[Number, Field(gt=0.0)]
+NonNegativeFloat = Annotated[Number, Field(ge=0.0)]
 Limits = tuple[NonNegativeFloat, PositiveFloat]
-Place = tuple[float, float]
+Place = tuple[Number, Number]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 _NO_LIMITS = (0.0, 0.0)
@@ -86,14 +111,16 @@ class Vehicle(Frozen):
     """m, kg"""
     inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
     """Ixx, Iyy, Izz of the diagonal inertia, kg m^2"""
+    allow_impossible_inertia: bool = False
+    """whether to fly an inertia that no rigid body has, by more than 5 %"""
     rotor_positions: tuple[Place, Place, Place, Place]
-    """x, y of each rotor in the body frame (x forward, y left), m"""
+    """x, y of each rotor from the centre of mass (x forward, y left), m; or give rotor_order"""
     rotor_directions: tuple[int, int, int, int]
     """sign of the yaw moment of each rotor: two of 1, two of -1"""
     moment_thrust_ratio: PositiveFloat
     """kM / kF, m"""
-    thrust_coefficient: PositiveFloat
-    """kF, N s^2, in F = kF ω^2 (Eq. 2.4)"""
+    thrust_coefficient: NonNegativeFloat = 0.0
+    """kF, N s^2, in F = kF ω^2 (Eq. 2.4); 0 if unknown: hover then takes 1,000 rad/s"""
     motor_gain_up: PositiveFloat
     """k_m of a rotor that speeds up, 1/s (Eq. 4.1)"""
     motor_gain_down: PositiveFloat
@@ -110,6 +137,11 @@ class Vehicle(Frozen):
     """the same in N"""
     rotor_speed_limits: Limits | None = Field(default=None, exclude=True)
     """the same as rotor speeds, rad/s"""
+    saturation: Literal["each", "shared"] = "each"
+    """where a low battery (randomize) does not give a command, each: this rotor turns as fast as it
+    can; shared: its missing speed is taken off all four, as Crazyflie's firmware does"""
+    supervisor: Literal["crazyflie"] | None = None
+    """whose firmware judges whether a flight would be cut, see evaluation/supervisor.py"""
     physics_step: PositiveFloat = Field(default=MAX_PHYSICS_STEP, le=MAX_PHYSICS_STEP)
     """s; at most 0.0025"""
     control_step: PositiveFloat = 0.01
@@ -125,15 +157,22 @@ class Vehicle(Frozen):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_motor_gain(cls, data: Any) -> Any:
-        """Take ``motor_gain`` for ``motor_gain_up`` and ``motor_gain_down``."""
-        if not isinstance(data, Mapping) or "motor_gain" not in data:
+    def _in_short(cls, data: Any) -> Any:
+        """Take ``motor_gain`` for that up and down, and ``rotor_order`` with what goes with it for
+        positions and directions.
+        """
+        if not isinstance(data, Mapping):
             return data
-        if data.keys() & MOTOR_GAINS:
-            raise ValueError("motor_gain: give it, or motor_gain_up and motor_gain_down")
         data = dict(data)
-        data.update(dict.fromkeys(MOTOR_GAINS, data.pop("motor_gain")))
-        return data
+        meant = {}
+        if "motor_gain" in data:
+            meant = dict.fromkeys(MOTOR_GAINS, data.pop("motor_gain"))
+        if "rotor_order" in data:
+            given = {key: data.pop(key) for key in NamedLayout.model_fields if key in data}
+            meant |= validate(NamedLayout, given, "rotor_order").rotors()
+        for key in sorted(data.keys() & meant):
+            raise ValueError(f"{key}: give it, or motor_gain or rotor_order, which stands for it")
+        return data | meant
 
     @model_validator(mode="after")
     def _limits_as_published(self) -> "Vehicle":
@@ -150,6 +189,10 @@ class Vehicle(Frozen):
         thrusts = np.array([low, high])
         # Eq. 2.4.
         if name == "rotor_speed_limits":
+            if self.thrust_coefficient == 0.0:
+                raise ValueError(
+                    "rotor_speed_limits: need thrust_coefficient; or give rotor_thrust_limits"
+                )
             thrusts = self.thrust_coefficient * thrusts**2
         limits = (thrusts / self.hover_thrust).tolist()
         # The model is frozen, but not yet handed out.
@@ -168,17 +211,22 @@ class Vehicle(Frozen):
             raise ValueError(
                 f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1"
             )
-        if self.largest_moment > INACCURACY:
-            raise ValueError(f"inertia {list(self.inertia)}: {self.inertia_fault}")
+        if self.largest_moment > INACCURACY and not self.allow_impossible_inertia:
+            raise ValueError(
+                f"inertia {list(self.inertia)}: {self.inertia_fault}; "
+                "allow_impossible_inertia: true flies it all the same"
+            )
         if abs(np.linalg.det(self.mixer)) < 1e-12:
             raise ValueError(
                 "rotor_positions: these rotors cannot give thrust, roll, pitch and yaw "
                 "independently"
             )
-        if not np.allclose(self.mixer[1:].sum(axis=1), 0.0, atol=1e-9):
-            raise ValueError(
-                "rotor_positions: equal thrusts must give no moment "
-                "(rotors symmetrical about the centre of mass)"
+        shares = self.hover_shares
+        if not low < shares.min() <= shares.max() < high:
+            raise CannotHover(
+                f"rotor_positions: hover about this centre of mass takes {shares.min():.3g} to "
+                f"{shares.max():.3g} of m g / 4 of its rotors, whose thrust_limits are "
+                f"[{low:.4g}, {high:.4g}]; move it nearer to the middle of the rotors"
             )
         return self
 
@@ -191,10 +239,12 @@ class Vehicle(Frozen):
                 f"{self.physics_step}, at most {MAX_SUBSTEPS} times"
             )
         gain = max(self.motor_gain_up, self.motor_gain_down)
-        if gain * self.physics_step > 1.0:
+        most = LARGEST_STEP[self.motor_integration]
+        if gain * self.physics_step > most:
             raise ValueError(
-                f"motor_gain {gain}: times physics_step it may not exceed 1 "
-                "(Eq. 4.1 would overshoot)"
+                f"motor_gain {gain:g}: times physics_step it may not exceed {most:g} with "
+                f"motor_integration {self.motor_integration}; make physics_step {most / gain:.3g} "
+                "or less"
             )
         return self
 
@@ -244,8 +294,10 @@ class Vehicle(Frozen):
         return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
-        """Whether both have the same parameters; names and an expert's gains do not matter."""
-        unlike = {"name", *_FOUND}
+        """Whether both have the same parameters; names, an expert's gains and who judges their
+        flights do not matter.
+        """
+        unlike = {"name", "supervisor", *_FOUND}
         return self.model_dump(exclude=unlike) == other.model_dump(exclude=unlike)
 
     @property
@@ -271,8 +323,26 @@ class Vehicle(Frozen):
 
     @property
     def hover_thrust(self) -> float:
-        """Thrust of one rotor in hover, m g / 4, N."""
+        """Mean thrust of the rotors in hover, m g / 4, N."""
         return self.mass * self.gravity / 4.0
+
+    @property
+    def hover_shares(self) -> FloatArray:
+        """Thrusts of the rotors in hover, in m g / 4, (4,): 1, or whatever gives no moment where
+        the centre of mass is not in the middle of the rotors.
+        """
+        # Rounded, so that rotors in symmetrical places have 1.
+        return np.round(4.0 * self.mixer_inverse[:, 0], 12)
+
+    @property
+    def hover_thrusts(self) -> FloatArray:
+        """Thrusts of the rotors in hover, (4,), N."""
+        return self.hover_shares * self.hover_thrust
+
+    @property
+    def lift(self) -> float:
+        """kF, N s²; where it is unknown, the one that makes ``hover_rotor_speed`` 1,000 rad/s."""
+        return self.thrust_coefficient or self.hover_thrust / HOVER_SPEED**2
 
     @property
     def thrust_range(self) -> tuple[float, float]:
@@ -290,13 +360,15 @@ class Vehicle(Frozen):
     def rotor_speed_range(self) -> tuple[float, float]:
         """Least and greatest speed of one rotor, rad/s (Eq. 2.4 at the thrust limits)."""
         low, high = self.thrust_range
-        return math.sqrt(low / self.thrust_coefficient), math.sqrt(high / self.thrust_coefficient)
+        return math.sqrt(low / self.lift), math.sqrt(high / self.lift)
 
     @property
     def greatest_moments(self) -> FloatArray:
         """Greatest moments about roll, pitch and yaw alone, (3,), N m, whatever the thrust is."""
-        # Equal thrusts give no moment, so it counts how far each can go from the middle.
-        return np.asarray(np.abs(self.mixer[1:]).sum(axis=1) * self._middle_and_half[1])
+        middle, half = self._middle_and_half
+        arms = self.mixer[1:]
+        # Each rotor goes from the middle of its limits to one end.
+        return np.asarray(np.abs(arms).sum(axis=1) * half + np.abs(arms.sum(axis=1)) * middle)
 
     @property
     def gyration_ratios(self) -> FloatArray:
@@ -325,13 +397,13 @@ class Vehicle(Frozen):
 
     @property
     def hover_rotor_speed(self) -> float:
-        """Speed of one rotor in hover, rad/s."""
-        return math.sqrt(self.hover_thrust / self.thrust_coefficient)
+        """Speed of a rotor that gives ``hover_thrust``, rad/s."""
+        return math.sqrt(self.hover_thrust / self.lift)
 
     @property
-    def hover_action(self) -> float:
-        """Action of each rotor in hover; 0 where hover is in the middle of the thrust limits."""
-        return float(self.thrust_to_action(np.array(self.hover_thrust)))
+    def hover_action(self) -> FloatArray:
+        """The action in hover, (4,); 0 where hover is in the middle of the thrust limits."""
+        return self.thrust_to_action(self.hover_thrusts)
 
     @property
     def substeps(self) -> int:
@@ -357,7 +429,7 @@ class Vehicle(Frozen):
             [
                 self.mass,
                 *self.inertia,
-                self.thrust_coefficient,
+                self.lift,
                 self.motor_gain_up,
                 self.motor_gain_down,
                 self.motor_integration == "exact",
@@ -365,9 +437,12 @@ class Vehicle(Frozen):
                 *self.drag,
                 self.hover_thrust,
                 *self._middle_and_half,
+                1.0,  # a full battery
+                self.saturation == "shared",
                 self.collision_radius,
                 self.delay,
                 *self.mixer[1:].flat,
+                *self.hover_shares,
             ]
         )
 
@@ -379,8 +454,7 @@ VehicleSource = StrPath | Vehicle
 def load_vehicle(source: VehicleSource) -> Vehicle:
     """Return a vehicle by name or path, or as it is.
 
-    A line on stderr warns of a user's file whose inertia no rigid body has, if it is within
-    ``INACCURACY``.
+    A line on stderr warns of a user's file whose inertia no rigid body has.
 
     :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown,

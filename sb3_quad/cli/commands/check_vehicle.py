@@ -41,8 +41,9 @@ can hover | yes: thrust-to-weight ratio {v.thrust_limits[1]:.2f}, least {v.thrus
 mass, weight | {v.mass:g} kg, {weight:.4g} N
 rotor thrust | {v.thrust_range[0]:.4g} to {v.thrust_range[1]:.4g} N, \
 hover {v.hover_thrust:.4g} N (action {action:+g})
+in hover | {shares} of that by the rotors
 rotor speed | {speeds[0]:.0f} to {speeds[1]:.0f} rad/s, hover {speeds[2]:.0f} rad/s \
-({rpm[0]:.0f} to {rpm[1]:.0f} rpm, hover {rpm[2]:.0f} rpm)
+({rpm[0]:.0f} to {rpm[1]:.0f} rpm, hover {rpm[2]:.0f} rpm){unknown}
 acceleration | up {up:.1f}, down while level {down:.1f}, \
 horizontal at constant height {horizontal:.1f} m/s²
 greatest moments | {v.greatest_moments[0]:.4g}, {v.greatest_moments[1]:.4g}, \
@@ -131,12 +132,18 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     from sb3_quad.experts.geometric_gains import command_lag
 
     least, most = vehicle.thrust_limits
+    shares = vehicle.hover_shares
+    # Without a moment, the rotor that gives most or least in hover is the first at its limit.
+    most /= shares.max()
+    least /= shares.min()
     speeds = np.array([*vehicle.rotor_speed_range, vehicle.hover_rotor_speed])
     text = PARAMETERS.format(
         v=vehicle,
         weight=vehicle.mass * vehicle.gravity,
         # Adding 0.0 turns a negative zero into one without a sign.
-        action=round(vehicle.hover_action, 3) + 0.0,
+        action=round(vehicle.hover_action.mean(), 3) + 0.0,
+        shares=shares.round(3).tolist(),
+        unknown="" if vehicle.thrust_coefficient else "; kF unknown: 1,000 rad/s stands for hover",
         speeds=speeds,
         rpm=speeds * RPM,
         up=vehicle.gravity * (most - 1.0),

@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX, TorchScript or a C header.
+"""Write a trained policy as ONNX, TorchScript, C, or for a flight controller.
 
 The exported policy takes 18 numbers in physical units: position relative to the
 target, m, world frame; rotation matrix from world to body, row by row;
@@ -8,6 +8,10 @@ checked against the policy on 10,000 observations. A policy that observes
 earlier frames, its last action or the position integral also takes a state,
 and returns the next one.
 
+A network for PX4 takes the 15 numbers of its module mc_nn_control instead, and
+comes with the module's parameters (docs/export.md). A safetensors file is the
+agent itself, without a pickle, for the commands of this package.
+
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1 --format onnx
   # defines agent_policy(observation, thrust)
@@ -15,9 +19,13 @@ examples:
   # rotor speeds instead of thrusts, rad/s
   sb3-quad export agent.zip --format torchscript --output speeds
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
+  sb3-quad export x500-px4 --format px4
+  sb3-quad export agent.zip --format safetensors
+  # a folder that the Crazyflie's firmware builds
+  sb3-quad export crazyflie-robust --format crazyflie -o my_app
 
-ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. The check
-of a C header needs a C compiler.
+ONNX and safetensors: pip install '.[export]' from a clone; PX4: pip install
+'.[px4]'. The check of a C header needs a C compiler.
 """
 
 from argparse import Namespace
@@ -33,7 +41,20 @@ from sb3_quad.cli.parser import (
 from sb3_quad.controllers.pretrained import agent_path
 
 # Facts about an exported policy that are printed, in this order.
-FACTS = ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check")
+FACTS = (
+    "vehicle",
+    "scaling",
+    "network",
+    "observation",
+    "state",
+    "result",
+    "rotors",
+    "motors",
+    "parameters",
+    "app",
+    "cost",
+    "check",
+)
 
 
 FLAGS: Flags = {
@@ -42,10 +63,11 @@ FLAGS: Flags = {
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     ),
-    "--format": ({"required": True}, "onnx, torchscript or c"),
+    "--format": ({"required": True}, "onnx, torchscript, c, crazyflie, px4 or safetensors"),
     "-o FILE": (
         {"dest": "file"},
-        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder)",
+        "file to write, or a folder for it (MODEL.onnx, .pt, .h or .safetensors in this folder); "
+        "for crazyflie and px4 the folder of all files (MODEL_crazyflie, MODEL_px4)",
     ),
     "--output KIND": (
         str,
@@ -64,30 +86,33 @@ def run(options: Namespace) -> int:
     from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import ControllerSpec
     from sb3_quad.export.c_header import c_name
-    from sb3_quad.export.policy import FORMATS, export_policy
+    from sb3_quad.export.policy import FOLDERS, FORMATS, export_policy
 
     refuse_unknown("format", [options.format], FORMATS)
     model = Path(options.model)
+    is_app = options.format in FOLDERS
     file = Path(options.file or "")
-    # Without a suffix it is a folder; without -o, this one.
-    if file.is_dir() or not file.suffix:
+    # Without a suffix it is a folder; without -o, this one. An app is a folder itself.
+    if not options.file or (not is_app and (file.is_dir() or not file.suffix)):
         file /= model.stem + FORMATS[options.format]
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
-    refuse_existing(file, options.overwrite)
+    refuse_existing(file / FOLDERS.get(options.format, ""), options.overwrite)
     name = options.name
     if name is None:
-        name = c_name(file.stem)
-    elif options.format != "c":
+        name = c_name(model.stem if is_app else file.stem)
+    elif options.format not in ("c", "crazyflie"):
         raise ConfigError(f"--name {name}: only a C header has one (--format c)")
     if options.vehicle:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))
     exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
-    write_bytes(file, exported.content)
+    files = exported.files or {"": exported.content}
+    for path, content in files.items():
+        write_bytes(file / path, content)
     unknown_settings = "in neither the zip nor its folder; assumed: itm, the scaling of Table A.2"
     print(f"settings: {exported.settings or unknown_settings}")
     for fact in FACTS:
         if fact in exported.metadata:
             print(f"{fact}: {exported.metadata[fact]}")
-    print(f"saved {file} ({len(exported.content)} bytes)")
+    print(f"saved {file} ({sum(map(len, files.values()))} bytes)")
     return 0

@@ -45,7 +45,7 @@ function resize() {
   Object.assign(canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   Object.assign(camera, { width, height });
-  camera.inset = narrow.matches ? { top: 84, right: 8, bottom: 12, left: 8 } : { top: 90, right: 16, bottom: 76, left: 16 };
+  camera.inset = narrow.matches ? { top: 84, right: 8, bottom: 12, left: 8 } : { top: 90, right: 16, bottom: 104, left: 16 };
   camera.prepare();
 }
 

@@ -6,21 +6,9 @@
  */
 import { errorOf, rotation } from "./dynamics.js";
 import { part } from "./tables.js";
-import { armsOf, commandLag, hoverThrust, thrustRange } from "./vehicle.js";
+import { armsOf, commandLag, hoverShares, hoverThrust, mixerInverse, thrustRange } from "./vehicle.js";
 
 const { sqrt, min, max, abs, atan2, sin, cos } = Math;
-
-/** Rotor thrusts from [ΣF, Mx, My, Mz], (4, 4), by Gauss and Jordan. @param {Vehicle} v */
-export function mixerInverse(v) {
-  const rows = [[1, 1, 1, 1], ...armsOf(v)].map((row, i) => [...row, ...[0, 1, 2, 3].map((k) => (k === i ? 1 : 0))]);
-  for (let k = 0; k < 4; k++) {
-    const best = rows.slice(k).reduce((far, row, j) => (abs(row[k]) > abs(rows[far][k]) ? k + j : far), k);
-    [rows[k], rows[best]] = [rows[best], rows[k]];
-    rows[k] = rows[k].map((each) => each / rows[k][k]);
-    for (let j = 0; j < 4; j++) if (j !== k) rows[j] = rows[j].map((each, i) => each - rows[j][k] * rows[k][i]);
-  }
-  return rows.map((row) => row.slice(4));
-}
 
 /** @param {number} value */
 const clipped = (value) => min(1, max(-1, value));
@@ -68,7 +56,8 @@ export function derivedGains(v) {
   const [low, high] = thrustRange(v);
   const moment = armsOf(v).map((arm) => (arm.reduce((sum, each) => sum + abs(each), 0) * (high - low)) / 2);
   const turn = min(moment[0] / v.inertia[0], moment[1] / v.inertia[1]), lag = commandLag(v), g = v.gravity;
-  const least = low / hoverThrust(v), most = max(high / hoverThrust(v), 1.01);
+  const hovers = hoverShares(v).map((share) => share * hoverThrust(v));
+  const least = low / min(...hovers), most = max(high / max(...hovers), 1.01);
   const rate = min(1 / (lag + 1 / sqrt(turn)), 0.438 / lag);
   const sideways = sqrt(most ** 2 - 1), upwards = g * (most - 1);
   return {
@@ -201,18 +190,21 @@ function wantedTurn(b1, b2, b3, p, q, gains) {
  */
 function allocate(thrust, mx, my, mz, mixer, low, high, actions) {
   const middle = (high + low) / 2, half = (high - low) / 2;
-  const differences = mixer.map((m) => m[1] * mx + m[2] * my);
-  const largest = max(...differences.map(abs));
-  const scale = largest > half ? half / largest : 1;
-  const most = max(0, ...differences), least = min(0, ...differences);
-  const common = min(high - scale * most, max(low - scale * least, min(high, max(low, thrust / 4))));
+  // Rotors give shares of the thrust, and what roll and pitch ask of them, here in terms of the whole thrust.
+  const shares = mixer.map(([each]) => each);
+  const tilting = mixer.map((m, k) => (m[1] * mx + m[2] * my) / shares[k]);
+  const least = min(0, ...tilting), most = max(0, ...tilting);
+  const highest = high / max(...shares), lowest = min(highest, low / min(...shares));
+  const scale = most - least > highest - lowest ? (highest - lowest) / (most - least) : 1;
+  const whole = min(highest - scale * most, max(lowest - scale * least, thrust));
+  const parts = shares.map((each, k) => each * (whole + scale * tilting[k]));
   let share = 1;
   for (let k = 0; k < 4; k++) {
-    const each = common + scale * differences[k], yaw = mixer[k][3] * mz;
+    const each = parts[k], yaw = mixer[k][3] * mz;
     const room = yaw > 0 ? high - each : each - low;
     if (abs(yaw) * share > room) share = max(0, room / abs(yaw));
   }
   for (let k = 0; k < 4; k++) {
-    actions[k] = clipped((common + scale * differences[k] + share * mixer[k][3] * mz - middle) / half);
+    actions[k] = clipped((parts[k] + share * mixer[k][3] * mz - middle) / half);
   }
 }

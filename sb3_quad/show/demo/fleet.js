@@ -31,7 +31,7 @@
 import { Course } from "./course.js";
 import { Flight, normals, NO_WRENCH, uniforms } from "./flight.js";
 import { part, STATE_SIZE } from "./tables.js";
-import { thrustRange } from "./vehicle.js";
+import { hoverShares, thrustRange } from "./vehicle.js";
 
 export const LOG_SECONDS = 8;
 const TRAIL_SECONDS = 4;
@@ -165,7 +165,8 @@ export class Fleet {
 
   /** Whether the rotors lift the vehicle in the world of the sliders. */
   get canHover() {
-    return thrustRange(this.vehicle)[1] * this.settings.battery * 4 > this.weight * this.settings.mass;
+    const most = Math.max(...hoverShares(this.vehicle));
+    return thrustRange(this.vehicle)[1] * this.settings.battery * 4 > most * this.weight * this.settings.mass;
   }
 
   /** Of the nominal vehicle, N. */

@@ -80,15 +80,14 @@ export class Flight {
   setWorld(world, noise) {
     this.parameters = parametersOf(this.vehicle, world);
     this.noise = noise;
-    const { delay, hoverSpeed } = this.parameters;
+    const { delay, hoverSpeeds } = this.parameters;
     while (this.queue.length > delay) this.queue.shift();
-    while (this.queue.length < delay) this.queue.unshift(this.queue[0] ?? Array(4).fill(hoverSpeed));
+    while (this.queue.length < delay) this.queue.unshift(this.queue[0] ?? [...hoverSpeeds]);
   }
 
   /** Begin an episode with rotors in hover. @param {Start} start */
   begin(start) {
-    const { hoverSpeed, delay } = this.parameters;
-    const hover = Array(4).fill(hoverSpeed);
+    const { hoverSpeeds: hover, delay } = this.parameters;
     this.state.fill(0);
     this.course = null;
     for (const name of STARTED) this.state.set(start[name], X[name]);

@@ -160,10 +160,10 @@ export class Training {
       }
       states[at + P + 2] = HEIGHT;
       states[at + X.target + 2] += HEIGHT;
-      for (let k = 0; k < 4; k++) states[at + M + k] = p.hoverSpeed;
+      for (let k = 0; k < 4; k++) states[at + M + k] = p.hoverSpeeds[k];
     }
     this.alive.fill(1, 0, ROWS);
-    this.wanted.fill(p.hoverSpeed);
+    for (let k = 0; k < this.wanted.length; k++) this.wanted[k] = p.hoverSpeeds[k % 4];
   }
 
   /**

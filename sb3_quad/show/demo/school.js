@@ -71,7 +71,11 @@ export class School {
     const layers = layersOf(numbers, SHAPES);
     const { fleet } = this.controls;
     const known = fleet.entries.find(({ agent }) => agent.label === LABEL)?.agent;
-    if (known?.vehicle === vehicle.name) known.layers = layers;
+    if (known?.vehicle === vehicle.name) {
+      known.layers = layers;
+      // It tries again with what it has learned.
+      if (fleet.done) this.controls.player.again();
+    }
     else if (known) this.#replace(known, vehicle, layers);
     else this.controls.join({ label: LABEL, kind: "network", vehicle: vehicle.name, layout: vehicle, observation: PLAIN, layers });
   }

@@ -13,7 +13,7 @@
  * @property {number} mass kg
  * @property {Triple} inertia kg m²
  * @property {number} moment_thrust_ratio m
- * @property {number} thrust_coefficient N s²
+ * @property {number} thrust_coefficient N s², 0 if unknown
  * @property {number} [motor_gain] 1/s, in place of the next two where they are the same
  * @property {number} [motor_gain_up] 1/s, of rotors that speed up
  * @property {number} [motor_gain_down] 1/s, of rotors that slow down
@@ -47,7 +47,7 @@
  * @property {number} gravity
  * @property {number} middle thrust of action 0, N
  * @property {number} half thrust of action 1 less that, N
- * @property {number} hoverSpeed rad/s
+ * @property {number[]} hoverSpeeds rad/s
  * @property {number} radius m
  * @property {number} delay control steps
  * @property {Quadruple[]} arms moment per thrust about roll, pitch and yaw, by rotor, m
@@ -77,6 +77,24 @@ export function armsOf(v) {
   return /** @type {Quadruple[]} */ (rows);
 }
 
+/** Rotor thrusts from [ΣF, Mx, My, Mz], (4, 4), by Gauss and Jordan. @param {Vehicle} v */
+export function mixerInverse(v) {
+  const rows = [[1, 1, 1, 1], ...armsOf(v)].map((row, i) => [...row, ...[0, 1, 2, 3].map((k) => (k === i ? 1 : 0))]);
+  for (let k = 0; k < 4; k++) {
+    const best = rows.slice(k).reduce((far, row, j) => (Math.abs(row[k]) > Math.abs(rows[far][k]) ? k + j : far), k);
+    [rows[k], rows[best]] = [rows[best], rows[k]];
+    rows[k] = rows[k].map((each) => each / rows[k][k]);
+    for (let j = 0; j < 4; j++) if (j !== k) rows[j] = rows[j].map((each, i) => each - rows[j][k] * rows[k][i]);
+  }
+  return rows.map((row) => row.slice(4));
+}
+
+/** Thrust of each rotor in hover, in m g / 4: other than 1 where the centre of mass is not in their middle. @param {Vehicle} v */
+export const hoverShares = (v) => mixerInverse(v).map(([share]) => Math.round(4e12 * share) / 1e12);
+
+/** kF, N s²; where it is unknown, the one that makes 1,000 rad/s of hover. @param {Vehicle} v */
+const lift = (v) => v.thrust_coefficient || hoverThrust(v) / 1e6;
+
 /** k_m of rotors that speed up and that slow down, 1/s. @param {Vehicle} v */
 const motorGains = (v) => [v.motor_gain_up ?? v.motor_gain ?? NaN, v.motor_gain_down ?? v.motor_gain ?? NaN];
 
@@ -98,7 +116,7 @@ export function parametersOf(v, world = CALM) {
   return {
     mass,
     inertia: v.inertia,
-    lift: v.thrust_coefficient,
+    lift: lift(v),
     up,
     down,
     exact,
@@ -106,7 +124,7 @@ export function parametersOf(v, world = CALM) {
     gravity: v.gravity,
     middle: ((high + low) / 2) * world.thrust,
     half: ((high - low) / 2) * world.thrust,
-    hoverSpeed: Math.sqrt((hoverThrust(v) * world.mass) / v.thrust_coefficient),
+    hoverSpeeds: hoverShares(v).map((share) => Math.sqrt((share * hoverThrust(v) * world.mass) / lift(v))),
     radius: v.collision_radius,
     delay: world.delay ?? v.delay,
     arms: armsOf(v),
@@ -142,7 +160,10 @@ const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
  * @returns {Turn | null}
  */
 export function findTurn(ours, theirs) {
-  const [places, goals] = [ours, theirs].map((each) => each.rotor_positions.map(([x, y]) => Math.atan2(y, x)));
+  const [places, goals] = [ours, theirs].map(({ rotor_positions: rotors }) => {
+    const [mx, my] = [0, 1].map((k) => rotors.reduce((sum, place) => sum + place[k] / 4, 0));
+    return rotors.map(([x, y]) => Math.atan2(y - my, x - mx));
+  });
   const turns = [];
   for (const order of permutations([0, 1, 2, 3])) {
     if (order.some((from, k) => ours.rotor_directions[from] !== theirs.rotor_directions[k])) continue;

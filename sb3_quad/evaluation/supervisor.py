@@ -1,0 +1,62 @@
+"""Whether the supervisor in a flight controller's firmware would have cut the motors of flights.
+
+The rule is that of Crazyflie's: ``isTumbledCheck`` in ``src/modules/src/supervisor.c`` of
+bitcraze/crazyflie-firmware (commit 2a18fc2, 2026), with the constants ``SUPERVISOR_TUMBLE_CHECK_…``
+of ``src/platform/interface/platform_defaults.h``.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_quad.base.types import BoolArray
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle
+
+G = 9.81  # m/s^2, the unit of what follows
+# Specific forces in g, and the times in s that they may last
+LOW = 0.5
+LOW_TIME = 1.0
+UPSIDE_DOWN = -0.2
+UPSIDE_DOWN_TIME = 0.1
+FREE_FALL = 0.1
+SUPERVISED = ("cut_by_supervisor", "low_force_time")
+
+
+class Supervisor:
+    """Watches, step by step, the specific force of n flights: what an accelerometer shows.
+
+    The motors are cut where its part along body z has stayed below 0.5 g for more than 1.0 s, or is
+    below -0.2 g after more than 0.1 s of that. Free fall, where no part reaches 0.1 g, does not
+    count, and ends the time. A flight that would be cut goes on here.
+
+    ``cut`` (n,) says which were. ``longest`` (n,) is the longest time below 0.5 g, s; NaN where the
+    vehicle's file names no ``supervisor``.
+
+    The firmware looks every 40 ms, at a sensor with a filter of 30 Hz; here each control step
+    counts, and the sensor has no noise.
+
+    :param vehicles: of the flights, (n,).
+    """
+
+    def __init__(self, vehicles: Sequence[Vehicle]) -> None:
+        self._control_step = vehicles[0].control_step
+        self._watched = np.array([vehicle.supervisor is not None for vehicle in vehicles])
+        self._steps = np.zeros(len(vehicles))
+        self.cut = np.zeros(len(vehicles), bool)
+        self.longest = np.where(self._watched, 0.0, np.nan)
+
+    def see(self, state: QuadcopterState, flying: BoolArray) -> None:
+        """See the state after a control step; only the flights (n,) that continue count."""
+        if not self._watched.any():
+            return
+        force = state.specific_force / G
+        along_z = force[:, 2]
+        falls = (np.abs(force) < FREE_FALL).all(axis=1)
+        self._steps += 1.0
+        self._steps *= (along_z < LOW) & ~falls & flying & self._watched
+        time = self._steps * self._control_step
+        np.maximum(self.longest, time, out=self.longest)
+        # A sum of control steps is a round number only up to rounding.
+        allowed = np.where(along_z < UPSIDE_DOWN, UPSIDE_DOWN_TIME, LOW_TIME) + 1e-9
+        self.cut |= time > allowed

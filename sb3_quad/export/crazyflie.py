@@ -1,0 +1,104 @@
+"""A policy as an app for the Crazyflie's firmware: an out-of-tree controller, by the templates
+``crazyflie.*.j2``.
+"""
+
+import math
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.templates import render
+from sb3_quad.base.types import StrDict
+from sb3_quad.export.check import Reference
+from sb3_quad.export.cost import cost_of
+from sb3_quad.export.network import Network
+from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
+
+FILES = ("Makefile", "Kbuild", "app-config", "README.md", "src/Kbuild", "src/sb3quad.c")
+CALL = 0.001  # s between calls of the firmware, each of which has so many cycles of its STM32F405:
+CYCLES = 168_000
+# Of these the policy may take a quarter in instructions, and a half where it cannot do with less:
+# an instruction may take two cycles, and the firmware has other things to do.
+SHARE = 0.25
+MOST = 0.5
+# THRUST_MIN and THRUST_MAX of the firmware's platforms, N: src/platform/interface in its repository
+# of August 2026, with battery compensation.
+PLATFORMS = {
+    "Crazyflie 2.x": (0.0128, 0.12),
+    "thrust upgrade kit": (0.0192, 0.18),
+    "Crazyflie 2.1 Brushless": (0.0214, 0.2),
+}
+
+
+def slices_of(network: Network, reference: Reference) -> tuple[int, int]:
+    """Return the firmware's calls in a control step, and over how many of them a policy spreads.
+
+    :raises ConfigError: a policy that is too slow, or whose control step is not a number of calls.
+    """
+    instructions = cost_of(network).instructions
+    step = reference.vehicle.control_step
+    period = round(step / CALL)
+    if not math.isclose(period * CALL, step):
+        raise ConfigError(
+            f"control_step {step:g} s: the Crazyflie's firmware calls every {CALL:g} s; "
+            "train with a multiple of that"
+        )
+    if instructions > MOST * CYCLES * period:
+        raise ConfigError(
+            f"the network takes {instructions / CYCLES:.1f} ms on the Crazyflie's chip, more than "
+            f"half of the {1000 * step:g} ms between calls; train one with a smaller net_arch"
+        )
+    return period, min(math.ceil(instructions / (SHARE * CYCLES)), period)
+
+
+def describe_app(network: Network, reference: Reference) -> str:
+    """Return how the app flies, and which platforms can give the vehicle's thrusts.
+
+    :raises ConfigError: none can; or see :func:`slices_of`.
+    """
+    low, high = reference.vehicle.thrust_range
+    able = []
+    for name, (least, greatest) in PLATFORMS.items():
+        if high <= greatest * (1.0 + 1e-4):
+            raised = f", less than {least:g} N is raised to it" if low < 0.99 * least else ""
+            able.append(f"{name} (THRUST_MAX {greatest:g} N{raised})")
+    if not able:
+        raise ConfigError(
+            f"vehicle {reference.vehicle.name}: up to {high:.4g} N a rotor, more than any Crazyflie"
+            " gives; say with --vehicle which one is to fly, such as crazyflie"
+        )
+    period, slices = slices_of(network, reference)
+    return (
+        f"{low:.4g} to {high:.4g} N a rotor, for {' or '.join(able)}; "
+        f"observes in every {period}th call of the firmware, computes in {slices} of them"
+    )
+
+
+def write_app(
+    network: Network, metadata: StrDict, name: str, reference: Reference
+) -> dict[str, bytes]:
+    """Return the files of the folder, by their paths in it, without ``src/policy.h``.
+
+    :param name: beginning of the header's identifiers.
+    :param reference: its vehicle's rotors are M1 to M4 of the firmware.
+    :raises ConfigError: see :func:`slices_of`.
+    """
+    period, slices = slices_of(network, reference)
+    content: StrDict = {
+        "name": name,
+        "network": network,
+        "metadata": metadata,
+        "period": period,
+        "slices": slices,
+        # A row's products stay together, so that a slice may end a row early.
+        "share": math.ceil(cost_of(network).multiplications / slices)
+        + max(layer["inputs"] for layer in network.shapes),
+        "highest": reference.vehicle.thrust_range[1],
+        "angle": reference.turn.angle,
+        "inputs": network.mean.numel(),
+        "features": OBSERVATION_SIZE,
+        "F": F,
+    }
+    files = {}
+    for path in FILES:
+        template = f"crazyflie.{path.replace('/', '.')}.j2"
+        files[path] = render("sb3_quad.export", template, **content).encode()
+    return files

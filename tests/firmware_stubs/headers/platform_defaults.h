@@ -1,0 +1,11 @@
+#pragma once
+#if defined(BRUSHLESS)
+#define THRUST_MIN 0.02136263065537499f
+#define THRUST_MAX 0.2f
+#elif defined(UPGRADE_KIT)
+#define THRUST_MIN 0.01922636758983749f
+#define THRUST_MAX 0.18f
+#else
+#define THRUST_MIN 0.012817578393224994f
+#define THRUST_MAX 0.12f
+#endif

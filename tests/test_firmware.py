@@ -1,0 +1,276 @@
+"""What the firmware of a Crazyflie does with a flight: its supervisor, which cuts the motors, and
+what a low battery leaves of a command.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch as th
+from gradient_of_your_environment import Carts
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_quad import APG, PIDExpert
+from sb3_quad.algorithms.flight_cost import cost_and_gradients, low_force_cost
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.metric_tables import metric_cells
+from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.supervisor import Supervisor
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import (
+    FORCE_BODY,
+    FORCE_WORLD,
+    STATE_SIZE,
+    VELOCITY,
+    WRENCH_SIZE,
+    QuadcopterState,
+)
+from sb3_quad.simulation.tape import FlightTape
+from sb3_quad.vehicles.vehicle import load_vehicle
+
+CRAZYFLIE = load_vehicle("crazyflie")
+WEIGHT = CRAZYFLIE.mass * CRAZYFLIE.gravity
+
+
+def watched(forces, vehicles=(CRAZYFLIE,), flying=True):
+    """Watch specific forces in g: numbers along body z, or vectors (x, y, z)."""
+    supervisor = Supervisor(vehicles)
+    array = np.zeros((STATE_SIZE, len(vehicles)))
+    array[3] = 1.0
+    wrench = np.zeros((WRENCH_SIZE, len(vehicles)))
+    parameters = np.stack([vehicle.parameters() for vehicle in vehicles], axis=1)
+    for force in forces:
+        along_z = np.append([0.2, 0.0], force)
+        wrench[FORCE_BODY] = WEIGHT * along_z[-3:, None]
+        state = QuadcopterState(array, parameters, wrench)
+        supervisor.see(state, np.full(len(vehicles), flying))
+    return supervisor
+
+
+@pytest.mark.parametrize(
+    ("forces", "is_cut"),
+    [
+        ([0.49] * 101, True),  # 1.01 s
+        ([0.49] * 100, False),
+        ([0.49] * 99, False),
+        ([0.51] * 200, False),
+        ([0.49] * 60 + [0.51] + [0.49] * 99, False),
+        ([0.49] * 10 + [-0.21], True),
+        ([0.49] * 9 + [-0.21], False),
+        ([-0.21] * 10 + [0.6], False),
+        ([0.49] * 50 + [-0.19] * 50, False),
+        ([(0.09, 0.0, 0.05)] * 300, False),  # free fall
+        ([0.49] * 60 + [(0.0, -0.09, 0.09)] + [0.49] * 99, False),
+        ([(0.2, 0.0, 0.05)] * 101, True),
+    ],
+)
+def test_the_motors_are_cut_as_the_firmware_does(forces, is_cut):
+    supervisor = watched(forces)
+    assert supervisor.cut.tolist() == [is_cut]
+    if forces[0] == 0.49 and len({*forces}) == 1:
+        assert supervisor.longest[0] == pytest.approx(0.01 * len(forces))
+    assert not watched(forces, flying=False).cut.any()
+
+
+def test_only_vehicles_with_a_supervisor_are_judged():
+    supervisor = watched([0.2] * 200, (CRAZYFLIE, load_vehicle("itm")))
+    assert supervisor.cut.tolist() == [True, False]
+    np.testing.assert_array_equal(supervisor.longest, [2.0, np.nan])
+
+
+def test_the_specific_force_is_what_accelerates_but_the_weight():
+    vehicle = load_vehicle("rotorpy_crazyflie").model_copy(
+        update={"physics_step": 1e-6, "control_step": 1e-6}
+    )
+    assert any(vehicle.drag)
+    settings = FlightSettings(task="state_recovery", vehicle=vehicle, randomize={"wind": [2, 4]})
+    batch = QuadcopterBatch(50, settings, 0, autoreset=False)
+    batch.reset()
+    batch.wrench[:] = np.random.default_rng(0).normal(size=batch.wrench.shape) * 0.05
+    state = batch.true_state().copy()
+    force = batch.true_state().specific_force
+    batch.step(np.zeros((50, 4)))
+    acceleration = (batch.state[VELOCITY] - state.array[VELOCITY]).T / 1e-6
+    acceleration[:, 2] += vehicle.gravity
+    in_body = np.einsum("nji,nj->ni", state.rotation, acceleration)
+    np.testing.assert_allclose(force, in_body, atol=1e-3)
+    assert abs(batch.true_state().wrench[FORCE_WORLD]).max() > 0.05
+
+
+def test_flights_are_judged_on_both_backends_and_shown():
+    pid = PIDExpert("crazyflie")
+    flown = {
+        backend: fly(pid, "state_recovery", 6, 3, "crazyflie", 0.0, backend, max_steps=150)
+        for backend in ("batch", "pybullet")
+    }
+    batch, bullet = flown.values()
+    np.testing.assert_array_equal(batch.cut_by_supervisor, bullet.cut_by_supervisor)
+    np.testing.assert_array_equal(batch.low_force_time, bullet.low_force_time)
+    assert batch.low_force_time.max() > 0.1
+    cells = metric_cells(summarise(replace(batch, cut_by_supervisor=np.arange(6) < 3)))
+    texts = {row.heading: cell.text for row, cell in cells.items()}
+    assert texts["cut by the supervisor, %"].startswith("50")
+    assert texts["longest time below 0.5 g, s"] == f"{batch.low_force_time.max():.2f}"
+    # itm has no supervisor.
+    others = summarise(fly(PIDExpert(), "state_recovery", 2, 0, max_steps=10))
+    assert others.cut_by_supervisor is None and others.low_force_time is None
+
+
+def test_who_judges_a_vehicle_changes_nothing_else():
+    other = CRAZYFLIE.model_copy(update={"supervisor": None})
+    assert other.flies_as(CRAZYFLIE)
+    with pytest.raises(ValueError, match="supervisor"):
+        CRAZYFLIE.model_copy(update={"supervisor": "px4"})
+
+
+@given(
+    saturation=st.sampled_from(["each", "shared"]),
+    battery=st.floats(0.6, 1.0),
+    least=st.floats(0.0, 0.06),
+    seed=st.integers(0, 2**31),
+)
+def test_a_low_battery_limits_each_rotor_or_all_by_the_same_speed(saturation, battery, least, seed):
+    changes = {"saturation": saturation, "rotor_thrust_limits": [least, 0.1125]}
+    vehicle = CRAZYFLIE.model_copy(update=changes)
+    full, low = (
+        QuadcopterBatch(
+            30, FlightSettings(vehicle=vehicle, noise=0.0, randomize=randomize), 0, n_threads=1
+        )
+        for randomize in (None, {"battery": battery})
+    )
+    actions = np.random.default_rng(seed).uniform(-1.5, 1.5, (30, 4))
+    for batch in (full, low):
+        batch.reset()
+        batch.step(actions)
+    asked = full.queue[-1]
+    given_speeds = low.queue[-1]
+    greatest = np.sqrt(battery) * vehicle.rotor_speed_range[1]
+    assert (given_speeds <= greatest * (1 + 1e-12)).all() and (given_speeds >= 0.0).all()
+    if saturation == "each":
+        np.testing.assert_allclose(given_speeds, np.minimum(asked, greatest), rtol=1e-12)
+        return
+    # What is taken off is the same for all that still turn, and nothing where all can be given.
+    taken = asked - given_speeds
+    excess = np.maximum(asked.max(axis=0) - greatest, 0.0)
+    np.testing.assert_allclose(taken, np.minimum(asked, excess), atol=1e-9)
+
+
+def test_a_full_battery_leaves_both_saturations_the_same_to_the_bit():
+    states = []
+    for saturation in ("each", "shared"):
+        vehicle = CRAZYFLIE.model_copy(update={"saturation": saturation})
+        env = QuadcopterVecEnv(40, task="state_recovery", vehicle=vehicle, seed=0)
+        env.reset()
+        for action in np.random.default_rng(0).uniform(-1.5, 1.5, (60, 40, 4)):
+            env.step(action)
+        states.append(env.batch.state)
+    np.testing.assert_array_equal(*states)
+
+
+def test_a_battery_that_cannot_hover_is_refused():
+    with pytest.raises(ConfigError, match="some vehicles could not fly"):
+        QuadcopterBatch(1, FlightSettings(vehicle="crazyflie", randomize={"battery": [0.5, 1]}))
+    with pytest.raises(ConfigError, match="battery"):
+        FlightSettings().with_changes(randomize={"battery": 1.1})
+
+
+@pytest.mark.parametrize("saturation", ["each", "shared"])
+def test_flights_with_a_low_battery_are_those_of_pybullet(saturation):
+    vehicle = CRAZYFLIE.model_copy(update={"saturation": saturation})
+    pid = PIDExpert(vehicle)
+    kwargs = {"randomize": {"battery": [0.7, 0.9]}, "max_steps": 100}
+    batch, bullet = (
+        fly(pid, "state_recovery", 4, 1, vehicle, 0.0, backend, **kwargs)
+        for backend in ("batch", "pybullet")
+    )
+    np.testing.assert_allclose(batch.final_offset, bullet.final_offset, atol=1e-9)
+    np.testing.assert_allclose(batch.path_length, bullet.path_length, atol=1e-9)
+    full = fly(pid, "state_recovery", 4, 1, vehicle, 0.0, max_steps=100)
+    assert (abs(batch.final_error - full.final_error) > 1e-6).any()
+
+
+def record(actions):
+    """Record flights of a Crazyflie by actions (steps, n, 4)."""
+    settings = FlightSettings(task="target_tracking", vehicle="crazyflie", noise=0.0)
+    tape = FlightTape(QuadcopterBatch(actions.shape[1], settings, 0), len(actions), 2)
+    tape.reset()
+    for action in actions:
+        tape.step(action)
+    return tape
+
+
+def low_force(tape):
+    """The mean cost of a recorded flight."""
+    return tape.begin(
+        lambda *flown: cost_and_gradients(
+            lambda states: 10.0 * low_force_cost(states, tape.control_step), *flown
+        )
+    )
+
+
+def test_the_cost_of_low_forces_is_zero_in_hover_and_known_in_a_fall():
+    hover = np.full((150, 1, 4), CRAZYFLIE.hover_action, np.float32)
+    assert low_force(record(hover)) < 1e-12
+    tape = record(np.full((200, 1, 4), -1.0, np.float32))
+    costs = []
+
+    def cost(states):
+        costs.append(low_force_cost(states, tape.control_step))
+        return costs[0]
+
+    tape.begin(lambda *flown: cost_and_gradients(cost, *flown))
+    # At first the force is that of hover; in the last 0.8 s the rotors give their least.
+    assert costs[0].shape == (200, 1) and costs[0][20] == 0.0
+    expected = (0.55 - CRAZYFLIE.thrust_limits[0]) ** 2
+    assert costs[0][-1].item() == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_gradient_of_the_cost_of_low_forces_is_that_of_differences():
+    random = np.random.default_rng(0)
+    # Multiples of 1/1024 and of the difference are exact in float32.
+    actions = np.float32(random.integers(-1000, -600, (110, 3, 4)) / 1024)
+    direction = np.float32(random.choice([-1.0, 1.0], actions.shape))
+    tape = record(actions)
+    assert low_force(tape) > 0.01
+    nothing = np.zeros(tape.batch.observe().shape, np.float32)
+    slope = 0.0
+    for step in reversed(range(len(actions))):
+        slope += (tape.backward(step, nothing) * direction[step]).sum()
+    h = 1 / 1024
+    costs = [low_force(record(actions + k * h * direction)) for k in (-2, -1, 1, 2)]
+    expected = (costs[0] - 8 * costs[1] + 8 * costs[2] - costs[3]) / (12 * h)
+    assert slope == pytest.approx(expected, rel=1e-6)
+
+
+def test_apg_adds_the_cost_of_low_forces_where_it_is_asked_to(tmp_path):
+    env = QuadcopterVecEnv(4, "target_tracking", vehicle="crazyflie", seed=0)
+    agents = []
+    for coef in (0.0, 5.0):
+        policy_kwargs = {"net_arch": [4]}
+        agent = APG(
+            "MlpPolicy",
+            env,
+            n_steps=120,
+            low_force_coef=coef,
+            cost=lambda flown: 0.0 * flown.distance,
+            policy_kwargs=policy_kwargs,
+            seed=0,
+        )
+        with th.no_grad():
+            agent.policy.action_net.bias[:] = -0.95
+        agents.append(agent.learn(4 * 120))
+    without, with_cost = (agent.policy.action_net.bias.detach().numpy() for agent in agents)
+    np.testing.assert_array_equal(without, np.float32(-0.95))
+    # The cost pushes every rotor's thrust up.
+    assert (with_cost > -0.95).all()
+    agents[1].save(tmp_path / "agent")
+    assert APG.load(tmp_path / "agent", env).low_force_coef == 5.0
+
+
+def test_apg_refuses_the_cost_for_other_environments():
+    with pytest.raises(ConfigError, match="Carts: low_force_coef is a cost of quadcopters"):
+        APG("MlpPolicy", Carts(2, 0), n_steps=5, low_force_coef=1.0).learn(10)

@@ -1,0 +1,1 @@
+"""Settings for policies that PX4's module mc_nn_control computes."""
