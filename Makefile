@@ -18,7 +18,7 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs docs-links pictures pictures-long lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs notebooks docs-links pictures pictures-long lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
@@ -34,6 +34,7 @@ help:
 	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
 	@echo "make pictures       draw the pages' pictures anew, ARGS=\"starts.png\" some of them; docs/pictures.py has their commands"
 	@echo "make pictures-long  draw those of agents that are trained first, in hours"
+	@echo "make notebooks      run the notebooks whose code has changed, and keep their outputs for the site; ARGS=--rerun all"
 	@echo "make docs-links     ask each address outside of the site, where there is a network"
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
@@ -98,12 +99,15 @@ transfer-files: $(INSTALLED)
 test-extras:
 	PYTHON=$(PYTHON) .ci/extras $(ARGS)
 
-# -n: what a page or a docstring refers to must be there. SB3_QUAD_NOTEBOOKS=run: notebooks are shown with their outputs, in minutes.
+# -n: what a page or a docstring refers to must be there.
 SPHINX := $(DOCS_VENV)/bin/python -m sphinx -E -n -W --keep-going -q -d build/doctrees
 
 docs: $(DOCS_INSTALLED)
 	$(SPHINX) -b html docs build/docs $(ARGS)
 	@echo "build/docs/index.html"
+
+notebooks: $(INSTALLED)
+	MPLBACKEND=Agg $(PY) docs/notebook_pages.py $(ARGS)
 
 docs-links: $(DOCS_INSTALLED)
 	$(SPHINX) -b linkcheck docs build/links $(ARGS)

@@ -17,6 +17,9 @@ from pathlib import Path
 # PyTorch reads it when it is imported. Without a GPU the tests are the same on every machine.
 os.environ["CUDA_VISIBLE_DEVICES"] = ""
 os.environ["MPLBACKEND"] = "Agg"
+# Also for the programs that tests start: threads of OpenMP and OpenBLAS wait by spinning, which
+# costs most where pytest's workers and other programs want the cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest

@@ -482,16 +482,14 @@ def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
 
 @pytest.mark.slow
 def test_the_benchmark_measures_each_kind_of_environments(capsys):
-    assert (
-        main(["benchmark", "--seconds", "0.1", "--sizes", "64", "--n-envs", "2", "--no-training"])
-        == 0
-    )
-    rows = re.findall(
-        r"^│ (PyBullet|batch).*│ +(\d+) │ +([\d,]+) │", capsys.readouterr().out, flags=re.MULTILINE
-    )
-    assert [n for _, n, _ in rows] == ["1", "2", "2", "64", "64"] and all(
-        rate != "0" for *_, rate in rows
-    )
+    sizes = ["--sizes", "64", "240", "--n-envs", "2"]
+    assert main(["benchmark", "--seconds", "0.1", *sizes, "--no-training"]) == 0
+    output = capsys.readouterr().out
+    rows = re.findall(r"^│ (PyBullet|batch).*│ +(\d+) │ +([\d,]+) │", output, flags=re.MULTILINE)
+    assert [n for _, n, _ in rows] == ["1", "2", "2", "64", "64", "240", "240"]
+    assert all(rate != "0" for *_, rate in rows)
+    (speed,) = re.findall(r"this machine: (\S+) times the reference", output)
+    assert float(speed) > 0
 
 
 def test_the_benchmark_measures_training_loops(tmp_path, capsys):

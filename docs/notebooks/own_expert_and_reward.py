@@ -253,7 +253,7 @@ plt.show()
 
 # %% [markdown]
 # Your cost is quadratic. So the large changes on the way became smaller. The small ones at the
-# target matter little, and they became larger.
+# target cost little, and they stayed about as they were.
 #
 # ## Further
 #

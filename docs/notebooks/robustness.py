@@ -133,7 +133,7 @@ plot_grid(results)
 # A successful flight survives and ends within 0.1 m of its target. You see that with another mass,
 # or a force, the PID and `itm-recovery` come to rest at an offset, since nothing in them integrates
 # the error. `itm-robust` has an integral. It also sees its last observations, from which it can
-# estimate what it flies. A delay of six control steps is too much for all three.
+# estimate what it flies. With a delay of six control steps, only `itm-robust` still arrives.
 #
 # ## Two things at once
 #

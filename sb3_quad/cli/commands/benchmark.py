@@ -1,8 +1,12 @@
 """Measure control steps per second of environments and training loops.
 
-The environments are PyBullet's, alone and vectorised, and the compiled batch. A
-training loop is a rollout with its update; APG's includes the way back through
-the recorded flights.
+The environments are the compiled batch and, where it is installed, PyBullet's,
+alone and vectorised. A training loop is a rollout with its update; APG's
+includes the way back through the recorded flights.
+
+The last line compares a core of your machine with one of the machine that the
+documentation's CPU seconds are from: at 0.5, expect twice as many. It needs the
+batch with 240 rows, and counts CPU seconds, so other programs hardly matter.
 
 examples:
   # everything, about a minute
@@ -18,6 +22,8 @@ import itertools
 from argparse import Namespace
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from importlib.util import find_spec
+from time import process_time
 from timeit import Timer
 from typing import Any, NamedTuple
 
@@ -34,6 +40,9 @@ ENV_ID = "QuadTargetTracking-v0"
 # The environment of the training loops.
 TRAINED = "QuadStateRecovery-v0"
 REPETITIONS = 5
+# The subject that needs one core, and its steps/s on the reference machine
+REFERENCE = ("batch", 240)
+REFERENCE_RATE = 9.15e6
 
 
 class Subject(NamedTuple):
@@ -95,6 +104,11 @@ def run(options: Namespace) -> int:
         )
     title = f"control steps per second (median of {REPETITIONS})"
     screen.print(text_table(title, ("", "rows", "steps/s", "to the first line"), lines))
+    for subject in subjects:
+        if subject[:2] == REFERENCE:
+            count, seconds = Timer(subject.call, timer=process_time).autorange()
+            speed = subject.steps * count / seconds / REFERENCE_RATE
+            screen.print(f"this machine: {speed:.2f} times the reference, core by core")
     return 0
 
 
@@ -143,9 +157,10 @@ def _environments(stack: ExitStack, sizes: list[int], n_envs: int) -> list[Subje
         settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": env_kwargs}
         add(name, rows, make_environments(build_config("ppo", ENV_ID, settings), rows, 0), rows)
 
-    add("PyBullet, one environment", 1, Autoreset(gymnasium.make(ENV_ID)))
-    add_vectorised("PyBullet, DummyVecEnv", "dummy", n_envs)
-    add_vectorised("PyBullet, SubprocVecEnv", "subproc", n_envs)
+    if find_spec("pybullet"):
+        add("PyBullet, one environment", 1, Autoreset(gymnasium.make(ENV_ID)))
+        add_vectorised("PyBullet, DummyVecEnv", "dummy", n_envs)
+        add_vectorised("PyBullet, SubprocVecEnv", "subproc", n_envs)
     robust = load_config("dagger", TRAINED, "robust/dagger.yml").env_kwargs["randomize"]
     for size in sizes:
         add_vectorised("batch", "batch", size)
