@@ -12,6 +12,7 @@ import argparse
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 
 from sb3_quad import PIDExpert, load_vehicle
@@ -63,8 +64,8 @@ def main():
         parser.error("give a folder, or --control")
     logs = [log for log in read_logs(arguments.folder, STEP) if log.flying.any()]
     fitted, judged = split(logs, arguments.leave_out)
-    print("fitted:", ", ".join(log.name for log in fitted))
-    print("judged:", ", ".join(log.name for log in judged))
+    print("fitted:", ", ".join(log.path.stem for log in fitted))
+    print("judged:", ", ".join(log.path.stem for log in judged))
     print("clocks differ by, ms:", ", ".join(f"{1000 * log.offset:.0f}" for log in logs))
     show(one_step_table(judged, vehicle))
     show(error_table(judged, vehicle))
@@ -90,11 +91,11 @@ def split(logs, left_out):
     """Return the logs to fit and those to judge: the named ones, or every second."""
     if left_out is None:
         return logs[::2], logs[1::2]
-    judged = [log for log in logs if log.name in left_out]
-    unknown = set(left_out) - {log.name for log in judged}
+    judged = [log for log in logs if log.path.stem in left_out]
+    unknown = set(left_out) - {log.path.stem for log in judged}
     if unknown or not judged:
         raise SystemExit(f"--leave-out {', '.join(unknown)}: no such flights in the air")
-    return [log for log in logs if log.name not in left_out], judged
+    return [log for log in logs if log.path.stem not in left_out], judged
 
 
 def longest_flight(log):
@@ -110,10 +111,17 @@ def state_of(motion):
     return QuadcopterState(motion.T)
 
 
+def columns_of(log, names):
+    """Return further columns of a log's file, (n, names), by the clock of the vehicle."""
+    table = pd.read_csv(log.path)
+    grid = table["t"].iloc[0] + STEP * np.arange(len(log.motion)) + log.offset
+    return np.stack([np.interp(grid, table["t"], table[name]) for name in names], axis=1)
+
+
 def run_of(log):
     """Return commands and response of a log's flight."""
     rows = longest_flight(log)
-    force = 9.81 * log.columns["imu_acc_z"][rows]
+    force = 9.81 * columns_of(log, ["imu_acc_z"])[rows, 0]
     response = np.column_stack([state_of(log.motion[rows]).body_rates, force])
     return Run(log.thrusts[rows] @ SIDES.T, response)
 
@@ -513,12 +521,12 @@ def closed_loop_table(logs, vehicle):
     rows = []
     for log in logs:
         part = longest_flight(log)
-        setpoint = np.stack([log.columns[f"sp_ctrltarget_{axis}"][part] for axis in "xyz"], axis=1)
+        setpoint = columns_of(log, [f"sp_ctrltarget_{axis}" for axis in "xyz"])[part]
         position = state_of(log.motion[part]).position
         texts = [f"{off(position, setpoint):.3f}"]
         for kind in ("cascade", "PID"):
             texts.append(f"{off(follow(vehicle, setpoint, position[0], kind), setpoint):.3f}")
-        rows.append([log.name, *texts])
+        rows.append([log.path.stem, *texts])
     heads = ("off the setpoint, rms, m", "flown", "cascade, simulated", "PIDExpert, simulated")
     return text_table(f"{vehicle.name}: closed loop on recorded setpoints", heads, rows)
 
@@ -611,7 +619,7 @@ def simulated_runs(vehicle, n=10, seconds=30.0, torque=1e-4, noise=0.004, seed=0
         target = curve * [0.8, 0.8, 0.3] + [0.0, 0.0, 1.0]
         gyro = state.body_rates + noise * rng.standard_normal((n, 3))
         commands[now] = controller.thrusts(state, target, gyro)
-        lift = vehicle.thrust_coefficient * (state.rotor_speeds**2).sum(axis=1) / vehicle.mass
+        lift = vehicle.lift * (state.rotor_speeds**2).sum(axis=1) / vehicle.mass
         response[now] = np.column_stack([gyro, lift])
         fresh = torque * rng.standard_normal((n, 3)) * [1.0, 1.0, 0.2]
         push = keep * push + np.sqrt(1.0 - keep**2) * fresh

@@ -255,7 +255,8 @@ REFUSED = {
     "body": ({"features": "body"}, {}, {}, "--env-kwargs features:px4"),
     "itm": ({"vehicle": "itm"}, {}, {}, "rotor_thrust_limits from 0"),
     "plus": ({"vehicle": "plus"}, {}, {}, "needs a rotor in each corner"),
-    "speeds": ({}, {}, {"output": "speeds"}, "export without --output"),
+    "unknown kF": ({"vehicle": "unknown kF"}, {}, {}, "give the vehicle its thrust_coefficient"),
+    "speeds": ({}, {}, {"output": "speeds"}, "the firmware takes thrusts; remove --output"),
     "large": ({}, {"net_arch": [4000]}, {}, "needs more than 10240 bytes; train smaller layers"),
 }
 
@@ -267,6 +268,8 @@ def test_what_the_module_cannot_compute_is_refused(case, tmp_path):
     if settings.get("vehicle") == "plus":
         plus = X500.model_copy(update={"name": "plus", "rotor_positions": PLUS})
         settings = {"vehicle": plus}
+    if settings.get("vehicle") == "unknown kF":
+        settings = {"vehicle": X500.model_copy(update={"thrust_coefficient": 0.0})}
     path = save(tmp_path / "agent.zip", settings, **policy)
     with pytest.raises(ConfigError, match=re.escape(message)) as error:
         export_policy(path, "px4", n_observations=100, **options)

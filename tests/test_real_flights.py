@@ -65,7 +65,7 @@ def folder(tmp_path_factory):
 def raw(logs, folder):
     """Return the logs without calibration, which is for instruments: here, there are none."""
     for log in logs:
-        table = pd.read_csv(folder / f"{log.name}.csv")[: len(log.flying)]
+        table = pd.read_csv(log.path)[: len(log.flying)]
         log.motion[:] = table[SEEN + FELT]
         log.thrusts[:] = table[THRUSTS]
     return logs
@@ -81,7 +81,7 @@ def test_our_own_log_flown_again_is_the_same_flight(folder):
 def test_calibration_leaves_a_log_without_faults_nearly_alone(folder):
     for log in read_logs(folder, STEP):
         assert abs(log.offset) <= 0.005 and log.flying.all()
-        table = pd.read_csv(folder / f"{log.name}.csv")[: len(log.flying)]
+        table = pd.read_csv(log.path)[: len(log.flying)]
         np.testing.assert_allclose(log.thrusts, table[THRUSTS], rtol=0.01)
         gap = log.motion[:, QUATERNION] - table[SEEN[QUATERNION]]
         # Half the angle
@@ -97,7 +97,7 @@ def test_a_late_clock_tilted_markers_and_an_uneven_motor_are_calibrated(folder, 
     late[SEEN[QUATERNION]] = turned_on(table[SEEN[QUATERNION]].to_numpy(), tilt)
     late.to_csv(tmp_path / "late.csv", index=False)
     (log,) = read_logs(tmp_path, STEP)
-    (true,) = [each for each in read_logs(folder, STEP) if each.name == "flight_0"]
+    (true,) = [each for each in read_logs(folder, STEP) if each.path.stem == "flight_0"]
     assert log.offset == pytest.approx(true.offset + 0.03, abs=0.002)
     inside = slice(50, -50)
     gap = (log.motion - true.motion)[inside, QUATERNION]
@@ -185,5 +185,5 @@ def test_the_fitted_file_predicts_flights_that_were_not_fitted():
 
 @real
 def test_a_log_ends_where_it_was_extrapolated():
-    (log,) = [each for each in read_logs(FOLDER, STEP) if "mellinger" in each.name]
+    (log,) = [each for each in read_logs(FOLDER, STEP) if "mellinger" in each.path.stem]
     assert log.flying.sum() < 1000

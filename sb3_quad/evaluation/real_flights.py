@@ -7,15 +7,15 @@ agree best; how the markers of the motion capture are mounted, so that the mean 
 along z; and the motors against each other, so that the mean commands give no moment.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import Arrays, BoolArray, FloatArray, StrPath
+from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.types import BoolArray, FloatArray, StrPath
 from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.physics import quaternion_product
@@ -59,11 +59,10 @@ HEADS = ("root mean square of the error", "simulated", "nothing changes", "veloc
 class Log:
     """A flight of n rows, one for each control step, in SI units."""
 
-    name: str  #: of its file
+    path: Path  #: of its file
     #: (n, 13): position, quaternion, velocity and body rates, as the rows of the state have them
     motion: FloatArray
     thrusts: FloatArray  #: (n, 4), commanded, M1 to M4, N
-    columns: Arrays  #: all columns of the file, (n,), by the clock of the vehicle
     flying: BoolArray  #: (n,), in the air
     offset: float  #: s, by which the vehicle's clock was behind that of the motion capture
 
@@ -81,10 +80,8 @@ def read_logs(folder: StrPath, step: float) -> list[Log]:
 
 def read_log(path: Path, step: float) -> Log:
     """Read one log, see :func:`read_logs`."""
-    try:
+    with raised_as(ConfigError, f"{path}: not a table of numbers"):
         table = pd.read_csv(path).astype(float)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: not a table of numbers: {error}") from error
     commands = THRUSTS if THRUSTS[0] in table else PWM
     missing = {"t", *SEEN, *FELT, *commands} - {*table}
     if missing:
@@ -92,7 +89,7 @@ def read_log(path: Path, step: float) -> Log:
     time = table["t"]
     grid = np.arange(time.iloc[0], time.iloc[-1], step)
 
-    def at(names: Iterable[str], behind: float = 0.0) -> FloatArray:
+    def at(names: list[str], behind: float = 0.0) -> FloatArray:
         return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
 
     motion = at(SEEN + FELT)
@@ -100,11 +97,11 @@ def read_log(path: Path, step: float) -> Log:
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     flying = motion[:, 2] > LEAST_HEIGHT
     flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
-    inverse = (attitude[:-2] * [1.0, -1.0, -1.0, -1.0]).T
-    turns = quaternion_product.py_func(*inverse, *attitude[2:].T)
-    # Twice the step, and twice the half angle: these are the body rates times the step.
-    rates = np.pad(turns[1:], ((0, 0), (1, 1))).T * flying[:, None]
-    offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind))))
+    # Rᵀ dR/dt has the body rates in three places.
+    rotation = rotation_matrices(attitude)
+    turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, step, axis=0))
+    rates = turning[flying][:, [2, 0, 1], [1, 2, 0]]
+    offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind)[flying])))
     motion[:, BODY_RATES] = at(FELT, offset)
 
     thrusts = at(commands, offset)
@@ -113,15 +110,12 @@ def read_log(path: Path, step: float) -> Log:
     # Some logs are extrapolated after the radio was lost.
     flying &= np.isfinite(thrusts).all(axis=1)
     if flying.any():
-        force = np.gradient(motion[:, VELOCITY], step, axis=0)
-        force[:, 2] += 9.81
-        in_body = np.einsum("nji,nj->ni", rotation_matrices(attitude), force)
-        x, y, z = in_body[flying].mean(axis=0)
+        force = np.gradient(motion[:, VELOCITY], step, axis=0) + [0.0, 0.0, 9.81]
+        x, y, z = np.einsum("nji,nj->ni", rotation, force)[flying].mean(axis=0)
         motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
         mean = thrusts[flying].mean(axis=0)
         thrusts *= mean.mean() / mean
-    columns = dict(zip(table, at(table, offset).T, strict=True))
-    return Log(path.stem, motion, thrusts, columns, flying, offset)
+    return Log(path, motion, thrusts, flying, offset)
 
 
 def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
@@ -130,7 +124,7 @@ def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
     :param pwm: (n, 4), 0 to 65,535; others and motors that stand become NaN.
     :param battery: (n, 1), V.
     """
-    thrusts = np.polynomial.polynomial.polyval(pwm / FULL_PWM * battery, THRUST_BY_VOLTAGE)
+    thrusts = np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(pwm / FULL_PWM * battery)
     return np.where((pwm > 0.0) & (pwm <= FULL_PWM), thrusts, np.nan)
 
 
@@ -163,14 +157,10 @@ def open_loop(
     step = vehicle.control_step
     before = round(WARM_UP / step)
     ends = [round(horizon / step) for horizon in HORIZONS]
-    fit = []
-    for log in logs:
-        fit.append(np.zeros(log.flying.size, bool))
-        total = np.cumsum(log.flying)
-        length = before + ends[-1]
-        # All rows around it fly.
-        fit[-1][before : -ends[-1]] = total[length:] - total[:-length] == length
-    rows = np.flatnonzero(np.concatenate(fit))[::stride]
+    length = before + ends[-1]
+    # All rows around it fly.
+    flights = [pd.Series(log.flying).rolling(length).sum().shift(-ends[-1]) for log in logs]
+    rows = np.flatnonzero(np.concatenate(flights) == length)[::stride]
     if rows.size == 0:
         raise ConfigError(f"no log flies above {LEAST_HEIGHT:g} m for {WARM_UP + HORIZONS[-1]:g} s")
     record = np.concatenate([log.motion for log in logs])

@@ -12,19 +12,12 @@ PER_CALL = 2365.0
 KB = 1024
 
 
-class Chip(NamedTuple):
-    """A flight controller's microcontroller."""
-
-    name: str
-    flash: int  # kB
-    clock: int  # MHz
-
-
-CHIPS = (
-    Chip("STM32F405 (Cortex-M4)", 1024, 168),
-    Chip("STM32F722 (Cortex-M7)", 512, 216),
-    Chip("STM32H743 (Cortex-M7)", 2048, 480),
-)
+# Microcontrollers of flight controllers: flash, kB, and clock, MHz.
+CHIPS = {
+    "STM32F405 (Cortex-M4)": (1024, 168),
+    "STM32F722 (Cortex-M7)": (512, 216),
+    "STM32H743 (Cortex-M7)": (2048, 480),
+}
 
 
 class Cost(NamedTuple):
@@ -38,22 +31,22 @@ class Cost(NamedTuple):
 
     def describe(self, period: float) -> str:
         """Return a line for the users of a header that is called every ``period`` seconds."""
-        text = (
+        chips = []
+        for chip, (kilobytes, clock) in CHIPS.items():
+            milliseconds = self.instructions / (1000 * clock)
+            flash = self.flash / (KB * kilobytes)
+            # The other programs of a flight controller need the rest.
+            fits = "fits" if max(flash, milliseconds / 1000 / period) < 1.0 else "does not fit"
+            chips.append(
+                f"{fits} {chip}: {milliseconds:.2f} ms at {clock} MHz, "
+                f"{100 * flash:.0f} % of {kilobytes:,} kB"
+            )
+        return (
             f"{self.flash:,} bytes of flash, {self.ram:,} of RAM, {self.stack:,} of stack; "
             f"{self.multiplications:,} multiplications and about "
             f"{self.instructions / 1000:,.0f} thousand instructions a call, "
-            "by one instruction a cycle:"
+            f"by one instruction a cycle: {'; '.join(chips)}"
         )
-        for chip in CHIPS:
-            seconds = self.instructions / (1e6 * chip.clock)
-            flash = self.flash / (KB * chip.flash)
-            # The other programs of a flight controller need the rest.
-            fits = "fits" if max(flash, seconds / period) < 1.0 else "does not fit"
-            text += (
-                f" {fits} {chip.name}: {1000 * seconds:.2f} ms at {chip.clock} MHz, "
-                f"{100 * flash:.0f} % of {chip.flash:,} kB;"
-            )
-        return text.rstrip(";")
 
 
 def cost_of(network: Network) -> Cost:

@@ -89,16 +89,16 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     refuse_unknown("format", [file_format], FORMATS)
+    if file_format == "safetensors":
+        return _agent_itself(path, output, vehicle)
     is_app = file_format == "crazyflie"
-    if is_app and output != "thrusts":
-        raise ConfigError("--format crazyflie: the firmware takes thrusts; remove --output")
+    if file_format in FOLDERS and output != "thrusts":
+        raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     settings, source = agent_settings(path)
-    given = settings
-    if vehicle is not None:
-        given = settings.with_changes(vehicle=vehicle)
-    if given.vehicles is not None and file_format != "safetensors":
+    given = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
+    if given.vehicles is not None:
         raise ConfigError(
             f"model {path}: flies any vehicle; "
             "say with --vehicle which one's thrusts the file is to give"
@@ -117,18 +117,7 @@ def export_policy(
         "crazyflie": header,
         "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
     }
-    features = "px4" if file_format == "px4" else "body"
-    if file_format == "safetensors":
-        features = settings.features
-    network = build_network(reference, f"model {path}", features)
-    if file_format == "safetensors":
-        if reference.clip or model.use_sde:
-            raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
-        data = saved_data(path)
-        if source is not None:
-            settings.write_into(model)
-            data[KEY] = getattr(model, KEY)
-        return Export(write_tensors(model, data), {}, 0.0, network.unit, source, None)
+    network = build_network(reference, f"model {path}", "px4" if file_format == "px4" else "body")
     metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
     write, read = formats[file_format]
     if write is header[0]:
@@ -157,6 +146,25 @@ def export_policy(
             files[name] = text.encode("ascii")
         metadata["parameters"] = "; ".join(text.splitlines())
     return Export(content, metadata, error, network.unit, source, files)
+
+
+def _agent_itself(path: StrPath, output: str, vehicle: VehicleSource | None) -> Export:
+    """Make a safetensors file of a zip."""
+    if output != "thrusts" or vehicle is not None:
+        raise ConfigError(
+            "--format safetensors: is the agent as it is; remove --output and --vehicle"
+        )
+    model = load_model(path)
+    settings, source = agent_settings(path)
+    reference = Reference(model, settings, first_vehicle(settings.vehicle))
+    network = build_network(reference, f"model {path}", settings.features)
+    if reference.clip or model.use_sde:
+        raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
+    data = saved_data(path)
+    if source is not None:
+        settings.write_into(model)
+        data[KEY] = getattr(model, KEY)
+    return Export(write_tensors(model, data), {}, 0.0, network.unit, source, None)
 
 
 def _describe(
