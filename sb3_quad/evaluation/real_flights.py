@@ -110,7 +110,8 @@ def read_log(path: Path, step: float) -> Log:
     # Some logs are extrapolated after the radio was lost.
     flying &= np.isfinite(thrusts).all(axis=1)
     if flying.any():
-        force = np.gradient(motion[:, VELOCITY], step, axis=0) + [0.0, 0.0, 9.81]
+        force = np.gradient(motion[:, VELOCITY], step, axis=0)
+        force[:, 2] += 9.81
         x, y, z = np.einsum("nji,nj->ni", rotation, force)[flying].mean(axis=0)
         motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
         mean = thrusts[flying].mean(axis=0)
@@ -167,6 +168,7 @@ def open_loop(
     thrusts = np.concatenate([log.thrusts for log in logs])
     actions = vehicle.thrust_to_action(np.nan_to_num(thrusts))
     start = record[rows]
+    rows -= before
 
     settings = FlightSettings(vehicle=vehicle, noise=0.0)
     batch = QuadcopterBatch(rows.size, settings, seed=0, autoreset=False)
@@ -176,13 +178,14 @@ def open_loop(
         if now == 0:
             motion[:] = start.T
         before_step(batch)
-        batch.step(actions[rows + now])
+        batch.step(actions[rows])
+        rows += 1
         if now + 1 in ends:
             time = (now + 1) * step
             stays = start.copy()
             stays[:, POSITION] += start[:, VELOCITY] * time
             stays[:, QUATERNION] = turned_on(start[:, QUATERNION], start[:, BODY_RATES] * time)
-            yield time, [motion.T.copy(), start, stays], record[rows + now + 1]
+            yield time, [motion.T.copy(), start, stays], record[rows]
 
 
 def errors(prediction: FloatArray, end: FloatArray) -> FloatArray:
