@@ -20,7 +20,7 @@ from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.cost import cost_of
-from sb3_quad.export.crazyflie import describe_app, write_app
+from sb3_quad.export.crazyflie import plan_app, write_app
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.export.px4 import load_px4, motor_order, write_px4
 from sb3_quad.simulation.observation import FEATURES, GROUPS
@@ -113,17 +113,16 @@ def export_policy(
     formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
-        "c": header,
-        "crazyflie": header,
         "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
     }
     network = build_network(reference, f"model {path}", "px4" if file_format == "px4" else "body")
     metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
-    write, read = formats[file_format]
+    write, read = formats.get(file_format, header)
     if write is header[0]:
         metadata["cost"] = cost_of(network).describe(flown.control_step)
     if is_app:
-        metadata["app"] = describe_app(network, reference)
+        plan = plan_app(network, reference)
+        metadata["app"] = plan["summary"]
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
@@ -138,7 +137,7 @@ def export_policy(
         content = write(network, metadata)
     files = None
     if is_app:
-        files = {FOLDERS[file_format]: content, **write_app(network, metadata, prefix, reference)}
+        files = {FOLDERS[file_format]: content, **write_app(plan, metadata, prefix)}
     if file_format == "px4":
         files = {FOLDERS[file_format]: content}
         for name in ("control_net.cpp", "control_net.hpp", "px4.params"):

@@ -123,9 +123,6 @@ def _check(network: Network, reference: Reference) -> None:
         "takes -1 for no thrust: give the vehicle rotor_thrust_limits from 0, and train for it": (
             reference.vehicle.thrust_range[0] > 0.0
         ),
-        "takes thrusts for squares of rotor speeds: give the vehicle its thrust_coefficient": (
-            not reference.vehicle.thrust_coefficient
-        ),
         "takes actions as they are: train without normalize and a turned rotor_layout": (
             reference.clip or reference.turn.angle
         ),
@@ -166,6 +163,6 @@ def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, s
             interpreter.set_input(shown[None], 0)
             interpreter.invoke()
             actions[row, motors] = interpreter.get_output(0)[0]
-        return vehicle.action_to_thrust(actions.clip(-1.0, 1.0)), state
+        return vehicle.action_to_thrust(actions), state
 
     return call, "tflite-micro"
