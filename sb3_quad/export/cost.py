@@ -9,15 +9,6 @@ from sb3_quad.export.network import Network
 PER_MULTIPLICATION = 4.36
 PER_UNIT = {"tanh": 104.0, "relu": 12.0, "none": 0.0}
 PER_CALL = 2365.0
-KB = 1024
-
-
-# Microcontrollers of flight controllers: flash, kB, and clock, MHz.
-CHIPS = {
-    "STM32F405 (Cortex-M4)": (1024, 168),
-    "STM32F722 (Cortex-M7)": (512, 216),
-    "STM32H743 (Cortex-M7)": (2048, 480),
-}
 
 
 class Cost(NamedTuple):
@@ -28,25 +19,6 @@ class Cost(NamedTuple):
     stack: int  # bytes
     multiplications: int
     instructions: float
-
-    def describe(self, period: float) -> str:
-        """Return a line for the users of a header that is called every ``period`` seconds."""
-        chips = []
-        for chip, (kilobytes, clock) in CHIPS.items():
-            milliseconds = self.instructions / (1000 * clock)
-            flash = self.flash / (KB * kilobytes)
-            # The other programs of a flight controller need the rest.
-            fits = "fits" if max(flash, milliseconds / 1000 / period) < 1.0 else "does not fit"
-            chips.append(
-                f"{fits} {chip}: {milliseconds:.2f} ms at {clock} MHz, "
-                f"{100 * flash:.0f} % of {kilobytes:,} kB"
-            )
-        return (
-            f"{self.flash:,} bytes of flash, {self.ram:,} of RAM, {self.stack:,} of stack; "
-            f"{self.multiplications:,} multiplications and about "
-            f"{self.instructions / 1000:,.0f} thousand instructions a call, "
-            f"by one instruction a cycle: {'; '.join(chips)}"
-        )
 
 
 def cost_of(network: Network) -> Cost:

@@ -29,19 +29,15 @@ PLATFORMS = {
 
 
 def plan_app(network: Network, reference: Reference) -> StrDict:
-    """Return what the templates need besides names, and how the app flies, ``summary``.
+    """Return what the templates need besides names.
 
     :param reference: its vehicle's rotors are M1 to M4 of the firmware.
     :raises ConfigError: thrusts that no platform gives; a policy that is too slow, or whose control
         step is not a number of calls.
     """
     vehicle = reference.vehicle
-    low, high = vehicle.thrust_range
-    able = []
-    for name, (least, greatest) in PLATFORMS.items():
-        if high <= greatest * (1.0 + 1e-4):
-            raised = f", less than {least:g} N is raised to it" if low < 0.99 * least else ""
-            able.append(f"{name} (THRUST_MAX {greatest:g} N{raised})")
+    high = vehicle.thrust_range[1]
+    able = [item for item in PLATFORMS.items() if high <= item[1][1] * (1.0 + 1e-4)]
     if not able:
         raise ConfigError(
             f"vehicle {vehicle.name}: up to {high:.4g} N a rotor, more than any Crazyflie"
@@ -75,10 +71,7 @@ def plan_app(network: Network, reference: Reference) -> StrDict:
         "inputs": network.mean.numel(),
         "features": OBSERVATION_SIZE,
         "F": F,
-        "summary": (
-            f"{low:.4g} to {high:.4g} N a rotor, for {' or '.join(able)}; "
-            f"observes in every {period}th call of the firmware, computes in {slices} of them"
-        ),
+        "able": able,
     }
 
 

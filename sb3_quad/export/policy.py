@@ -116,13 +116,13 @@ def export_policy(
         "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
     }
     network = build_network(reference, f"model {path}", "px4" if file_format == "px4" else "body")
-    metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
     write, read = formats.get(file_format, header)
+    facts: StrDict = {}
     if write is header[0]:
-        metadata["cost"] = cost_of(network).describe(flown.control_step)
+        facts["cost"] = cost_of(network)
     if is_app:
-        plan = plan_app(network, reference)
-        metadata["app"] = plan["summary"]
+        facts["plan"] = plan_app(network, reference)
+    metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown, facts)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
@@ -137,7 +137,7 @@ def export_policy(
         content = write(network, metadata)
     files = None
     if is_app:
-        files = {FOLDERS[file_format]: content, **write_app(plan, metadata, prefix)}
+        files = {FOLDERS[file_format]: content, **write_app(facts["plan"], metadata, prefix)}
     if file_format == "px4":
         files = {FOLDERS[file_format]: content}
         for name in ("control_net.cpp", "control_net.hpp", "px4.params"):
@@ -167,7 +167,12 @@ def _agent_itself(path: StrPath, output: str, vehicle: VehicleSource | None) -> 
 
 
 def _describe(
-    path: Path, algorithm: str, network: Network, reference: Reference, vehicle: Vehicle
+    path: Path,
+    algorithm: str,
+    network: Network,
+    reference: Reference,
+    vehicle: Vehicle,
+    facts: StrDict,
 ) -> StrDict:
     """Return what users of the file must know; ASCII but for names."""
     text = render(
@@ -184,6 +189,7 @@ def _describe(
         motors=motor_order(vehicle) if network.observation.features == "px4" else [],
         n_parameters=parameters_to_vector(network.parameters()).numel(),
         needs=network.observation.model_dump(mode="json", exclude={"preview"}),
+        **facts,
     )
     # The name of a file may hold anything, also the end of a line.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
