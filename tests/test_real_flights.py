@@ -166,6 +166,8 @@ def test_check_vehicle_prints_the_errors(folder, capsys):
             "a log is a CSV file with numbers in the columns t, px",
         ),
         (lambda table: table.assign(pz=0.0), "no log flies above 0.3 m for 1 s"),
+        (lambda table: table[:0], "a log is a CSV file with numbers in the columns t, px"),
+        (lambda table: table[:1], "a log is a CSV file with numbers in the columns t, px"),
         (
             lambda table: table.drop(columns=[*THRUSTS]),
             "real_flights.py --write makes such files of logs with PWM",

@@ -69,13 +69,13 @@ def read_log(path: Path, step: float) -> Log:
     """Read one log, see :func:`read_logs`."""
     with raised_as(ConfigError, f"{path}: {NEEDED}"):
         table = pd.read_csv(path, usecols=["t", *COLUMNS]).astype(float)
-    time = table["t"]
-    grid = np.arange(time.iloc[0], time.iloc[-1], step)
-    rows = np.stack([np.interp(grid, time, table[name]) for name in COLUMNS], axis=1)
-    motion, thrusts = np.split(rows, [BODY_RATES.stop], axis=1)
-    motion[:, QUATERNION] /= np.linalg.norm(motion[:, QUATERNION], axis=1, keepdims=True)
-    flying = motion[:, 2] > LEAST_HEIGHT
-    flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
+        time = table["t"]
+        grid = np.arange(time.iloc[0], time.iloc[-1], step)
+        rows = np.stack([np.interp(grid, time, table[name]) for name in COLUMNS], axis=1)
+        motion, thrusts = np.split(rows, [BODY_RATES.stop], axis=1)
+        motion[:, QUATERNION] /= np.linalg.norm(motion[:, QUATERNION], axis=1, keepdims=True)
+        flying = motion[:, 2] > LEAST_HEIGHT
+        flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
     # Commands that nobody knows fly nothing.
     flying &= np.isfinite(thrusts).all(axis=1)
     return Log(path, motion, thrusts, flying)
