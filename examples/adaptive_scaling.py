@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.colors import to_hex, to_rgb
 
 from sb3_quad.algorithms.offset_correction import N_OFFSETS, ROUNDS, hover_offset
 from sb3_quad.base.errors import ConfigError
@@ -145,7 +146,13 @@ def main() -> None:
     rows = metric_rows(scenario, cells, scenario.published.values())
     console().print(Table(columns, rows, title=scenario.heading, caption=CAPTION))
     if options.output:
-        write_bytes(options.output, arrivals_plot(scenario, metrics, colours_of([*metrics])).png)
+        # With adaptive scaling, an agent has a lighter tone of its own colour.
+        colours = colours_of([*plain])
+        for label in plain:
+            red, green, blue = to_rgb(colours[label])
+            light = (0.5 + 0.5 * red, 0.5 + 0.5 * green, 0.5 + 0.5 * blue)
+            colours[f"{label} (adaptive)"] = to_hex(light)
+        write_bytes(options.output, arrivals_plot(scenario, metrics, colours).png)
 
 
 if __name__ == "__main__":

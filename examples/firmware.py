@@ -10,6 +10,7 @@ All constants are those of bitcraze/crazyflie-firmware, commit 2a18fc2 (2026).
 
 import argparse
 import math
+from typing import Any
 
 import numpy as np
 from stable_baselines3 import PPO
@@ -58,10 +59,11 @@ def print_volts() -> None:
     """
     for name, (polynomial, largest) in MOTORS.items():
         thrust = np.polynomial.Polynomial(polynomial)
-        least = [root.real for root in (thrust - largest).roots() if abs(root.imag) < 1e-9]
-        slower = math.sqrt(thrust(0.9 * min(least)) / largest)
+        roots = np.asarray((thrust - largest).roots())
+        least = float(roots.real[np.abs(roots.imag) < 1e-9].min())
+        slower = math.sqrt(thrust(0.9 * least) / largest)
         print(
-            f"{name}, at most {largest} N a rotor, at {min(least):.2f} V; with 90 % of that voltage"
+            f"{name}, at most {largest} N a rotor, at {least:.2f} V; with 90 % of that voltage"
             f" it turns at {100 * slower:.0f} % of the speed:"
         )
         for voltage in VOLTAGES:
@@ -147,7 +149,7 @@ def print_battery(arguments) -> None:
     vehicle = load_vehicle(arguments.vehicle)
     shared = vehicle.model_copy(update={"saturation": "shared"})
     low = {"randomize": {"battery": arguments.lowest}}
-    conditions = {
+    conditions: dict[str, dict[str, Any]] = {
         "full battery": {},
         "full battery, shared saturation": {"vehicle": shared},
         "low battery": low,

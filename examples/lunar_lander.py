@@ -43,7 +43,7 @@ def report(name, controller):
     """Print the mean reward of fresh episodes, the same for all."""
     env = make_vec_env(ENV, N_EPISODES, seed=1_000_000)
     rewards, _ = evaluate_policy(controller, env, N_EPISODES, return_episode_rewards=True)
-    print(f"{name}: mean reward {np.mean(rewards):.1f}, worst {min(rewards):.0f}", flush=True)
+    print(f"{name}: mean reward {np.mean(rewards):.1f}, worst {np.min(rewards):.0f}", flush=True)
 
 
 parser = argparse.ArgumentParser(

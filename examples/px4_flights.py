@@ -52,7 +52,7 @@ class Module:
         """Return the actions of observations, (n, 18) to (n, 4)."""
         features = observations * self.std + self.mean
         thrusts, _ = self.call(features.astype(np.float32))
-        return self.vehicle.thrust_to_action(thrusts)
+        return self.vehicle.thrust_to_action(thrusts.astype(np.float64))
 
 
 def report(label: str, controller: Any, flights: int, seed: int, **settings: Any) -> None:

@@ -1,7 +1,8 @@
 r"""The picture of docs/agents.md: success and final error over what scenarios of a suite vary.
 
-    sb3-quad evaluate pid geometric itm-robust --suite robustness \
-        --scenario mass constant_force -o FOLDER
+    PYTHONPATH=examples sb3-quad evaluate PID=pid geometric "RL agent=itm-recovery" \
+        itm-robust RAPTOR=raptor:Raptor --suite robustness \
+        --scenario mass constant_force motor_gain delay noise wandering_gusts -o FOLDER
     python examples/robustness_plot.py FOLDER robustness.png
 
 A scenario that varies nothing, or two quantities at once, has no panel.
@@ -19,7 +20,7 @@ from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
-COLUMNS = 3
+COLUMNS = 2
 MARKERS = "osD^vP"
 # m. The axis is logarithmic; smaller errors are drawn there.
 LEAST_ERROR = 1e-3
@@ -32,7 +33,7 @@ def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> N
     """
     (key,) = cells[0].cell
     for number, controller in enumerate(results.controllers):
-        colour = f"C{number}"
+        colour = results.colours[controller.label]
         style: dict[str, Any] = {
             "marker": MARKERS[number % len(MARKERS)],
             "markersize": 5,
@@ -90,7 +91,7 @@ def draw(results: Results) -> Figure:
         )
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(4.2 * columns, 4.4 * rows), dpi=120, layout="constrained")
+    figure = Figure(figsize=(4.2 * columns, 4.3 * rows), dpi=120, layout="constrained")
     places = figure.subfigures(rows, columns, squeeze=False).flat
     for place, (part, cells) in enumerate(zip(places, groups.values(), strict=False)):
         top, bottom = part.subplots(2, 1, sharex=True)

@@ -253,7 +253,7 @@ def test_paths_and_distances_are_the_flights(folder, parts):
         if line.get_label() == "pid"
     )
     assert line.get_xdata()[-1] < 2.0  # a lost flight counts as far away, and ends in a cross
-    assert "x" in [
+    assert "X" in [
         line.get_marker() for line in plot_of(parts, "upside_down", "paths").figure.axes[0].lines
     ]
 

@@ -75,7 +75,7 @@ def test_a_recording_is_the_flight_of_the_environment():
 
 
 def test_a_lost_flight_ends_where_it_was_lost(fall):
-    assert fall.lost == "collision"
+    assert fall.lost == "crashed"
     assert fall.state.position[-1, 2] <= fall.vehicle.collision_radius < fall.state.position[-2, 2]
     assert fall.times[-1] == pytest.approx(
         1.71, abs=0.02

@@ -28,7 +28,7 @@ from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.results import COLOURS
+from sb3_quad.evaluation.results import COLOURS, colours_of
 from sb3_quad.report.plots import STYLE
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
@@ -60,9 +60,10 @@ def plot_recoveries(controllers):
     """Plot tilt and distance from the target over time, with a cross where a flight ends early."""
     n = len(controllers)
     _, axes = plt.subplots(2, n, figsize=(4.2 * n, 4.6), sharex=True, sharey="row")
+    colours = colours_of([*controllers])
     for number, (name, controller) in enumerate(controllers.items()):
         top, bottom = axes[:, number]
-        colour = COLOURS[number]
+        colour = colours[name]
         flights = recorded(controller)
         times = flights["time"]
         _, x, y, _ = np.moveaxis(flights["quaternion"], -1, 0)
@@ -217,9 +218,10 @@ for name, controller in controllers.items():
 # %% tags=["hide-input"]
 figure, axes = plt.subplots(figsize=(6.4, 3))
 times = np.linspace(0, 6, 301)
-for (name, flights), colour in zip(recoveries.items(), COLOURS, strict=False):
+colours = colours_of([*recoveries])
+for name, flights in recoveries.items():
     stable = [(flights.recovery_time <= time).mean() * 100 for time in times]
-    axes.plot(times, stable, color=colour, label=name, linewidth=2)
+    axes.plot(times, stable, color=colours[name], label=name, linewidth=2)
 axes.set(
     xlabel="time since the start (s)",
     ylabel="flights that are stable (%)",

@@ -28,7 +28,7 @@ from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.results import COLOURS
+from sb3_quad.evaluation.results import colours_of
 from sb3_quad.experts.protocol import Expert
 from sb3_quad.report.plots import STYLE
 from sb3_quad.simulation.state import TARGET, QuadcopterState
@@ -85,8 +85,9 @@ def recorded(controller, n=24, seed=7):
 def plot_flights(controllers):
     """Plot distance, speed and tilt over time: the median, and the range of nine flights in ten."""
     _, panels = plt.subplots(1, 3, figsize=(11, 3.2))
-    for number, (name, controller) in enumerate(controllers.items()):
-        colour = COLOURS[number]
+    colours = colours_of([*controllers])
+    for name, controller in controllers.items():
+        colour = colours[name]
         flights = recorded(controller)
         times = flights["time"]
         _, x, y, _ = np.moveaxis(flights["quaternion"], -1, 0)
@@ -231,14 +232,15 @@ def mean_reward(controller):
 
 _, axes = plt.subplots(figsize=(7, 3.2))
 before_and_after = {"before": load_pretrained("itm-imitation"), "after": calm}
-for (name, controller), colour in zip(before_and_after.items(), COLOURS, strict=False):
+colours = colours_of([*before_and_after])
+for name, controller in before_and_after.items():
     flights = recorded(controller, n=EPISODES, seed=1_000_000)
     change = np.square(np.diff(flights["action"], axis=1)).mean(axis=(0, 2))
     print(
         f"{name:6} mean reward {mean_reward(controller):6.2f}, "
         f"mean squared change {np.nanmean(change):.6f}"
     )
-    axes.semilogy(flights["time"][1:], change, color=colour, label=name)
+    axes.semilogy(flights["time"][1:], change, color=colours[name], label=name)
 axes.set(
     xlabel="time (s)",
     ylabel="mean squared change",

@@ -26,7 +26,6 @@ import numpy as np
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
-from sb3_quad.evaluation.results import COLOURS
 from sb3_quad.evaluation.scenarios.load import axis_label, parse_suite
 from sb3_quad.report.plots import STYLE
 
@@ -102,7 +101,8 @@ def plot_grid(results):
     for (top, bottom), cells in zip(axes.T, groups.values(), strict=True):
         (key,) = cells[0].cell
         x = [cell.cell[key] for cell in cells]
-        for controller, colour in zip(results.controllers, COLOURS, strict=False):
+        for controller in results.controllers:
+            colour = results.colours[controller.label]
             success = []
             error = []
             for cell in cells:

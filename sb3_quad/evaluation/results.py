@@ -44,11 +44,29 @@ _AXES = {
 # palette for the colour-blind, without black and yellow, which are hard to see on dark or light
 # paper, and without green, which marks targets. A few are shifted.
 COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8A5A3B", "#7F7F7F")
+# Labels of well-known controllers, a group for each colour in turn.
+NAMED = re.compile(
+    r"""
+    (pid(?:.expert)?) | (geometric(?:.expert)?) | (itm-robust | our.agent.\(itm-robust\))
+    | (rl.agent(?:,.second.half)? | itm-recovery | thesis-recovery) | (any.quadcopter)
+    | (il.agent | imitation.agent | itm-imitation | thesis-imitation) | (raptor | ppo.only.*)
+    """,
+    re.IGNORECASE | re.VERBOSE,
+)
 
 
 def colours_of(names: Sequence[str]) -> dict[str, str]:
-    """Return a colour, ``#rrggbb``, for each name, by its position. They repeat after eight."""
-    return dict(zip(names, cycle(COLOURS), strict=False))
+    """Return a colour, ``#rrggbb``, for each label of a controller.
+
+    A well-known controller has the same one everywhere. The others take what is left, in their
+    order, and share colours where more than eight fly.
+    """
+    colours = dict.fromkeys(names, "")
+    for name in names:
+        if known := NAMED.fullmatch(name):
+            colours[name] = COLOURS[(known.lastindex or 1) - 1]
+    free = cycle([colour for colour in COLOURS if colour not in colours.values()] or COLOURS)
+    return {name: colour or next(free) for name, colour in colours.items()}
 
 
 class ControllerRecord(Frozen):

@@ -68,8 +68,9 @@ def paths_plot(
     """
     count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
     follows = scenario.reference is not None
-    figure = Figure(figsize=(2.0 * WIDTH, 1.2 * HEIGHT), layout="constrained")
-    for axes, (i, j) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
+    # One above the other, so that they can be read on a telephone.
+    figure = Figure(figsize=(WIDTH, 2.2 * HEIGHT), layout="constrained")
+    for axes, (i, j) in zip(figure.subplots(2, 1), ((0, 1), (0, 2)), strict=True):
         axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal")
         axes.set_adjustable("datalim")
         for label, tracks in flights.items():
@@ -90,13 +91,13 @@ def _draw_path(
 ) -> None:
     stride = -(-len(track.position) // LINE_POINTS)
     path = track.position[:, plane]
-    axes.plot(*path[::stride].T, color=colour, label=label, linewidth=1.2)
+    axes.plot(*path[::stride].T, color=colour, label=label, linewidth=1.8)
     if follows:
         axes.plot(*track.target[::stride, plane].T, color=TARGET, label="reference", zorder=1)
     else:
         axes.plot(*track.targets[:, plane].T, "D", color=TARGET, markersize=4, label="target")
     if track.lost:
-        axes.plot(*path[-1], "x", color=colour)
+        axes.plot(*path[-1], "X", color=colour, markersize=9)
     # An arrow where a force begins.
     acts = track.wrench[:, :3].any(axis=1)
     begins = acts & ~np.roll(acts, 1)

@@ -14,7 +14,7 @@ from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import MARKER, Pose
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
-from sb3_quad.evaluation.results import COLOURS
+from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
 from sb3_quad.simulation.checks import per_row
@@ -39,7 +39,7 @@ class Recording:
     # likewise, N m
     wrench: FloatArray
     reward: float  # sum of the rewards
-    lost: str  # how it was lost: "collision", "out of range", or empty
+    lost: str  # how it was lost: "crashed", "out of range", or empty
 
     @cached_property
     def times(self) -> FloatArray:
@@ -183,6 +183,7 @@ def fly_all(
     while left > 0:
         settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
         episode: list[Recording] = []
+        colours = colours_of([*controllers])
         # All controllers fly the same seeds, each with the observations that it was trained on.
         for name, controller in controllers.items():
             own = settings.with_changes(**setting.own.get(name, {}))
@@ -202,7 +203,7 @@ def fly_all(
                     )
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
-                episode.append(log.recording(label, COLOURS[len(episode) % len(COLOURS)], flights))
+                episode.append(log.recording(label, colours[name], flights))
         yield episode
         if n_timesteps is None:
             return
@@ -237,7 +238,7 @@ class _Log(Hook):
         """Return the flight, whose results are the only ones of ``flights``."""
         lost = ""
         if flights.collision[0]:
-            lost = "collision"
+            lost = "crashed"
         elif not flights.survival[0]:
             lost = "out of range"
         return Recording(

@@ -22,14 +22,14 @@ from sb3_quad.envs.rendering.camera import Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.episodes import Recording, outlook
-from sb3_quad.show.labels import side_by_side, with_header
+from sb3_quad.show.labels import mark_lost, side_by_side, with_header
 
 FPS = 25
-HOLD = 1.0  # the last picture stays for that long, s
+HOLD = 0.4  # the last picture stays for that long, s
 # Of the default vehicle, m: the margin around the vehicle, and how much of the way to its target a
 # camera shows.
-MARGIN = 0.9
-AHEAD = 2.5
+MARGIN = 0.6
+AHEAD = 3.0
 PANELS_ABREAST = 3
 LAG = 0.044  # s of flight after which a camera has followed to 1/e of a jump, as of a new target
 WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
@@ -143,13 +143,14 @@ def _panel(
             step = recording.at(seconds)
             scene.place([recording.pose(step)], recording.state.target[[step]])
             picture = Pillow.fromarray(scene.picture(camera, recording.trails(step)))
+            # A lost vehicle stands still from then on, in a picture without colours.
+            if recording.lost and step == recording.state.n - 1:
+                picture = mark_lost(picture, recording.lost, 2 * font_size)
             yield with_header(picture, recording, [_caption(recording, step)], font_size)
 
 
 def _caption(recording: Recording, step: int) -> str:
     seconds = f"{recording.times[step]:5.2f} s"
-    if step == len(recording.times) - 1 and recording.lost:
-        return f"{seconds}   {recording.lost}"
     distance = recording.state.distance[step]
     height = recording.state.position[step, 2]
     caption = f"{seconds}   {distance:.2f} m from target   {height:.1f} m high"

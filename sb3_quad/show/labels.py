@@ -13,6 +13,7 @@ from sb3_quad.show.episodes import Recording
 
 INK = (24, 32, 44)
 PLATE = (255, 255, 255, 205)
+LOST = (190, 20, 20)
 STEP = 1.3  # between lines of text, in font sizes
 SMALLER = 0.88  # font size of the lines below a heading
 GAP = 4  # between pictures side by side, pixels
@@ -43,6 +44,13 @@ def with_header(
         row = (0.35 + number * STEP) * size
         draw.text((column, row), line, font=font(round(SMALLER * size)), fill=INK)
     return image
+
+
+def mark_lost(picture: Pillow.Image, text: str, size: int) -> Pillow.Image:
+    """Return a picture in grey, with a red text of ``size`` pixels in its upper left corner."""
+    grey = picture.convert("L").convert("RGB")
+    ImageDraw.Draw(grey).text((size, size), text, LOST, font(size, "DejaVuSans-Bold"))
+    return grey
 
 
 def side_by_side(pictures: Sequence[Pillow.Image], columns: int) -> Image:

@@ -22,7 +22,9 @@ from sb3_quad.simulation.state import QuadcopterState
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays within that of its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
 LARGEST = 6.0  # how much larger than life it is drawn at most
-APART = 0.8  # between poses in the picture, in the vehicle's drawn breadth
+APART = 0.95  # between poses in the picture, in the vehicle's drawn breadth
+AROUND = np.array([[0, 1, -1, 0], [-1, 0, 0, 1]]).T  # where its time may stand; above it is best
+COVERED = 0.4  # of a pose's drawn breadth: half the breadth that no text is to cover
 
 
 class View(NamedTuple):
@@ -131,16 +133,28 @@ def _explanation(recording: Recording, steps: list[int], view: View) -> list[str
 def draw_times(
     draw: ImageDraw.ImageDraw, recording: Recording, steps: list[int], view: View, size: int
 ) -> None:
-    """Write the time of each pose on a small plate above it, inside the picture.
+    """Write the time of each pose on a small plate beside it, inside the picture, where it covers
+    least; a plate that has no room clear of the others is left out.
 
     :param size: of the font, pixels.
     """
-    places, breadths = view.project(recording.state.position[steps])
-    for step, place, breadth in zip(steps, places, breadths, strict=True):
+    places, breadths = view.project(recording.state.position)
+    # What should not be covered, as boxes: the points of the path, the poses, and then the plates.
+    centres = places
+    halves = np.zeros(places.shape)
+    halves[steps] = COVERED * breadths[steps, None]
+    for step in steps:
         text = f"{recording.times[step]:.2f} s"
         half = 0.5 * np.array([font(size).getlength(text) + 0.7 * size, 1.5 * size])
         # The centre is clipped so that the whole plate is inside the picture.
-        above = place - (0.0, 0.4 * breadth + half[1])
-        centre = np.clip(above, half, view.camera.lens[:2] - half)
+        around = places[step] + AROUND * (halves[step] + half)
+        around = np.clip(around, half, view.camera.lens[:2] - half)
+        covered = (halves + half - abs(centres - around[:, None])).clip(0.0).prod(axis=2)
+        best = covered.sum(axis=1).argmin()
+        if covered[best, len(places) :].any():
+            continue
+        centre = around[best]
+        centres = np.vstack([centres, centre])
+        halves = np.vstack([halves, half])
         draw.rounded_rectangle((*(centre - half), *(centre + half)), 0.3 * size, fill=PLATE)
         draw.text((centre[0], centre[1]), text, font=font(size), fill=INK, anchor="mm")

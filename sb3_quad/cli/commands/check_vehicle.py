@@ -9,7 +9,7 @@ examples:
   sb3-quad check-vehicle crazyflie
   # from the parameters alone, without flying
   sb3-quad check-vehicle my.yaml -n 0
-  # how far it departs from logs of real flights, beside predictions without a model
+  # how far it departs from logs of real flights
   sb3-quad check-vehicle my.yaml --flights logs
 
 Exit code 1: the rotors cannot produce hover thrust. For the contents of a

@@ -189,6 +189,7 @@ export async function readAgent(label, content) {
   }
   if (data.vec_normalize?.norm_obs) throw new Error("it was trained with VecNormalize; sb3-quad demo makes a page of it");
   const settings = data.flight_settings ?? {};
+  if (settings.features && settings.features !== "body") throw new Error(`its features are those of ${settings.features}, which this page does not compute`);
   const { last_action = false, history = null, position_integral = null, preview = null } = settings;
   const size = (history ?? [0]).length * (OBSERVATION_SIZE + (last_action ? 4 : 0)) + 3 * (preview ?? []).length;
   if (!layers.length || layers[0].inputs !== size || layers[layers.length - 1].outputs !== 4) {
