@@ -246,16 +246,16 @@ def one_step_table(logs, vehicle):
         drag = in_body(state.rotation, state.velocity) * vehicle.drag / vehicle.mass
         lift = np.column_stack([-drag[:, :2], wrench[:, 0] / vehicle.mass - drag[:, 2]])
         given.append(np.column_stack([lift, wrench[:, 1:] / vehicle.inertia]))
-    flown = np.concatenate([part[50:] for part in flown])
-    given = np.concatenate([part[50:] for part in given])
+    measured = np.concatenate([part[50:] for part in flown])
+    expected = np.concatenate([part[50:] for part in given])
     names = ["specific force " + axis + ", m/s²" for axis in "xyz"]
     names += ["angular acceleration " + axis + ", rad/s²" for axis in "xyz"]
     rows = []
-    for name, one, other in zip(names, given.T, flown.T, strict=True):
+    for name, one, other in zip(names, expected.T, measured.T, strict=True):
         gap = one - other
         rows.append([name, *(f"{value:.3g}" for value in (other.std(), gap.mean(), gap.std()))])
     heads = ("one step", "flown, std", "residual, mean", "residual, std")
-    return text_table(f"{vehicle.name}: from commands, {len(flown)} steps", heads, rows)
+    return text_table(f"{vehicle.name}: from commands, {len(measured)} steps", heads, rows)
 
 
 def in_body(rotation, vectors):
@@ -266,8 +266,8 @@ def in_body(rotation, vectors):
 def lagged(signal, time_constant, delay, step=STEP):
     """Return a signal, (n, k), behind a delay and a first-order lag, both in s."""
     rows = np.arange(len(signal))
-    late = [np.interp(rows - delay / step, rows, column) for column in signal.T]
-    late = np.stack(late, axis=1)
+    columns = [np.interp(rows - delay / step, rows, column) for column in signal.T]
+    late = np.stack(columns, axis=1)
     share = 1.0 - np.exp(-step / time_constant) if time_constant > 0.0 else 1.0
     result = late.copy()
     for row in range(1, len(late)):
@@ -368,16 +368,18 @@ def step_response(runs, axis):
 def fit_step(response, used=20):
     """Return time constant and delay, ms, and the slope of b (1 - exp(-(t - delay) / τ))."""
     times = 10.0 * np.arange(used)
-    best = None
+    least = np.inf
+    best = (0, 0, 0.0)
     for time_constant in range(10, 140, 2):
         for delay in range(-10, 40, 2):
             after = np.maximum(times - delay, 0.0)
             shape = 1.0 - np.exp(-after / time_constant)
             slope = shape @ response[:used] / (shape @ shape)
             error = np.sum((response[:used] - slope * shape) ** 2)
-            if best is None or error < best[0]:
-                best = (error, time_constant, delay, slope)
-    return best[1:]
+            if error < least:
+                least = error
+                best = (time_constant, delay, slope)
+    return best
 
 
 def resonance(runs, axis, n=256):
@@ -643,7 +645,8 @@ def follow(vehicle, setpoint, begin, kind):
         # Attitude and rates are controlled at 500 Hz, as in the firmware.
         vehicle = fast(vehicle)
     batch = started(vehicle, 1, begin)
-    controller = Cascade(vehicle, 1) if kind == "cascade" else PIDExpert(vehicle)
+    cascade = Cascade(vehicle, 1)
+    expert = PIDExpert(vehicle)
     positions = []
     for target in setpoint:
         batch.fix("target", target[:, None])
@@ -651,10 +654,10 @@ def follow(vehicle, setpoint, begin, kind):
         for _ in range(round(STEP / vehicle.control_step)):
             state = batch.true_state()
             if kind == "cascade":
-                thrusts = controller.thrusts(state, target[None], state.body_rates)
+                thrusts = cascade.thrusts(state, target[None], state.body_rates)
                 actions = vehicle.thrust_to_action(thrusts)
             else:
-                actions = controller.actions(state)
+                actions = expert.actions(state)
             batch.step(actions)
     return np.array(positions)
 
