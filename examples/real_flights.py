@@ -1,31 +1,52 @@
 """Measure a vehicle file with real flights, and find parameters that fit them.
 
     python examples/real_flights.py FOLDER [--vehicle FILE] [--leave-out NAME …] [--control]
+    python examples/real_flights.py FOLDER --write CALIBRATED
 
-FOLDER holds CSV files in the format of NanoBench: docs/vehicles.md lists their columns. What is
-printed, and what came out for eleven flights of a Crazyflie, stands in docs/research/reality.md.
+FOLDER holds CSV files in the format of NanoBench (Ullah and Baca 2026, arXiv 2603.09908): the
+columns that docs/vehicles.md lists, or in place of thrusts the motors' PWM and the battery's
+voltage. Three things are calibrated by the whole flight: the clock of the vehicle's own columns, by
+the shift at which gyro and attitude agree best; how the markers of the motion capture are mounted,
+so that the mean specific force lies along z; and the motors against each other, so that the mean
+commands give no moment. ``--write`` writes the calibrated logs for `sb3-quad check-vehicle
+--flights`. What is printed, and what came out for eleven flights of a Crazyflie, stands in
+docs/research/reality.md.
+
 ``--control`` flies a vehicle of known lag under the firmware's kind of controller instead, and
 shows what the same estimates make of it.
 """
 
 import argparse
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 
 from sb3_quad import PIDExpert, load_vehicle
 from sb3_quad.evaluation.real_flights import (
+    COLUMNS,
+    LEAST_HEIGHT,
+    LONGEST_GAP,
     QUANTITIES,
+    Log,
     error_table,
     errors,
     open_loop,
-    read_logs,
+    turned_on,
 )
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import TORQUE_BODY, QuadcopterState
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    QUATERNION,
+    TORQUE_BODY,
+    VELOCITY,
+    QuadcopterState,
+    rotation_matrices,
+)
 
 STEP = 0.01  # s, of the estimates
 GRAVITY = np.array([0.0, 0.0, 9.81])
@@ -37,6 +58,26 @@ ARM = 0.0325  # m, of a rotor about an axis
 # Past rates and past commands of the model that predicts the next rate.
 PAST = 12
 COMMANDS = 25
+
+
+# Differences of clocks that are tried, s.
+OFFSETS = np.arange(-0.1, 0.1005, 0.001)
+# Thrust of a motor, N, by powers of its voltage from the 0th: crazyflie-firmware 2025.12,
+# platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM / 65,535 of the battery's.
+THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
+FULL_PWM = 65_535.0
+SEEN = COLUMNS[:10]  # by the motion capture
+FELT = COLUMNS[10:13]
+THRUSTS = COLUMNS[13:]
+PWM = ("motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4", "pwr_pm_vbat")
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated(Log):
+    """A calibrated log."""
+
+    columns: dict[str, np.ndarray]  # all columns of the file, (n,), by the clock of the vehicle
+    offset: float  # s, by which the vehicle's clock was behind that of the motion capture
 
 
 @dataclass
@@ -53,6 +94,7 @@ def main():
     parser.add_argument("folder", nargs="?")
     parser.add_argument("--vehicle", default="crazyflie_nanobench", help="name or YAML file")
     parser.add_argument("--leave-out", nargs="*", default=None, help="flights that judge the fit")
+    parser.add_argument("--write", metavar="FOLDER", help="where to write calibrated logs")
     parser.add_argument("--control", action="store_true", help="estimates of simulated flights")
     arguments = parser.parse_args()
     vehicle = load_vehicle(arguments.vehicle)
@@ -61,10 +103,14 @@ def main():
         return
     if arguments.folder is None:
         parser.error("give a folder, or --control")
-    logs = [log for log in read_logs(arguments.folder, STEP) if log.flying.any()]
+    logs = read_flights(arguments.folder)
+    if arguments.write:
+        write(logs, Path(arguments.write))
+        return
+    logs = [log for log in logs if log.flying.any()]
     fitted, judged = split(logs, arguments.leave_out)
-    print("fitted:", ", ".join(log.name for log in fitted))
-    print("judged:", ", ".join(log.name for log in judged))
+    print("fitted:", ", ".join(log.path.stem for log in fitted))
+    print("judged:", ", ".join(log.path.stem for log in judged))
     print("clocks differ by, ms:", ", ".join(f"{1000 * log.offset:.0f}" for log in logs))
     show(one_step_table(judged, vehicle))
     show(error_table(judged, vehicle))
@@ -86,15 +132,78 @@ def show(table):
     Console(width=160).print(table)
 
 
+def read_flights(folder):
+    """Read and calibrate the logs of a folder."""
+    return [calibrated(path) for path in sorted(Path(folder).glob("*.csv"))]
+
+
+def calibrated(path):
+    """Read and calibrate a log, with rows 0.01 s apart."""
+    table = pd.read_csv(path).astype(float)
+    commands = THRUSTS if THRUSTS[0] in table else PWM
+    time = table["t"]
+    grid = np.arange(time.iloc[0], time.iloc[-1], STEP)
+
+    def at(names, behind=0.0):
+        return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
+
+    motion = at(SEEN + FELT)
+    attitude = motion[:, QUATERNION]
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    flying = motion[:, 2] > LEAST_HEIGHT
+    flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
+    # Rᵀ dR/dt has the body rates in three places.
+    rotation = rotation_matrices(attitude)
+    turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, STEP, axis=0))
+    rates = turning[flying][:, [2, 0, 1], [1, 2, 0]]
+    offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind)[flying])))
+    motion[:, BODY_RATES] = at(FELT, offset)
+
+    thrusts = at(commands, offset)
+    if commands is PWM:
+        thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
+    # Some logs are extrapolated after the radio was lost.
+    flying &= np.isfinite(thrusts).all(axis=1)
+    if flying.any():
+        force = np.gradient(motion[:, VELOCITY], STEP, axis=0) + GRAVITY
+        x, y, z = in_body(rotation, force)[flying].mean(axis=0)
+        motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
+        mean = thrusts[flying].mean(axis=0)
+        thrusts *= mean.mean() / mean
+    columns = dict(zip(table, at(table, offset).T, strict=True))
+    return Calibrated(path, motion, thrusts, flying, columns, offset)
+
+
+def motor_thrusts(pwm, battery):
+    """Return the thrusts, N, that the Crazyflie's firmware expects of its commands.
+
+    :param pwm: (n, 4), 0 to 65,535; others and motors that stand become NaN.
+    :param battery: (n, 1), V.
+    """
+    thrusts = np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(pwm / FULL_PWM * battery)
+    return np.where((pwm > 0.0) & (pwm <= FULL_PWM), thrusts, np.nan)
+
+
+def write(logs, folder):
+    """Write calibrated logs, with NaN for commands where they do not fly."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for log in logs:
+        thrusts = np.where(log.flying[:, None], log.thrusts, np.nan)
+        table = pd.DataFrame(np.column_stack([log.motion, thrusts]), columns=COLUMNS)
+        table.insert(0, "t", STEP * np.arange(len(table)))
+        table.to_csv(folder / log.path.name, index=False)
+    print(f"wrote {len(logs)} logs to {folder}")
+
+
 def split(logs, left_out):
     """Return the logs to fit and those to judge: the named ones, or every second."""
     if left_out is None:
         return logs[::2], logs[1::2]
-    judged = [log for log in logs if log.name in left_out]
-    unknown = set(left_out) - {log.name for log in judged}
+    judged = [log for log in logs if log.path.stem in left_out]
+    unknown = set(left_out) - {log.path.stem for log in judged}
     if unknown or not judged:
         raise SystemExit(f"--leave-out {', '.join(unknown)}: no such flights in the air")
-    return [log for log in logs if log.name not in left_out], judged
+    return [log for log in logs if log.path.stem not in left_out], judged
 
 
 def longest_flight(log):
@@ -137,16 +246,16 @@ def one_step_table(logs, vehicle):
         drag = in_body(state.rotation, state.velocity) * vehicle.drag / vehicle.mass
         lift = np.column_stack([-drag[:, :2], wrench[:, 0] / vehicle.mass - drag[:, 2]])
         given.append(np.column_stack([lift, wrench[:, 1:] / vehicle.inertia]))
-    flown = np.concatenate([part[50:] for part in flown])
-    given = np.concatenate([part[50:] for part in given])
+    measured = np.concatenate([part[50:] for part in flown])
+    expected = np.concatenate([part[50:] for part in given])
     names = ["specific force " + axis + ", m/s²" for axis in "xyz"]
     names += ["angular acceleration " + axis + ", rad/s²" for axis in "xyz"]
     rows = []
-    for name, one, other in zip(names, given.T, flown.T, strict=True):
+    for name, one, other in zip(names, expected.T, measured.T, strict=True):
         gap = one - other
         rows.append([name, *(f"{value:.3g}" for value in (other.std(), gap.mean(), gap.std()))])
     heads = ("one step", "flown, std", "residual, mean", "residual, std")
-    return text_table(f"{vehicle.name}: from commands, {len(flown)} steps", heads, rows)
+    return text_table(f"{vehicle.name}: from commands, {len(measured)} steps", heads, rows)
 
 
 def in_body(rotation, vectors):
@@ -157,8 +266,8 @@ def in_body(rotation, vectors):
 def lagged(signal, time_constant, delay, step=STEP):
     """Return a signal, (n, k), behind a delay and a first-order lag, both in s."""
     rows = np.arange(len(signal))
-    late = [np.interp(rows - delay / step, rows, column) for column in signal.T]
-    late = np.stack(late, axis=1)
+    columns = [np.interp(rows - delay / step, rows, column) for column in signal.T]
+    late = np.stack(columns, axis=1)
     share = 1.0 - np.exp(-step / time_constant) if time_constant > 0.0 else 1.0
     result = late.copy()
     for row in range(1, len(late)):
@@ -259,16 +368,18 @@ def step_response(runs, axis):
 def fit_step(response, used=20):
     """Return time constant and delay, ms, and the slope of b (1 - exp(-(t - delay) / τ))."""
     times = 10.0 * np.arange(used)
-    best = None
+    least = np.inf
+    best = (0, 0, 0.0)
     for time_constant in range(10, 140, 2):
         for delay in range(-10, 40, 2):
             after = np.maximum(times - delay, 0.0)
             shape = 1.0 - np.exp(-after / time_constant)
             slope = shape @ response[:used] / (shape @ shape)
             error = np.sum((response[:used] - slope * shape) ** 2)
-            if best is None or error < best[0]:
-                best = (error, time_constant, delay, slope)
-    return best[1:]
+            if error < least:
+                least = error
+                best = (time_constant, delay, slope)
+    return best
 
 
 def resonance(runs, axis, n=256):
@@ -518,7 +629,7 @@ def closed_loop_table(logs, vehicle):
         texts = [f"{off(position, setpoint):.3f}"]
         for kind in ("cascade", "PID"):
             texts.append(f"{off(follow(vehicle, setpoint, position[0], kind), setpoint):.3f}")
-        rows.append([log.name, *texts])
+        rows.append([log.path.stem, *texts])
     heads = ("off the setpoint, rms, m", "flown", "cascade, simulated", "PIDExpert, simulated")
     return text_table(f"{vehicle.name}: closed loop on recorded setpoints", heads, rows)
 
@@ -534,7 +645,8 @@ def follow(vehicle, setpoint, begin, kind):
         # Attitude and rates are controlled at 500 Hz, as in the firmware.
         vehicle = fast(vehicle)
     batch = started(vehicle, 1, begin)
-    controller = Cascade(vehicle, 1) if kind == "cascade" else PIDExpert(vehicle)
+    cascade = Cascade(vehicle, 1)
+    expert = PIDExpert(vehicle)
     positions = []
     for target in setpoint:
         batch.fix("target", target[:, None])
@@ -542,10 +654,10 @@ def follow(vehicle, setpoint, begin, kind):
         for _ in range(round(STEP / vehicle.control_step)):
             state = batch.true_state()
             if kind == "cascade":
-                thrusts = controller.thrusts(state, target[None], state.body_rates)
+                thrusts = cascade.thrusts(state, target[None], state.body_rates)
                 actions = vehicle.thrust_to_action(thrusts)
             else:
-                actions = controller.actions(state)
+                actions = expert.actions(state)
             batch.step(actions)
     return np.array(positions)
 
@@ -611,7 +723,7 @@ def simulated_runs(vehicle, n=10, seconds=30.0, torque=1e-4, noise=0.004, seed=0
         target = curve * [0.8, 0.8, 0.3] + [0.0, 0.0, 1.0]
         gyro = state.body_rates + noise * rng.standard_normal((n, 3))
         commands[now] = controller.thrusts(state, target, gyro)
-        lift = vehicle.thrust_coefficient * (state.rotor_speeds**2).sum(axis=1) / vehicle.mass
+        lift = vehicle.lift * (state.rotor_speeds**2).sum(axis=1) / vehicle.mass
         response[now] = np.column_stack([gyro, lift])
         fresh = torque * rng.standard_normal((n, 3)) * [1.0, 1.0, 0.2]
         push = keep * push + np.sqrt(1.0 - keep**2) * fresh

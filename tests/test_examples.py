@@ -36,11 +36,16 @@ def run(tmp_path, monkeypatch, capsys):
 
 
 def test_every_script_is_run_and_says_how_it_is_started():
-    names = ("test_examples.py", "test_real_flights.py")
+    names = ("test_examples.py", "test_px4.py", "test_real_flights.py")
     tests = "".join((Path(__file__).parent / name).read_text("utf-8") for name in names)
     for path in EXAMPLES.glob("*.py"):
-        assert f'"{path.name}"' in tests
+        assert f'"{path.stem}' in tests
         assert f"python examples/{path.name}" in path.read_text(encoding="utf-8")
+
+
+def test_a_battery_leaves_less_of_the_largest_thrust(run):
+    output = run("firmware.py", "volts")
+    assert "brushless, at most 0.2 N a rotor" in output and "3.00 V: largest" in output
 
 
 def shares(output):

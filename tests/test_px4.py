@@ -182,12 +182,14 @@ def test_the_printed_parameters_turn_actions_into_the_thrusts_of_the_vehicle(age
     np.testing.assert_allclose(X500.thrust_coefficient * speed**2, expected, atol=5e-3)
 
 
-def test_slow_motors_keep_their_shares_within_px4s_largest_coefficient(tmp_path):
+@pytest.mark.parametrize("lift", [5e-5, 0.0])
+def test_slow_and_unknown_motors_keep_their_shares(tmp_path, lift):
     pytest.importorskip("tflite_micro")
-    slow = X500.model_copy(update={"name": "slow", "thrust_coefficient": 5e-5})
+    slow = X500.model_copy(update={"name": "slow", "thrust_coefficient": lift})
     path = save(tmp_path / "slow.zip", {"vehicle": slow})
     parameters = parameters_of(export_policy(path, "px4", n_observations=100))
-    assert parameters["MC_NN_THRST_COEF"] == 5.0
+    # The largest that PX4 takes
+    assert parameters["MC_NN_THRST_COEF"] <= 5.0
     share = outputs(commands(np.array([-1.0, 0.0, 1.0]), parameters), 0.8)
     np.testing.assert_allclose(share, [0.0, np.sqrt(0.5), 1.0], atol=1e-3)
 
@@ -255,7 +257,7 @@ REFUSED = {
     "body": ({"features": "body"}, {}, {}, "--env-kwargs features:px4"),
     "itm": ({"vehicle": "itm"}, {}, {}, "rotor_thrust_limits from 0"),
     "plus": ({"vehicle": "plus"}, {}, {}, "needs a rotor in each corner"),
-    "speeds": ({}, {}, {"output": "speeds"}, "export without --output"),
+    "speeds": ({}, {}, {"output": "speeds"}, "the firmware takes thrusts; remove --output"),
     "large": ({}, {"net_arch": [4000]}, {}, "needs more than 10240 bytes; train smaller layers"),
 }
 

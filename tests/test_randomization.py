@@ -272,6 +272,10 @@ def test_the_base_vehicle_says_what_a_distribution_does_not():
     )
     np.testing.assert_allclose(one.rotor_positions, np.cbrt(2.0) * np.array(base.rotor_positions))
     np.testing.assert_allclose(one.hover_rotor_speed, base.hover_rotor_speed)
+    unknown = base.model_copy(update={"thrust_coefficient": 0.0})
+    (one,) = sample_vehicles({**ranges, "moment_thrust_ratio": 0.02}, 1, vehicle=unknown)
+    assert one.thrust_coefficient == 0.0
+    np.testing.assert_allclose(one.hover_rotor_speed, 1000.0)
 
 
 def test_a_distribution_goes_with_an_agent_and_a_vehicle_replaces_it():

@@ -171,3 +171,9 @@ def test_what_it_cannot_hold_stays_in_a_zip(tmp_path):
         model.save(tmp_path / f"{number}.zip")
         with pytest.raises(ConfigError, match="has normalize or use_sde; only its zip holds these"):
             export_policy(tmp_path / f"{number}.zip", "safetensors")
+
+
+@pytest.mark.parametrize("changes", [{"output": "speeds"}, {"vehicle": "crazyflie"}])
+def test_it_is_the_agent_as_it_is(zips, changes):
+    with pytest.raises(ConfigError, match="remove --output and --vehicle"):
+        export_policy(zips / "ppo.zip", "safetensors", **changes)

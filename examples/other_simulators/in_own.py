@@ -58,7 +58,7 @@ class Own:
 
     def thrusts(self, speeds: Array) -> Array:
         low, high = self._vehicle.rotor_speed_range
-        return np.asarray(self._vehicle.thrust_coefficient * (low + (high - low) * speeds) ** 2)
+        return np.asarray(self._vehicle.lift * (low + (high - low) * speeds) ** 2)
 
 
 CELLS = {

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch as th
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool1d, pad
 
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.state import STATE
@@ -124,7 +124,6 @@ def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
     acceleration = flown.velocity.diff(dim=0) / (GRAVITY * control_step)
     # What each force lacks of 1 g; nothing is known of the first one.
     lack = 1.0 - flown.r33[1:] - (acceleration * up[1:]).sum(dim=-1)
-    sums = pad(lack, (0, 0, 1, 0)).cumsum(dim=0)
     window = round(WINDOW / control_step)
-    mean = (sums - pad(sums, (0, 0, window, 0))[: len(sums)]) / window
+    mean = avg_pool1d(pad(lack, (0, 0, window, 0)).T, window, 1).T
     return (mean - LACK).clamp(min=0.0).square()

@@ -26,13 +26,17 @@ def write_tensors(model: Any, data: StrDict) -> bytes:
     :raises ConfigError: safetensors is not installed.
     """
     safetensors = require("safetensors.torch", "export", "--format safetensors")
-    plain = {"observation_size": model.observation_space.shape[0]}
-    for key, value in data.items():
-        if not (isinstance(value, dict) and ":serialized:" in value):
-            plain[key] = value
-    # The module of its class tells the algorithm's family.
-    plain["policy_class"] = {"__module__": type(model.policy).__module__}
-    plain["policy_kwargs"] = model.policy_kwargs
+    plain = {
+        key: value
+        for key, value in data.items()
+        if not (isinstance(value, dict) and ":serialized:" in value)
+    }
+    plain |= {
+        "observation_size": model.observation_space.shape[0],
+        # The module of its class tells the algorithm's family.
+        "policy_class": {"__module__": type(model.policy).__module__},
+        "policy_kwargs": model.policy_kwargs,
+    }
     text = json.dumps(plain, default=_class_name)
     return bytes(safetensors.save(model.policy.state_dict(), {"sb3_quad": text}))
 

@@ -100,10 +100,7 @@ def summarise(flights: Flights) -> Metrics:
     """Return the metrics of some flights, at least one."""
     survived = flights.survival
     error = flights.final_error[survived]
-    cut = None
-    supervised = np.isfinite(flights.low_force_time)
-    if supervised.any():
-        cut = share(flights.cut_by_supervisor[supervised])
+    cut = flights.cut_by_supervisor[np.isfinite(flights.low_force_time)]
     course = None
     if flights.waypoint_times.shape[1] > 0:
         reached = np.isfinite(flights.waypoint_times)
@@ -130,7 +127,7 @@ def summarise(flights: Flights) -> Metrics:
         recovery_time=_moment(flights.recovery_time),
         cross_track_error=mean(flights.cross_track_error[survived]),
         **{name: mean(getattr(flights, name)) for name in FOLLOWED},
-        cut_by_supervisor=cut,
+        cut_by_supervisor=share(cut) if cut.size else None,
         low_force_time=_one(flights.low_force_time, np.max),
         course=course,
     )

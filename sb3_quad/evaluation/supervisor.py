@@ -56,7 +56,7 @@ class Supervisor:
         self._steps += 1.0
         self._steps *= (along_z < LOW) & ~falls & flying & self._watched
         time = self._steps * self._control_step
-        np.maximum(self.longest, time, out=self.longest)
+        self.longest = np.maximum(self.longest, time)
         # A sum of control steps is a round number only up to rounding.
         allowed = np.where(along_z < UPSIDE_DOWN, UPSIDE_DOWN_TIME, LOW_TIME) + 1e-9
         self.cut |= time > allowed

@@ -9,22 +9,6 @@ from sb3_quad.export.network import Network
 PER_MULTIPLICATION = 4.36
 PER_UNIT = {"tanh": 104.0, "relu": 12.0, "none": 0.0}
 PER_CALL = 2365.0
-KB = 1024
-
-
-class Chip(NamedTuple):
-    """A flight controller's microcontroller."""
-
-    name: str
-    flash: int  # kB
-    clock: int  # MHz
-
-
-CHIPS = (
-    Chip("STM32F405 (Cortex-M4)", 1024, 168),
-    Chip("STM32F722 (Cortex-M7)", 512, 216),
-    Chip("STM32H743 (Cortex-M7)", 2048, 480),
-)
 
 
 class Cost(NamedTuple):
@@ -35,25 +19,6 @@ class Cost(NamedTuple):
     stack: int  # bytes
     multiplications: int
     instructions: float
-
-    def describe(self, period: float) -> str:
-        """Return a line for the users of a header that is called every ``period`` seconds."""
-        text = (
-            f"{self.flash:,} bytes of flash, {self.ram:,} of RAM, {self.stack:,} of stack; "
-            f"{self.multiplications:,} multiplications and about "
-            f"{self.instructions / 1000:,.0f} thousand instructions a call, "
-            "by one instruction a cycle:"
-        )
-        for chip in CHIPS:
-            seconds = self.instructions / (1e6 * chip.clock)
-            flash = self.flash / (KB * chip.flash)
-            # The other programs of a flight controller need the rest.
-            fits = "fits" if max(flash, seconds / period) < 1.0 else "does not fit"
-            text += (
-                f" {fits} {chip.name}: {1000 * seconds:.2f} ms at {chip.clock} MHz, "
-                f"{100 * flash:.0f} % of {chip.flash:,} kB;"
-            )
-        return text.rstrip(";")
 
 
 def cost_of(network: Network) -> Cost:

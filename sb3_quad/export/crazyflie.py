@@ -28,77 +28,62 @@ PLATFORMS = {
 }
 
 
-def slices_of(network: Network, reference: Reference) -> tuple[int, int]:
-    """Return the firmware's calls in a control step, and over how many of them a policy spreads.
+def plan_app(network: Network, reference: Reference) -> StrDict:
+    """Return what the templates need besides names.
 
-    :raises ConfigError: a policy that is too slow, or whose control step is not a number of calls.
+    :param reference: its vehicle's rotors are M1 to M4 of the firmware.
+    :raises ConfigError: thrusts that no platform gives; a policy that is too slow, or whose control
+        step is not a number of calls.
     """
-    instructions = cost_of(network).instructions
-    step = reference.vehicle.control_step
+    vehicle = reference.vehicle
+    high = vehicle.thrust_range[1]
+    able = [item for item in PLATFORMS.items() if high <= item[1][1] * (1.0 + 1e-4)]
+    if not able:
+        raise ConfigError(
+            f"vehicle {vehicle.name}: up to {high:.4g} N a rotor, more than any Crazyflie"
+            " gives; say with --vehicle which one is to fly, such as crazyflie"
+        )
+    cost = cost_of(network)
+    step = vehicle.control_step
     period = round(step / CALL)
     if not math.isclose(period * CALL, step):
         raise ConfigError(
             f"control_step {step:g} s: the Crazyflie's firmware calls every {CALL:g} s; "
             "train with a multiple of that"
         )
-    if instructions > MOST * CYCLES * period:
+    # In calls of the firmware
+    time = cost.instructions / CYCLES
+    if time > MOST * period:
         raise ConfigError(
-            f"the network takes {instructions / CYCLES:.1f} ms on the Crazyflie's chip, more than "
+            f"the network takes {time:.1f} ms on the Crazyflie's chip, more than "
             f"half of the {1000 * step:g} ms between calls; train one with a smaller net_arch"
         )
-    return period, min(math.ceil(instructions / (SHARE * CYCLES)), period)
-
-
-def describe_app(network: Network, reference: Reference) -> str:
-    """Return how the app flies, and which platforms can give the vehicle's thrusts.
-
-    :raises ConfigError: none can; or see :func:`slices_of`.
-    """
-    low, high = reference.vehicle.thrust_range
-    able = []
-    for name, (least, greatest) in PLATFORMS.items():
-        if high <= greatest * (1.0 + 1e-4):
-            raised = f", less than {least:g} N is raised to it" if low < 0.99 * least else ""
-            able.append(f"{name} (THRUST_MAX {greatest:g} N{raised})")
-    if not able:
-        raise ConfigError(
-            f"vehicle {reference.vehicle.name}: up to {high:.4g} N a rotor, more than any Crazyflie"
-            " gives; say with --vehicle which one is to fly, such as crazyflie"
-        )
-    period, slices = slices_of(network, reference)
-    return (
-        f"{low:.4g} to {high:.4g} N a rotor, for {' or '.join(able)}; "
-        f"observes in every {period}th call of the firmware, computes in {slices} of them"
-    )
-
-
-def write_app(
-    network: Network, metadata: StrDict, name: str, reference: Reference
-) -> dict[str, bytes]:
-    """Return the files of the folder, by their paths in it, without ``src/policy.h``.
-
-    :param name: beginning of the header's identifiers.
-    :param reference: its vehicle's rotors are M1 to M4 of the firmware.
-    :raises ConfigError: see :func:`slices_of`.
-    """
-    period, slices = slices_of(network, reference)
-    content: StrDict = {
-        "name": name,
+    slices = min(math.ceil(time / SHARE), period)
+    # A row's products stay together, so that a slice may end a row early.
+    longest_row = max(layer["inputs"] for layer in network.shapes)
+    return {
         "network": network,
-        "metadata": metadata,
         "period": period,
         "slices": slices,
-        # A row's products stay together, so that a slice may end a row early.
-        "share": math.ceil(cost_of(network).multiplications / slices)
-        + max(layer["inputs"] for layer in network.shapes),
-        "highest": reference.vehicle.thrust_range[1],
+        "share": math.ceil(cost.multiplications / slices) + longest_row,
+        "highest": high,
         "angle": reference.turn.angle,
         "inputs": network.mean.numel(),
         "features": OBSERVATION_SIZE,
         "F": F,
+        "able": able,
     }
+
+
+def write_app(plan: StrDict, metadata: StrDict, name: str) -> dict[str, bytes]:
+    """Return the files of the folder, by their paths in it, without ``src/policy.h``.
+
+    :param plan: of :func:`plan_app`.
+    :param name: beginning of the header's identifiers.
+    """
     files = {}
     for path in FILES:
         template = f"crazyflie.{path.replace('/', '.')}.j2"
-        files[path] = render("sb3_quad.export", template, **content).encode()
+        text = render("sb3_quad.export", template, name=name, metadata=metadata, **plan)
+        files[path] = text.encode()
     return files

@@ -20,7 +20,7 @@ from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.cost import cost_of
-from sb3_quad.export.crazyflie import describe_app, write_app
+from sb3_quad.export.crazyflie import plan_app, write_app
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.export.px4 import load_px4, motor_order, write_px4
 from sb3_quad.simulation.observation import FEATURES, GROUPS
@@ -89,16 +89,16 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     refuse_unknown("format", [file_format], FORMATS)
+    if file_format == "safetensors":
+        return _agent_itself(path, output, vehicle)
     is_app = file_format == "crazyflie"
-    if is_app and output != "thrusts":
-        raise ConfigError("--format crazyflie: the firmware takes thrusts; remove --output")
+    if file_format in FOLDERS and output != "thrusts":
+        raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     settings, source = agent_settings(path)
-    given = settings
-    if vehicle is not None:
-        given = settings.with_changes(vehicle=vehicle)
-    if given.vehicles is not None and file_format != "safetensors":
+    given = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
+    if given.vehicles is not None:
         raise ConfigError(
             f"model {path}: flies any vehicle; "
             "say with --vehicle which one's thrusts the file is to give"
@@ -113,28 +113,16 @@ def export_policy(
     formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
-        "c": header,
-        "crazyflie": header,
         "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
     }
-    features = "px4" if file_format == "px4" else "body"
-    if file_format == "safetensors":
-        features = settings.features
-    network = build_network(reference, f"model {path}", features)
-    if file_format == "safetensors":
-        if reference.clip or model.use_sde:
-            raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
-        data = saved_data(path)
-        if source is not None:
-            settings.write_into(model)
-            data[KEY] = getattr(model, KEY)
-        return Export(write_tensors(model, data), {}, 0.0, network.unit, source, None)
-    metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown)
-    write, read = formats[file_format]
+    network = build_network(reference, f"model {path}", "px4" if file_format == "px4" else "body")
+    write, read = formats.get(file_format, header)
+    facts: StrDict = {}
     if write is header[0]:
-        metadata["cost"] = cost_of(network).describe(flown.control_step)
+        facts["cost"] = cost_of(network)
     if is_app:
-        metadata["app"] = describe_app(network, reference)
+        facts["plan"] = plan_app(network, reference)
+    metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown, facts)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
@@ -149,7 +137,7 @@ def export_policy(
         content = write(network, metadata)
     files = None
     if is_app:
-        files = {FOLDERS[file_format]: content, **write_app(network, metadata, prefix, reference)}
+        files = {FOLDERS[file_format]: content, **write_app(facts["plan"], metadata, prefix)}
     if file_format == "px4":
         files = {FOLDERS[file_format]: content}
         for name in ("control_net.cpp", "control_net.hpp", "px4.params"):
@@ -159,8 +147,32 @@ def export_policy(
     return Export(content, metadata, error, network.unit, source, files)
 
 
+def _agent_itself(path: StrPath, output: str, vehicle: VehicleSource | None) -> Export:
+    """Make a safetensors file of a zip."""
+    if output != "thrusts" or vehicle is not None:
+        raise ConfigError(
+            "--format safetensors: is the agent as it is; remove --output and --vehicle"
+        )
+    model = load_model(path)
+    settings, source = agent_settings(path)
+    reference = Reference(model, settings, first_vehicle(settings.vehicle))
+    network = build_network(reference, f"model {path}", settings.features)
+    if reference.clip or model.use_sde:
+        raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
+    data = saved_data(path)
+    if source is not None:
+        settings.write_into(model)
+        data[KEY] = getattr(model, KEY)
+    return Export(write_tensors(model, data), {}, 0.0, network.unit, source, None)
+
+
 def _describe(
-    path: Path, algorithm: str, network: Network, reference: Reference, vehicle: Vehicle
+    path: Path,
+    algorithm: str,
+    network: Network,
+    reference: Reference,
+    vehicle: Vehicle,
+    facts: StrDict,
 ) -> StrDict:
     """Return what users of the file must know; ASCII but for names."""
     text = render(
@@ -177,6 +189,7 @@ def _describe(
         motors=motor_order(vehicle) if network.observation.features == "px4" else [],
         n_parameters=parameters_to_vector(network.parameters()).numel(),
         needs=network.observation.model_dump(mode="json", exclude={"preview"}),
+        **facts,
     )
     # The name of a file may hold anything, also the end of a line.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -16,6 +16,7 @@ from sb3_quad.export.check import Reference
 from sb3_quad.export.load import Call
 from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import GROUPS, F
+from sb3_quad.vehicles.layout import ORDERS
 from sb3_quad.vehicles.vehicle import Vehicle
 
 ARENA = 10 * 1024  # bytes that the module gives the interpreter
@@ -29,8 +30,6 @@ SHOWN = np.r_[
     GROUPS["body_rates"],
 ]
 SIGNS = np.repeat([-1.0, 1.0], [3, 12]).astype(np.float32)
-# Motors 1 to 4 of PX4's quadcopter X: the signs of x (forward) and y (left)
-CORNERS = [[1, -1], [-1, 1], [1, 1], [-1, -1]]
 
 
 def write_px4(network: Network, metadata: StrDict, reference: Reference) -> bytes:
@@ -124,8 +123,9 @@ def _check(network: Network, reference: Reference) -> None:
         "takes -1 for no thrust: give the vehicle rotor_thrust_limits from 0, and train for it": (
             reference.vehicle.thrust_range[0] > 0.0
         ),
-        "takes actions as they are: train without normalize and a turned rotor_layout, and export"
-        " without --output": reference.clip or reference.turn.angle or network.output != "thrusts",
+        "takes actions as they are: train without normalize and a turned rotor_layout": (
+            reference.clip or reference.turn.angle
+        ),
     }
     for refusal, holds in refusals.items():
         if holds:
@@ -138,10 +138,11 @@ def motor_order(vehicle: Vehicle) -> list[int]:
     :raises ConfigError: not one rotor in each corner.
     """
     corners = np.sign(vehicle.rotor_positions).tolist()
+    order = np.array(ORDERS["px4"]).tolist()
     with raised_as(
         ConfigError, f"--format px4: vehicle {vehicle.name}: needs a rotor in each corner"
     ):
-        return [corners.index(corner) for corner in CORNERS]
+        return [corners.index(corner) for corner in order]
 
 
 def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, str]:
@@ -162,6 +163,6 @@ def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, s
             interpreter.set_input(shown[None], 0)
             interpreter.invoke()
             actions[row, motors] = interpreter.get_output(0)[0]
-        return vehicle.action_to_thrust(actions.clip(-1.0, 1.0)), state
+        return vehicle.action_to_thrust(actions), state
 
     return call, "tflite-micro"

@@ -174,9 +174,8 @@ class QuadcopterState:
 
     def rows(self, rows: slice) -> "QuadcopterState":
         """Return some of the vehicles, as views."""
-        others = []
-        for array in (self.vehicles, self.wrench):
-            others.append(None if array is None else array[:, rows])
+        known = (self.vehicles, self.wrench)
+        others = [None if array is None else array[:, rows] for array in known]
         return QuadcopterState(self.array[:, rows], *others)
 
     @staticmethod

@@ -36,29 +36,6 @@ SLIM_THRUST = 1.2
 FASTEST_HOVER = 95_000.0
 # rpm per rad/s.
 RPM = 60.0 / (2.0 * math.pi)
-PARAMETERS = """\
-can hover | yes: thrust-to-weight ratio {v.thrust_limits[1]:.2f}, least {v.thrust_limits[0]:.2f}
-mass, weight | {v.mass:g} kg, {weight:.4g} N
-rotor thrust | {v.thrust_range[0]:.4g} to {v.thrust_range[1]:.4g} N, \
-hover {v.hover_thrust:.4g} N (action {action:+g})
-in hover | {shares} of that by the rotors
-rotor speed | {speeds[0]:.0f} to {speeds[1]:.0f} rad/s, hover {speeds[2]:.0f} rad/s \
-({rpm[0]:.0f} to {rpm[1]:.0f} rpm, hover {rpm[2]:.0f} rpm){unknown}
-acceleration | up {up:.1f}, down while level {down:.1f}, \
-horizontal at constant height {horizontal:.1f} m/s²
-greatest moments | {v.greatest_moments[0]:.4g}, {v.greatest_moments[1]:.4g}, \
-{v.greatest_moments[2]:.4g} N m about roll, pitch and yaw
- | which accelerate it by {turning[0]:.1f}, {turning[1]:.1f}, {turning[2]:.1f} rad/s²
-inertia | {v.inertia[0]:.4g}, {v.inertia[1]:.4g}, {v.inertia[2]:.4g} kg m²
- | {physical}: the largest moment is {v.largest_moment:.2f} of the other two together, \
-at most 1 (triangle inequality)
- | radii of gyration {v.gyration_ratios[0]:.2f}, {v.gyration_ratios[1]:.2f}, \
-{v.gyration_ratios[2]:.2f} of the rotors' distance from the centre
-motors | time constant {motor_up:.1f} ms up, {motor_down:.1f} ms down; \
-from command to thrust {lag:.1f} ms
-"""
-"""The lines of the table, of a vehicle ``v``."""
-
 
 FLAGS: Flags = {
     "vehicle VEHICLE": "name or YAML file",
@@ -127,35 +104,11 @@ def run(options: Namespace) -> int:
 
 def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     """Return the lines of the table: names and values."""
-    import numpy as np
-
+    from sb3_quad.base.templates import render
     from sb3_quad.experts.geometric_gains import command_lag
 
-    least, most = vehicle.thrust_limits
-    shares = vehicle.hover_shares
-    # Without a moment, the rotor that gives most or least in hover is the first at its limit.
-    most /= shares.max()
-    least /= shares.min()
-    speeds = np.array([*vehicle.rotor_speed_range, vehicle.hover_rotor_speed])
-    text = PARAMETERS.format(
-        v=vehicle,
-        weight=vehicle.mass * vehicle.gravity,
-        # Adding 0.0 turns a negative zero into one without a sign.
-        action=round(vehicle.hover_action.mean(), 3) + 0.0,
-        shares=shares.round(3).tolist(),
-        unknown="" if vehicle.thrust_coefficient else "; kF unknown: 1,000 rad/s stands for hover",
-        speeds=speeds,
-        rpm=speeds * RPM,
-        up=vehicle.gravity * (most - 1.0),
-        down=vehicle.gravity * (1.0 - least),
-        # The vertical part of full thrust holds the weight.
-        horizontal=vehicle.gravity * math.sqrt(most**2 - 1.0),
-        turning=vehicle.greatest_moments / vehicle.inertia,
-        physical="unphysical" if vehicle.inertia_fault else "physical",
-        motor_up=1000.0 / vehicle.motor_gain_up,
-        motor_down=1000.0 / vehicle.motor_gain_down,
-        lag=1000.0 * command_lag(vehicle.parameters(), vehicle.control_step),
-    )
+    lag = 1000.0 * command_lag(vehicle.parameters(), vehicle.control_step)
+    text = render("sb3_quad.cli.commands", "check_vehicle.j2", v=vehicle, rpm=RPM, lag=lag)
     return [line.split(" | ") for line in text.splitlines()]
 
 
