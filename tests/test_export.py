@@ -338,7 +338,7 @@ def test_the_run_folder_gives_vehicle_and_scaling(zips, tmp_path):
     (run_folder / "Env-v0").mkdir(parents=True)
     path = run_folder / "agent.zip"
     path.write_bytes((zips / "tanh.zip").read_bytes())
-    (tmp_path / "light.yaml").write_text("\n".join(f"{k}: {v}" for k, v in light().items()))
+    (tmp_path / "light.yaml").write_text(json.dumps(light()))
     given = {
         "vehicle": str(tmp_path / "light.yaml"),
         "observation_mean": [0.5] * 18,
