@@ -1,24 +1,15 @@
 """Measure a vehicle file with real flights, and find parameters that fit them.
 
     python examples/real_flights.py FOLDER [--vehicle FILE] [--leave-out NAME …] [--control]
-    python examples/real_flights.py FOLDER --write CALIBRATED
 
-FOLDER holds CSV files in the format of NanoBench (Ullah and Baca 2026, arXiv 2603.09908): the
-columns that docs/vehicles.md lists, or in place of thrusts the motors' PWM and the battery's
-voltage. Three things are calibrated by the whole flight: the clock of the vehicle's own columns, by
-the shift at which gyro and attitude agree best; how the markers of the motion capture are mounted,
-so that the mean specific force lies along z; and the motors against each other, so that the mean
-commands give no moment. ``--write`` writes the calibrated logs for `sb3-quad check-vehicle
---flights`. What is printed, and what came out for eleven flights of a Crazyflie, stands in
-docs/research/reality.md.
-
+FOLDER holds CSV files in the format of NanoBench: docs/vehicles.md lists their columns. What is
+printed, and what came out for eleven flights of a Crazyflie, stands in docs/research/reality.md.
 ``--control`` flies a vehicle of known lag under the firmware's kind of controller instead, and
 shows what the same estimates make of it.
 """
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -26,27 +17,16 @@ from rich.console import Console
 
 from sb3_quad import PIDExpert, load_vehicle
 from sb3_quad.evaluation.real_flights import (
-    COLUMNS,
-    LEAST_HEIGHT,
-    LONGEST_GAP,
     QUANTITIES,
-    Log,
     error_table,
     errors,
     open_loop,
-    turned_on,
+    read_logs,
 )
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import (
-    BODY_RATES,
-    QUATERNION,
-    TORQUE_BODY,
-    VELOCITY,
-    QuadcopterState,
-    rotation_matrices,
-)
+from sb3_quad.simulation.state import TORQUE_BODY, QuadcopterState
 
 STEP = 0.01  # s, of the estimates
 GRAVITY = np.array([0.0, 0.0, 9.81])
@@ -58,26 +38,6 @@ ARM = 0.0325  # m, of a rotor about an axis
 # Past rates and past commands of the model that predicts the next rate.
 PAST = 12
 COMMANDS = 25
-
-
-# Differences of clocks that are tried, s.
-OFFSETS = np.arange(-0.1, 0.1005, 0.001)
-# Thrust of a motor, N, by powers of its voltage from the 0th: crazyflie-firmware 2025.12,
-# platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM / 65,535 of the battery's.
-THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
-FULL_PWM = 65_535.0
-SEEN = COLUMNS[:10]  # by the motion capture
-FELT = COLUMNS[10:13]
-THRUSTS = COLUMNS[13:]
-PWM = ("motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4", "pwr_pm_vbat")
-
-
-@dataclass(frozen=True, eq=False)
-class Calibrated(Log):
-    """A calibrated log."""
-
-    columns: dict[str, np.ndarray]  # all columns of the file, (n,), by the clock of the vehicle
-    offset: float  # s, by which the vehicle's clock was behind that of the motion capture
 
 
 @dataclass
@@ -94,7 +54,6 @@ def main():
     parser.add_argument("folder", nargs="?")
     parser.add_argument("--vehicle", default="crazyflie_nanobench", help="name or YAML file")
     parser.add_argument("--leave-out", nargs="*", default=None, help="flights that judge the fit")
-    parser.add_argument("--write", metavar="FOLDER", help="where to write calibrated logs")
     parser.add_argument("--control", action="store_true", help="estimates of simulated flights")
     arguments = parser.parse_args()
     vehicle = load_vehicle(arguments.vehicle)
@@ -103,11 +62,7 @@ def main():
         return
     if arguments.folder is None:
         parser.error("give a folder, or --control")
-    logs = read_flights(arguments.folder)
-    if arguments.write:
-        write(logs, Path(arguments.write))
-        return
-    logs = [log for log in logs if log.flying.any()]
+    logs = [log for log in read_logs(arguments.folder, STEP) if log.flying.any()]
     fitted, judged = split(logs, arguments.leave_out)
     print("fitted:", ", ".join(log.path.stem for log in fitted))
     print("judged:", ", ".join(log.path.stem for log in judged))
@@ -130,69 +85,6 @@ def main():
 def show(table):
     """Print a table as wide as it is."""
     Console(width=160).print(table)
-
-
-def read_flights(folder):
-    """Read and calibrate the logs of a folder."""
-    return [calibrated(path) for path in sorted(Path(folder).glob("*.csv"))]
-
-
-def calibrated(path):
-    """Read and calibrate a log, with rows 0.01 s apart."""
-    table = pd.read_csv(path).astype(float)
-    commands = THRUSTS if THRUSTS[0] in table else PWM
-    time = table["t"]
-    grid = np.arange(time.iloc[0], time.iloc[-1], STEP)
-
-    def at(names, behind=0.0):
-        return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
-
-    motion = at(SEEN + FELT)
-    attitude = motion[:, QUATERNION]
-    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
-    flying = motion[:, 2] > LEAST_HEIGHT
-    flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
-    # Rᵀ dR/dt has the body rates in three places.
-    rotation = rotation_matrices(attitude)
-    turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, STEP, axis=0))
-    rates = turning[flying][:, [2, 0, 1], [1, 2, 0]]
-    offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind)[flying])))
-    motion[:, BODY_RATES] = at(FELT, offset)
-
-    thrusts = at(commands, offset)
-    if commands is PWM:
-        thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
-    # Some logs are extrapolated after the radio was lost.
-    flying &= np.isfinite(thrusts).all(axis=1)
-    if flying.any():
-        force = np.gradient(motion[:, VELOCITY], STEP, axis=0) + GRAVITY
-        x, y, z = in_body(rotation, force)[flying].mean(axis=0)
-        motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
-        mean = thrusts[flying].mean(axis=0)
-        thrusts *= mean.mean() / mean
-    columns = dict(zip(table, at(table, offset).T, strict=True))
-    return Calibrated(path, motion, thrusts, flying, columns, offset)
-
-
-def motor_thrusts(pwm, battery):
-    """Return the thrusts, N, that the Crazyflie's firmware expects of its commands.
-
-    :param pwm: (n, 4), 0 to 65,535; others and motors that stand become NaN.
-    :param battery: (n, 1), V.
-    """
-    thrusts = np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(pwm / FULL_PWM * battery)
-    return np.where((pwm > 0.0) & (pwm <= FULL_PWM), thrusts, np.nan)
-
-
-def write(logs, folder):
-    """Write calibrated logs, with NaN for commands where they do not fly."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for log in logs:
-        thrusts = np.where(log.flying[:, None], log.thrusts, np.nan)
-        table = pd.DataFrame(np.column_stack([log.motion, thrusts]), columns=COLUMNS)
-        table.insert(0, "t", STEP * np.arange(len(table)))
-        table.to_csv(folder / log.path.name, index=False)
-    print(f"wrote {len(logs)} logs to {folder}")
 
 
 def split(logs, left_out):
@@ -219,10 +111,17 @@ def state_of(motion):
     return QuadcopterState(motion.T)
 
 
+def columns_of(log, names):
+    """Return further columns of a log's file, (n, names), by the clock of the vehicle."""
+    table = pd.read_csv(log.path)
+    grid = table["t"].iloc[0] + STEP * np.arange(len(log.motion)) + log.offset
+    return np.stack([np.interp(grid, table["t"], table[name]) for name in names], axis=1)
+
+
 def run_of(log):
     """Return commands and response of a log's flight."""
     rows = longest_flight(log)
-    force = 9.81 * log.columns["imu_acc_z"][rows]
+    force = 9.81 * columns_of(log, ["imu_acc_z"])[rows, 0]
     response = np.column_stack([state_of(log.motion[rows]).body_rates, force])
     return Run(log.thrusts[rows] @ SIDES.T, response)
 
@@ -624,7 +523,7 @@ def closed_loop_table(logs, vehicle):
     rows = []
     for log in logs:
         part = longest_flight(log)
-        setpoint = np.stack([log.columns[f"sp_ctrltarget_{axis}"][part] for axis in "xyz"], axis=1)
+        setpoint = columns_of(log, [f"sp_ctrltarget_{axis}" for axis in "xyz"])[part]
         position = state_of(log.motion[part]).position
         texts = [f"{off(position, setpoint):.3f}"]
         for kind in ("cascade", "PID"):

@@ -1,7 +1,10 @@
 """How far a vehicle departs from real flights when it flies the commands that their motors got.
 
-A log is a CSV file with the columns that docs/vehicles.md lists. It is resampled to the vehicle's
-control step, and taken as it is: ``examples/real_flights.py`` aligns clocks and calibrates motors.
+A log is a CSV file with the columns of NanoBench (Ullah and Baca 2026, arXiv 2603.09908), which
+docs/vehicles.md lists. It is resampled to the vehicle's control step. Three things are calibrated
+by the whole flight: the clock of the vehicle's own columns, by the shift at which gyro and attitude
+agree best; how the markers of the motion capture are mounted, so that the mean specific force lies
+along z; and the motors against each other, so that the mean commands give no moment.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +20,13 @@ from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.physics import quaternion_product
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    VELOCITY,
+    rotation_matrices,
+)
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
@@ -27,17 +36,20 @@ WARM_UP = 0.5
 LEAST_HEIGHT = 0.3
 # Longer gaps between rows are not filled, s.
 LONGEST_GAP = 0.05
-# In the order of the state's first rows, then the commands
-# fmt: off
-COLUMNS = (
-    "px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz",
-    "imu_gyro_x", "imu_gyro_y", "imu_gyro_z",
-    "thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4",
-)
-# fmt: on
+# Differences of clocks that are tried, s.
+OFFSETS = np.arange(-0.1, 0.1005, 0.001)
+# Thrust of a motor, N, by powers of its voltage from the 0th: crazyflie-firmware 2025.12,
+# platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM / 65,535 of the battery's.
+THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
+FULL_PWM = 65_535.0
+# By the motion capture, in the order of the state's first rows
+SEEN = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
+FELT = ["imu_gyro_x", "imu_gyro_y", "imu_gyro_z"]
+THRUSTS = ["thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4"]
+PWM = ["motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4", "pwr_pm_vbat"]
 NEEDED = (
-    f"a log is a CSV file with numbers in the columns t, {', '.join(COLUMNS)}; "
-    "examples/real_flights.py --write makes such files of logs with PWM"
+    f"a log is a CSV file with the columns t, {', '.join(SEEN + FELT)}, and thrusts in N "
+    f"({', '.join(THRUSTS)}) or {', '.join(PWM)}"
 )
 QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
 HEADS = ("root mean square of the error", "simulated", "nothing changes", "velocity, rates stay")
@@ -52,6 +64,7 @@ class Log:
     motion: FloatArray
     thrusts: FloatArray  #: (n, 4), commanded, M1 to M4, N
     flying: BoolArray  #: (n,), in the air
+    offset: float  #: s, by which the vehicle's clock was behind that of the motion capture
 
 
 def read_logs(folder: StrPath, step: float) -> list[Log]:
@@ -67,18 +80,55 @@ def read_logs(folder: StrPath, step: float) -> list[Log]:
 
 def read_log(path: Path, step: float) -> Log:
     """Read one log, see :func:`read_logs`."""
-    with raised_as(ConfigError, f"{path}: {NEEDED}"):
-        table = pd.read_csv(path, usecols=["t", *COLUMNS]).astype(float)
-        time = table["t"]
-        grid = np.arange(time.iloc[0], time.iloc[-1], step)
-        rows = np.stack([np.interp(grid, time, table[name]) for name in COLUMNS], axis=1)
-        motion, thrusts = np.split(rows, [BODY_RATES.stop], axis=1)
-        motion[:, QUATERNION] /= np.linalg.norm(motion[:, QUATERNION], axis=1, keepdims=True)
-        flying = motion[:, 2] > LEAST_HEIGHT
-        flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
-    # Commands that nobody knows fly nothing.
+    with raised_as(ConfigError, f"{path}: not a table of numbers"):
+        table = pd.read_csv(path).astype(float)
+    commands = THRUSTS if THRUSTS[0] in table else PWM
+    missing = {"t", *SEEN, *FELT, *commands} - {*table}
+    if missing:
+        raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
+    if len(table) < 2:
+        raise ConfigError(f"{path}: fewer than two rows")
+    time = table["t"]
+    grid = np.arange(time.iloc[0], time.iloc[-1], step)
+
+    def at(names: list[str], behind: float = 0.0) -> FloatArray:
+        return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
+
+    motion = at(SEEN + FELT)
+    attitude = motion[:, QUATERNION]
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    flying = motion[:, 2] > LEAST_HEIGHT
+    flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
+    # Rᵀ dR/dt has the body rates in three places.
+    rotation = rotation_matrices(attitude)
+    turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, step, axis=0))
+    rates = turning[flying][:, [2, 0, 1], [1, 2, 0]]
+    offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind)[flying])))
+    motion[:, BODY_RATES] = at(FELT, offset)
+
+    thrusts = at(commands, offset)
+    if commands is PWM:
+        thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
+    # Some logs are extrapolated after the radio was lost.
     flying &= np.isfinite(thrusts).all(axis=1)
-    return Log(path, motion, thrusts, flying)
+    if flying.any():
+        force = np.gradient(motion[:, VELOCITY], step, axis=0)
+        force[:, 2] += 9.81
+        x, y, z = np.einsum("nji,nj->ni", rotation, force)[flying].mean(axis=0)
+        motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
+        mean = thrusts[flying].mean(axis=0)
+        thrusts *= mean.mean() / mean
+    return Log(path, motion, thrusts, flying, offset)
+
+
+def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
+    """Return the thrusts, N, that the Crazyflie's firmware expects of its commands.
+
+    :param pwm: (n, 4), 0 to 65,535; others and motors that stand become NaN.
+    :param battery: (n, 1), V.
+    """
+    thrusts = np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(pwm / FULL_PWM * battery)
+    return np.where((pwm > 0.0) & (pwm <= FULL_PWM), thrusts, np.nan)
 
 
 def turned_on(quaternion: FloatArray, rotation: FloatArray) -> FloatArray:
