@@ -31,6 +31,7 @@ Pendulum-v1:
 # Parts of lines that are not run here: which test runs them, or why nothing does.
 ELSEWHERE = {
     "--executor ray": "tests/test_ray.py",
+    "--flights": "tests/test_real_flights.py",
     "--resume": "tests/test_runs.py",
     "--track": "tests/test_tracking.py",
     "my_experts:": "tests/test_docs.py",
