@@ -167,6 +167,11 @@ def test_a_log_that_does_not_fit_is_refused_in_a_line(folder, tmp_path, capsys, 
     assert words in error and error.count("\n") == 1
 
 
+def test_a_vehicle_in_other_axes_is_refused(folder, capsys):
+    assert main(["check-vehicle", "hummingbird", "--flights", str(folder), "-n", "0"]) == 2
+    assert "logs are of an X whose rotors turn as those of the Crazyflie" in capsys.readouterr().err
+
+
 def test_a_folder_without_logs_is_refused_with_the_columns(tmp_path):
     (tmp_path / "flight.ulg").write_bytes(b"ULog")
     with pytest.raises(

@@ -27,6 +27,7 @@ from sb3_quad.simulation.state import (
     VELOCITY,
     rotation_matrices,
 )
+from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
@@ -156,7 +157,14 @@ def open_loop(
         each (windows, 13) as in ``Log.motion``.
     :raises ConfigError: no log flies for long enough, or the rotors do not lie as M1 to M4 do.
     """
-    vehicle = first_vehicle(vehicle, "crazyflie")
+    crazyflie = first_vehicle("crazyflie")
+    # A log has the axes of its vehicle, and they do not turn.
+    if find_turn(vehicle, crazyflie).angle != 0.0:
+        raise ConfigError(
+            f"{vehicle.name}: logs are of an X whose rotors turn as those of the Crazyflie do, front"
+            " right anticlockwise; this vehicle's rotors turn the other way or form a plus"
+        )
+    vehicle = vehicle.in_layout_of(crazyflie)
     step = vehicle.control_step
     before = round(WARM_UP / step)
     ends = [round(horizon / step) for horizon in HORIZONS]
