@@ -70,7 +70,7 @@ def main():
     show(one_step_table(judged, vehicle))
     show(error_table(judged, vehicle))
     show(lag_table([run_of(log) for log in logs], "lags and slopes, all flights"))
-    show(told_table(fitted))
+    show(estimate_table(fitted))
     names = ("mass", "drag", "drag_z")
     better, spread = fit(fitted, vehicle, names)
     print(fit_text(better, spread, names))
@@ -240,7 +240,7 @@ def step_response(runs, axis):
     """Return the acceleration, (30,), after a step of the command, from an ARX model.
 
     The next response is predicted from PAST earlier ones and COMMANDS earlier commands. What the
-    controller answers is then told apart from what the motors do, as long as these take at least
+    controller answers is then kept apart from what the motors do, as long as these take at least
     one sample (Ljung, System Identification, 2nd ed., 13.4).
     """
     regressors = []
@@ -297,7 +297,7 @@ def resonance(runs, axis, n=256):
     return float(frequencies[inside][np.argmax(power[inside])])
 
 
-def told_table(logs):
+def estimate_table(logs):
     """Return what motion tells directly, with 95 % jackknife intervals."""
     names = (
         "mass by thrust, g",
@@ -307,18 +307,18 @@ def told_table(logs):
         "inertia about y, 1e-5 kg m², from ARX's slope",
     )
 
-    def told(some):
+    def given(some):
         runs = [run_of(log) for log in some]
         slopes = [fit_step(step_response(runs, axis))[2] for axis in (0, 1)]
         return np.array([*fit_forces(some), *(1e5 * ARM / np.array(slopes))])
 
-    values = told(logs)
-    parts = np.array([told(logs[:i] + logs[i + 1 :]) for i in range(len(logs))])
+    values = given(logs)
+    parts = np.array([given(logs[:i] + logs[i + 1 :]) for i in range(len(logs))])
     spread = 1.96 * np.sqrt((len(logs) - 1) * parts.var(axis=0))
     rows = []
     for name, value, width in zip(names, values, spread, strict=True):
         rows.append([name, f"{value:.3g} ± {width:.2g}"])
-    return text_table(f"told by {len(logs)} flights", ("parameter", "value"), rows)
+    return text_table(f"estimated from {len(logs)} flights", ("parameter", "value"), rows)
 
 
 def fit(logs, vehicle, names=("mass", "drag", "drag_z"), iterations=4):

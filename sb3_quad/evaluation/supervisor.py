@@ -28,7 +28,7 @@ class Supervisor:
 
     The motors are cut where its part along body z has stayed below 0.5 g for more than 1.0 s, or is
     below -0.2 g after more than 0.1 s of that. Free fall, where no part reaches 0.1 g, does not
-    count, and ends the time. A flight that would be cut goes on here.
+    count, and ends the time. A flight that would be cut continues here.
 
     ``cut`` (n,) says which were. ``longest`` (n,) is the longest time below 0.5 g, s; NaN where the
     vehicle's file names no ``supervisor``.
