@@ -161,8 +161,8 @@ def open_loop(
     # A log has the axes of its vehicle, and they do not turn.
     if find_turn(vehicle, crazyflie).angle != 0.0:
         raise ConfigError(
-            f"{vehicle.name}: logs are of an X whose rotors turn as those of the Crazyflie do, front"
-            " right anticlockwise; this vehicle's rotors turn the other way or form a plus"
+            f"{vehicle.name}: logs are of an X whose rotors turn as those of the Crazyflie do,"
+            " front right anticlockwise; this vehicle's rotors turn the other way or form a plus"
         )
     vehicle = vehicle.in_layout_of(crazyflie)
     step = vehicle.control_step
