@@ -490,7 +490,7 @@ def test_names_are_no_html():
 @pytest.mark.slow
 def test_the_default_page_is_small():
     page, _, rounded = default_page()
-    assert len(page.encode()) <= 620_000
+    assert len(page.encode()) <= 660_000
     assert set(rounded) == {"any-quadcopter", "itm-robust"}
     assert f"Weights of {' and '.join(rounded)} are rounded" in page
 

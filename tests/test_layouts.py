@@ -124,7 +124,7 @@ def test_an_agent_flies_all_orders_alike():
 
 
 def test_an_exported_file_flies_a_vehicle_with_its_battery_at_the_back():
-    assert_it_flies("crazyflie-robust", in_order("px4", 0.046, center_of_mass=[-0.0046, 0.0]))
+    assert_it_flies("crazyflie-robust", in_order("px4", 0.046, center_of_mass=[-0.0023, 0.0]))
 
 
 def test_a_wider_vehicle_with_the_same_rotors_is_not_turned():

@@ -37,6 +37,10 @@ class BulletReference:
             str(path), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, **self.client
         )
         pybullet.changeDynamics(self.body, -1, linearDamping=0, angularDamping=0, **self.client)
+        if vehicle.allow_impossible_inertia:
+            # The reader of URDF files sets such an inertia to zero.
+            inertia = list(vehicle.inertia)
+            pybullet.changeDynamics(self.body, -1, localInertiaDiagonal=inertia, **self.client)
         w, x, y, z = state[QUATERNION]
         pybullet.resetBasePositionAndOrientation(
             self.body, state[POSITION], (x, y, z, w), **self.client

@@ -72,7 +72,7 @@ def test_what_messages_call_a_file(here):
             "imt",
             None,
             "unknown vehicle 'imt': did you mean 'itm'? "
-            "(valid: cf21B_500, cf2x_L250, cf2x_P250, cf2x_T350, crazyflie, hummingbird, itm, l2f_",
+            "(valid: cf21B_500, cf2x_L250, cf2x_P250, cf2x_T350, crazyflie, crazyflie_nanobench, ",
         ),
         ("missing.yaml", None, "missing.yaml: no such file"),
         ("bad.yaml", b"\xff\xfe\x00\x01", "bad.yaml: cannot be read"),

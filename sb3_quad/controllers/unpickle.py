@@ -113,6 +113,17 @@ def _check_tensor(stored: Any, offset: Any, shape: Any, *_: Any) -> None:
     _check(offset + math.prod(shape) <= stored, "a tensor")
 
 
+def _unit(value: Any) -> TrainFrequencyUnit:
+    """Return a member of this enumeration by its value."""
+    return TrainFrequencyUnit(value)
+
+
+def _unit_by_name(enumeration: Any, name: Any) -> TrainFrequencyUnit:
+    """Return it by its name, as Python 3.11.0 to 3.11.3 pickle it, and nothing else."""
+    _check(enumeration is _unit and type(name) is str, "an enumeration")
+    return TrainFrequencyUnit[name]
+
+
 def _none(*_: Any) -> None:
     """Stand for what is not needed."""
 
@@ -207,10 +218,8 @@ _FUNCTIONS = {
     "numpy.core.multiarray.scalar": lambda dtype, content: _array(content, dtype, (), "C")[()],
     "collections.OrderedDict": lambda: OrderedDict(),
     "collections.deque": lambda _, length=None: deque(maxlen=length),
-    # A member of this enumeration is called for by its value.
-    "stable_baselines3.common.type_aliases.TrainFrequencyUnit": (
-        TrainFrequencyUnit._value2member_map_.__getitem__
-    ),
+    "stable_baselines3.common.type_aliases.TrainFrequencyUnit": _unit,
+    "builtins.getattr": _unit_by_name,
 }
 # Arguments of these functions, which know by themselves what they make.
 _ARGUMENTS = {

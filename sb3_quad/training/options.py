@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, NonNegativeFloat, PositiveInt, model_validator
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
 from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import Seed
@@ -26,9 +26,14 @@ Number = Annotated[int, BeforeValidator(parse_number)]
 
 
 def _check_device(device: str) -> str:
-    """Refuse CUDA on a machine without it; SB3 would take the CPU without a warning."""
+    """Refuse a device that PyTorch does not know, and CUDA on a machine without it, for which SB3
+    would take the CPU without a warning.
+    """
     import torch
 
+    if device != "auto":
+        with raised_as(ConfigError, f"device {device}; give cpu or auto"):
+            torch.device(device)
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device {device}: PyTorch finds no CUDA here; give cpu or auto")
     return device
