@@ -34,7 +34,12 @@ METHODS: dict[str, tuple[str, str, dict[str, Any], bool]] = {
     "PPO with cloning": ("ppo_bc", RECOVERY, {}, True),
     "SAC with cloning": ("sac_bc", RECOVERY, {"policy_kwargs": None}, True),
     "DAgger from the geometric expert": ("dagger", RECOVERY, {"expert": "geometric"}, False),
-    "model's gradient from the clone": ("apg", RECOVERY, {}, True),
+    "model's gradient from the clone": (
+        "apg",
+        RECOVERY,
+        {"learning_rate": "lin_1e-2", "n_timesteps": 20_736_000},
+        True,
+    ),
 }
 FROM_NOTHING = "model's gradient from nothing"
 FIRST = 1.0  # CPU seconds until the first evaluation; each later one waits for a quarter more

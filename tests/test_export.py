@@ -24,7 +24,10 @@ from test_extending import DIFFS, ROOT, apply
 
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
+from sb3_quad.controllers.agent_settings import env_kwargs
+from sb3_quad.controllers.pretrained import agent_path, load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
 from sb3_quad.export import c_header, network, policy
 from sb3_quad.export.check import Reference
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
@@ -620,3 +623,29 @@ def test_a_policy_that_sees_a_further_feature_exports(tmp_path):
     for line in lines:
         assert line.startswith("22 numbers")
         assert "15-17 body rates, body frame, rad/s; 18-21 rotor_speeds, rad/s" in line
+
+
+def test_a_header_in_half_precision_computes_what_its_rounded_policy_does():
+    exported = export_policy(
+        agent_path("crazyflie-recovery"), "c", name="own", n_observations=1000, half=True
+    )
+    assert b"static const own_half own_policy_weight_0[64][18]" in exported.content
+    assert exported.max_error < 1e-6
+    with pytest.raises(ConfigError, match="--half: is for --format c; --format onnx"):
+        export_policy(agent_path("crazyflie-recovery"), "onnx", half=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["crazyflie-recovery", "crazyflie-robust", "any-quadcopter"])
+def test_960_recoveries_in_half_precision(name):
+    flown = {}
+    for half in (False, True):
+        model = load_pretrained(name)
+        if half:
+            for values in model.policy.parameters():
+                values.data = values.data.half().float()
+        settings = {**env_kwargs(name), "vehicle": "crazyflie"}
+        settings.pop("vehicles", None)
+        flown[half] = fly(model, "state_recovery", 960, seed=1000, **settings).success.mean()
+    print(f"{name}: {100 * flown[False]:.2f} %, in half precision {100 * flown[True]:.2f} %")
+    assert abs(flown[True] - flown[False]) <= 0.003

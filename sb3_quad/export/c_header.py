@@ -20,7 +20,7 @@ def c_name(text: str) -> str:
     return name if name and not name[0].isdigit() else f"quad_{name}".rstrip("_")
 
 
-def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
+def write_header(network: Network, metadata: StrDict, name: str, half: bool = False) -> bytes:
     """Return the header, with ``static inline void NAME_policy(const float observation[18], float
     thrust[4])``, and ``NAME_relate``, which makes an observation relative to a reference that
     moves.
@@ -31,6 +31,7 @@ def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     :param network: for speeds the second parameter is called ``rotor_speed``.
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
+    :param half: whether the weights stand in half precision, in half the flash.
     """
     return render(
         "sb3_quad.export",
@@ -40,6 +41,7 @@ def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
         table=_table,
         c_number=_number,
         network=network,
+        half=half,
         features=OBSERVATION_SIZE,
         F=F,
     ).encode("ascii")

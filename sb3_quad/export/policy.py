@@ -58,6 +58,7 @@ def export_policy(
     vehicle: VehicleSource | None = None,
     name: str | None = None,
     n_observations: int = N_OBSERVATIONS,
+    half: bool = False,
 ) -> Export:
     """Make a file that flies by itself of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC;
     ``MlpPolicy``).
@@ -75,6 +76,8 @@ def export_policy(
         and for speeds its kF.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
     :param n_observations: of the check, at most, see :func:`~sb3_quad.export.check.compare`.
+    :param half: round the weights to half precision, for ``c``. The check compares the file with
+        the policy of these weights.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are
         not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle,
         and none is given; a vehicle whose rotors cannot be brought to where the policy knows them;
@@ -89,6 +92,8 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     refuse_unknown("format", [file_format], FORMATS)
+    if half and file_format != "c":
+        raise ConfigError(f"--half: is for --format c; --format {file_format} keeps float32")
     if file_format == "safetensors":
         return _agent_itself(path, output, vehicle)
     is_app = file_format == "crazyflie"
@@ -96,6 +101,9 @@ def export_policy(
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
+    if half:
+        for values in model.policy.parameters():
+            values.data = values.data.half().float()
     settings, source = agent_settings(path)
     given = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
     if given.vehicles is not None:
@@ -109,7 +117,7 @@ def export_policy(
         flown = flown.in_layout_of(load_vehicle("crazyflie"))
     reference = Reference(model, settings, flown, output)
     # Each format has a writer, and a reader for the check.
-    header = (partial(write_header, name=prefix), partial(load.load_header, name=prefix))
+    header = (partial(write_header, name=prefix, half=half), partial(load.load_header, name=prefix))
     formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
@@ -118,7 +126,8 @@ def export_policy(
     network = build_network(reference, f"model {path}", "px4" if file_format == "px4" else "body")
     write, read = formats.get(file_format, header)
     facts: StrDict = {}
-    if write is header[0]:
+    # What conversions from half precision take was not measured.
+    if write is header[0] and not half:
         facts["cost"] = cost_of(network)
     if is_app:
         facts["plan"] = plan_app(network, reference)

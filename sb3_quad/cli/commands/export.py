@@ -35,6 +35,7 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import (
     OVERWRITE,
+    SWITCH,
     TRUST,
     Flags,
 )
@@ -75,6 +76,7 @@ FLAGS: Flags = {
         "result of the policy: thrusts (N, default) or speeds (rad/s)",
     ),
     "--vehicle": "vehicle, by name or YAML file (that of the zip or its run folder)",
+    "--half": (SWITCH, "weights in half precision, in half the flash (--format c)"),
     "--name": "call the C function NAME_policy (the name of the file)",
     **TRUST,
     **OVERWRITE,
@@ -105,7 +107,9 @@ def run(options: Namespace) -> int:
         raise ConfigError(f"--name {name}: only a C header has one (--format c)")
     if options.vehicle:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))
-    exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
+    exported = export_policy(
+        model, options.format, options.output, options.vehicle, name=name, half=options.half
+    )
     files = exported.files or {"": exported.content}
     for path, content in files.items():
         write_bytes(file / path, content)
