@@ -143,6 +143,9 @@ sb3-quad train --algo dagger --env QuadTargetTracking-v0 -n 240000
 sb3-quad sweep cloning
 python examples/cloning_plot.py logs/sweep/cloning_1/results.csv cloning.png
 """,
+    "learning_speed.png": """
+python examples/learning_speed.py --cpu-seconds 45 learning_speed.csv learning_speed.png
+""",
 }
 PICTURES = SHORT | LONG
 

@@ -155,6 +155,8 @@ def draw(rows: list[dict[str, str]], path: str) -> None:
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     left.set_ylim(-3, 103)
+    left.set_xlim(0.5)
+    right.set_xlim(left.get_xlim())
     right.set_ylim(2, 6)
     left.legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=120)
