@@ -113,9 +113,9 @@ def _check_tensor(stored: Any, offset: Any, shape: Any, *_: Any) -> None:
     _check(offset + math.prod(shape) <= stored, "a tensor")
 
 
-def _unit(value: Any) -> TrainFrequencyUnit:
-    """Return a member of this enumeration by its value."""
-    return TrainFrequencyUnit(value)
+# A member of this enumeration is called for by its value. The enumeration itself would show a wrong
+# value in its message.
+_unit = TrainFrequencyUnit._value2member_map_.__getitem__
 
 
 def _unit_by_name(enumeration: Any, name: Any) -> TrainFrequencyUnit:
