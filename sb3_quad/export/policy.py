@@ -22,7 +22,7 @@ from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.cost import cost_of
 from sb3_quad.export.crazyflie import plan_app, write_app
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
-from sb3_quad.export.px4 import load_px4, motor_order, write_px4
+from sb3_quad.export.px4 import PARAMETERS, load_px4, motor_order, write_module, write_px4
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.simulation.settings import KEY
 from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle, load_vehicle
@@ -148,11 +148,8 @@ def export_policy(
     if is_app:
         files = {FOLDERS[file_format]: content, **write_app(facts["plan"], metadata, prefix)}
     if file_format == "px4":
-        files = {FOLDERS[file_format]: content}
-        for name in ("control_net.cpp", "control_net.hpp", "px4.params"):
-            text = render("sb3_quad.export", f"{name}.j2", vehicle=flown, content=content)
-            files[name] = text.encode("ascii")
-        metadata["parameters"] = "; ".join(text.splitlines())
+        files = {FOLDERS[file_format]: content, **write_module(content, flown)}
+        metadata["parameters"] = "; ".join(files[PARAMETERS].decode().splitlines())
     return Export(content, metadata, error, network.unit, source, files)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
+from sb3_quad.base.templates import render
 from sb3_quad.base.types import Float32Array, StrDict
 from sb3_quad.export.check import Reference
 from sb3_quad.export.load import Call
@@ -19,6 +20,8 @@ from sb3_quad.simulation.observation import GROUPS, F
 from sb3_quad.vehicles.layout import ORDERS
 from sb3_quad.vehicles.vehicle import Vehicle
 
+PARAMETERS = "px4.params"
+FILES = ("control_net.cpp", "control_net.hpp", PARAMETERS)
 ARENA = 10 * 1024  # bytes that the module gives the interpreter
 # The features behind the 15 inputs. The module shows the first two rows of the rotation matrix from
 # body to world, which are columns of ours, and target - position.
@@ -108,6 +111,18 @@ def write_px4(network: Network, metadata: StrDict, reference: Reference) -> byte
     )
     builder.Finish(model, b"TFL3")
     return bytes(builder.Output())
+
+
+def write_module(content: bytes, vehicle: Vehicle) -> dict[str, bytes]:
+    """Return the files of the folder, by their names, without that of :func:`write_px4`.
+
+    :param content: of that file.
+    """
+    files = {}
+    for name in FILES:
+        text = render("sb3_quad.export", f"{name}.j2", vehicle=vehicle, content=content)
+        files[name] = text.encode("ascii")
+    return files
 
 
 def _check(network: Network, reference: Reference) -> None:
