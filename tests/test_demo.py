@@ -90,11 +90,13 @@ LEARNING = """
 const job = JSON.parse((await import("node:fs")).readFileSync(0, "utf8"));
 const p = new Training(job.vehicle, job.seed).p;
 const answers = {
-  advance() {
-    const [ours, theirs] = [Float64Array.from(job.state), Float64Array.from(job.state)];
-    advance(ours, 0, Float64Array.from(job.wanted), 0, p);
+  step() {
+    // Alone, and as the second of two
+    const ours = Float64Array.from([...job.state, ...job.state]);
+    const theirs = Float64Array.from(job.state);
+    physicsStep(ours, [0, 0, 0, 0, ...job.wanted], p, NO_WRENCH, STATE_SIZE, 4);
     physicsStep(theirs, job.wanted, p, NO_WRENCH);
-    return [[...ours], [...theirs]];
+    return [[...ours.subarray(STATE_SIZE)], [...theirs]];
   },
   undo() {
     const moved = Float64Array.from(job.by), byWanted = new Float64Array(4);
@@ -759,7 +761,7 @@ def test_the_page_differentiates_its_physics(changes, tmp_path):
     def step(values):
         later = [*values[:-4], *state[values.size - 4 :]]
         ours, theirs = in_node(
-            tmp_path, LEARNING, what="advance", state=later, wanted=values[-4:].tolist(), **job
+            tmp_path, LEARNING, what="step", state=later, wanted=values[-4:].tolist(), **job
         )
         np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=1e-13)
         return by_result @ np.array(ours[: X.rotor_speeds + 4])

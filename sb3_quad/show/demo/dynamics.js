@@ -13,14 +13,25 @@ import { part, X } from "./tables.js";
 
 const MAX_VELOCITY = 100; // PyBullet's cut of each world component, m/s and rad/s
 
-/** The rotation matrix of a state, body to world, row by row. @param {Float64Array} s */
-export function rotation(s) {
-  const [w, x, y, z] = part(s, "quaternion");
-  return [
-    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-  ];
+/**
+ * The rotation matrix of a state, body to world, row by row.
+ * @template {number[] | Float64Array} T
+ * @param {Float64Array} s states, one after the other
+ * @param {number} at where in them the state begins
+ * @param {T} out
+ */
+export function rotation(s, at = 0, out = /** @type {T} */ (Array(9))) {
+  const q = at + X.quaternion, w = s[q], x = s[q + 1], y = s[q + 2], z = s[q + 3];
+  out[0] = 1 - 2 * (y * y + z * z);
+  out[1] = 2 * (x * y - w * z);
+  out[2] = 2 * (x * z + w * y);
+  out[3] = 2 * (x * y + w * z);
+  out[4] = 1 - 2 * (x * x + z * z);
+  out[5] = 2 * (y * z - w * x);
+  out[6] = 2 * (x * z - w * y);
+  out[7] = 2 * (y * z + w * x);
+  out[8] = 1 - 2 * (x * x + y * y);
+  return out;
 }
 
 /**
@@ -35,70 +46,92 @@ export function commandedSpeeds(actions, p) {
 /** @param {number} value */
 const cut = (value) => Math.min(Math.max(value, -MAX_VELOCITY), MAX_VELOCITY);
 
+// Of the step that is computed: no step allocates.
+const r = new Float64Array(9);
+const rotors = new Float64Array(8);
+
+/**
+ * Thrusts of the rotors in a physics step, N, and behind them their speeds after it, rad/s, (8,).
+ * @param {Float64Array} s
+ * @param {number} at
+ * @param {ArrayLike<number>} wanted rotor speeds, rad/s
+ * @param {number} from where in them those of the state begin
+ * @param {Parameters} p
+ * @param {Float64Array} out
+ */
+export function drive(s, at, wanted, from, p, out) {
+  for (let k = 0; k < 4; k++) {
+    const old = s[at + X.rotor_speeds + k], missing = wanted[from + k] - old;
+    const speed = old + missing * (missing > 0 ? p.up : p.down);
+    out[k] = p.lift * speed * (speed + p.exact * (old - speed));
+    out[4 + k] = speed;
+  }
+}
+
+/** The sum of a row of four with what `drive` wrote. @param {ArrayLike<number>} arm @param {Float64Array} driven */
+export const moment = (arm, driven) => arm[0] * driven[0] + arm[1] * driven[1] + (arm[2] * driven[2] + arm[3] * driven[3]);
+
 /**
  * One physics step of a state, in place.
- * @param {Float64Array} s
- * @param {number[]} wanted rotor speeds, rad/s
+ * @param {Float64Array} s states, one after the other
+ * @param {ArrayLike<number>} wanted rotor speeds, rad/s
  * @param {Parameters} p
  * @param {Wrench} wrench
+ * @param {number} at where the state begins
+ * @param {number} from where its wanted speeds begin
  */
-export function physicsStep(s, wanted, p, wrench) {
-  const dt = p.dt;
-  const thrusts = [0, 0, 0, 0];
-  for (let k = 0; k < 4; k++) {
-    const old = s[X.rotor_speeds + k], missing = wanted[k] - old;
-    const speed = old + missing * (missing > 0 ? p.up : p.down);
-    s[X.rotor_speeds + k] = speed;
-    thrusts[k] = p.lift * speed * (speed + p.exact * (old - speed));
-  }
-  const r = rotation(s);
-  const velocity = part(s, "velocity"), rates = part(s, "body_rates"); // views, changed in place
-  const [cx, cy, cz] = p.drag;
-  const [ux, uy, uz] = velocity.map((v, k) => v - wrench.wind[k]);
-  const fx = -cx * (r[0] * ux + r[3] * uy + r[6] * uz);
-  const fy = -cy * (r[1] * ux + r[4] * uy + r[7] * uz);
-  const fz = thrusts[0] + thrusts[1] + (thrusts[2] + thrusts[3]) - cz * (r[2] * ux + r[5] * uy + r[8] * uz);
+export function physicsStep(s, wanted, p, { force, torque, wind }, at = 0, from = 0) {
+  const { dt, drag, inertia, arms } = p, v = at + X.velocity, w = at + X.body_rates;
+  drive(s, at, wanted, from, p, rotors);
+  for (let k = 0; k < 4; k++) s[at + X.rotor_speeds + k] = rotors[4 + k];
+  rotation(s, at, r);
+  const ux = s[v] - wind[0], uy = s[v + 1] - wind[1], uz = s[v + 2] - wind[2];
+  const fx = -drag[0] * (r[0] * ux + r[3] * uy + r[6] * uz);
+  const fy = -drag[1] * (r[1] * ux + r[4] * uy + r[7] * uz);
+  const thrust = rotors[0] + rotors[1] + (rotors[2] + rotors[3]);
+  const fz = thrust - drag[2] * (r[2] * ux + r[5] * uy + r[8] * uz);
   const perForce = dt / p.mass;
-  velocity[0] += perForce * (wrench.force[0] + r[0] * fx + r[1] * fy + r[2] * fz);
-  velocity[1] += perForce * (wrench.force[1] + r[3] * fx + r[4] * fy + r[5] * fz);
-  velocity[2] += perForce * (wrench.force[2] + r[6] * fx + r[7] * fy + r[8] * fz) - p.gravity * dt;
+  s[v] += perForce * (force[0] + r[0] * fx + r[1] * fy + r[2] * fz);
+  s[v + 1] += perForce * (force[1] + r[3] * fx + r[4] * fy + r[5] * fz);
+  s[v + 2] += perForce * (force[2] + r[6] * fx + r[7] * fy + r[8] * fz) - p.gravity * dt;
 
-  const [ixx, iyy, izz] = p.inertia;
-  const [wx, wy, wz] = rates;
-  const moment = p.arms.map((arm) => arm[0] * thrusts[0] + arm[1] * thrusts[1] + (arm[2] * thrusts[2] + arm[3] * thrusts[3]));
-  rates[0] += (dt / ixx) * (wrench.torque[0] - (izz - iyy) * wy * wz + moment[0]);
-  rates[1] += (dt / iyy) * (wrench.torque[1] - (ixx - izz) * wz * wx + moment[1]);
-  rates[2] += (dt / izz) * (wrench.torque[2] - (iyy - ixx) * wx * wy + moment[2]);
-  limitVelocities(velocity, rates, r);
-  move(s, dt);
+  const [ixx, iyy, izz] = inertia, wx = s[w], wy = s[w + 1], wz = s[w + 2];
+  s[w] += (dt / ixx) * (torque[0] - (izz - iyy) * wy * wz + moment(arms[0], rotors));
+  s[w + 1] += (dt / iyy) * (torque[1] - (ixx - izz) * wz * wx + moment(arms[1], rotors));
+  s[w + 2] += (dt / izz) * (torque[2] - (iyy - ixx) * wx * wy + moment(arms[2], rotors));
+  limitVelocities(s, at);
+  move(s, at, dt);
 }
 
 /**
  * PyBullet's cut of v and ω, in the world frame, in place.
- * @param {Float64Array} velocity
- * @param {Float64Array} rates
- * @param {number[]} r
+ * @param {Float64Array} s
+ * @param {number} at
  */
-function limitVelocities(velocity, rates, r) {
-  for (let k = 0; k < 3; k++) velocity[k] = cut(velocity[k]);
-  const [x, y, z] = rates;
+function limitVelocities(s, at) {
+  for (let k = 0; k < 3; k++) s[at + X.velocity + k] = cut(s[at + X.velocity + k]);
+  const w = at + X.body_rates, x = s[w], y = s[w + 1], z = s[w + 2];
   if (x * x + y * y + z * z <= MAX_VELOCITY * MAX_VELOCITY) return;
-  const w = [0, 3, 6].map((k) => cut(r[k] * x + r[k + 1] * y + r[k + 2] * z));
-  for (let k = 0; k < 3; k++) rates[k] = r[k] * w[0] + r[3 + k] * w[1] + r[6 + k] * w[2];
+  const world = [0, 3, 6].map((k) => cut(r[k] * x + r[k + 1] * y + r[k + 2] * z));
+  for (let k = 0; k < 3; k++) s[w + k] = r[k] * world[0] + r[3 + k] * world[1] + r[6 + k] * world[2];
 }
+
+/** sin(h) / h by h². @param {number} h2 */
+export const sincOf = (h2) => 1 - (h2 / 6) * (1 - (h2 / 20) * (1 - (h2 / 42) * (1 - (h2 / 72) * (1 - h2 / 110))));
+/** cos(h) by h². @param {number} h2 */
+export const cosineOf = (h2) => 1 - (h2 / 2) * (1 - (h2 / 12) * (1 - (h2 / 30) * (1 - (h2 / 56) * (1 - (h2 / 90) * (1 - h2 / 132)))));
 
 /**
  * Position and attitude by the new velocities; the rotation is exact to double precision.
  * @param {Float64Array} s
+ * @param {number} at
  * @param {number} dt
  */
-function move(s, dt) {
-  for (let k = 0; k < 3; k++) s[X.position + k] += dt * s[X.velocity + k];
-  const [x, y, z] = part(s, "body_rates").map((rate) => 0.5 * dt * rate);
-  const h2 = x * x + y * y + z * z;
-  const sinc = 1 - (h2 / 6) * (1 - (h2 / 20) * (1 - (h2 / 42) * (1 - (h2 / 72) * (1 - h2 / 110))));
-  const aw = 1 - (h2 / 2) * (1 - (h2 / 12) * (1 - (h2 / 30) * (1 - (h2 / 56) * (1 - (h2 / 90) * (1 - h2 / 132)))));
-  turnBody(s, aw, x * sinc, y * sinc, z * sinc);
+function move(s, at, dt) {
+  for (let k = 0; k < 3; k++) s[at + X.position + k] += dt * s[at + X.velocity + k];
+  const w = at + X.body_rates, x = 0.5 * dt * s[w], y = 0.5 * dt * s[w + 1], z = 0.5 * dt * s[w + 2];
+  const h2 = x * x + y * y + z * z, sinc = sincOf(h2);
+  turnBody(s, cosineOf(h2), x * sinc, y * sinc, z * sinc, at);
 }
 
 /**
@@ -108,15 +141,19 @@ function move(s, dt) {
  * @param {number} ax
  * @param {number} ay
  * @param {number} az
+ * @param {number} at where the state begins
  */
-export function turnBody(s, aw, ax, ay, az) {
-  const [qw, qx, qy, qz] = part(s, "quaternion");
+export function turnBody(s, aw, ax, ay, az, at = 0) {
+  const q = at + X.quaternion, qw = s[q], qx = s[q + 1], qy = s[q + 2], qz = s[q + 3];
   const w = qw * aw - qx * ax - qy * ay - qz * az;
   const x = qw * ax + qx * aw + qy * az - qz * ay;
   const y = qw * ay - qx * az + qy * aw + qz * ax;
   const z = qw * az + qx * ay - qy * ax + qz * aw;
   const scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z); // one step of Newton's method
-  s.set([w * scale, x * scale, y * scale, z * scale], X.quaternion);
+  s[q] = w * scale;
+  s[q + 1] = x * scale;
+  s[q + 2] = y * scale;
+  s[q + 3] = z * scale;
 }
 
 /** |r - r_T|, m. @param {Float64Array} s */

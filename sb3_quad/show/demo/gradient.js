@@ -8,8 +8,9 @@
  * @typedef {import("./vehicle.js").Vehicle} Vehicle
  * @typedef {import("./flight.js").Agent} Agent
  */
+import { cosineOf, drive, moment, physicsStep, rotation, sincOf } from "./dynamics.js";
 import { geometric } from "./experts.js";
-import { MAX_DISTANCE, normals } from "./flight.js";
+import { MAX_DISTANCE, normals, NO_WRENCH } from "./flight.js";
 import { DEFAULT_STD, F, OBSERVATION_SIZE, STATE_SIZE, X } from "./tables.js";
 import { parametersOf } from "./vehicle.js";
 
@@ -20,7 +21,7 @@ const ROWS = 64, STEPS = 250; // flights in an update, and control steps of each
 const EVALUATED = 600; // control steps of a flight that is only evaluated
 const SUBSTEPS = 2; // physics steps in a control step of the training, as APG has them
 const IMITATION = { updates: 60, steps: 100, rate: 4e-3 };
-const DESCENT = { updates: 200, rate: 3e-2 };
+const DESCENT = { updates: 300, rate: 3e-2 };
 const REPORTED = 10; // updates from one report of the worker to the next
 const NOISE = 0.05;
 const HEIGHT = 15, NEAREST = 1e-8; // m; keeps lengths smooth at zero
@@ -185,7 +186,7 @@ export class Training {
       states.copyWithin(next, now, next);
       for (let r = 0; r < ROWS; r++) {
         const at = next + r * STATE_SIZE, before = alive[t * ROWS + r];
-        if (before) for (let k = 0; k < SUBSTEPS; k++) advance(states, at, wanted, (t * ROWS + r) * 4, p);
+        if (before) for (let k = 0; k < SUBSTEPS; k++) physicsStep(states, wanted, p, NO_WRENCH, at, (t * ROWS + r) * 4);
         alive[(t + 1) * ROWS + r] = before && states[at + P + 2] > p.radius ? 1 : 0;
       }
     }
@@ -275,7 +276,7 @@ export class Training {
         for (let k = 0; k < MOVED; k++) inner[k] = states[before + k];
         for (let k = 1; k < SUBSTEPS; k++) {
           inner.copyWithin(k * MOVED, (k - 1) * MOVED, k * MOVED);
-          advance(inner, k * MOVED, wanted, (t * ROWS + r) * 4, p);
+          physicsStep(inner, wanted, p, NO_WRENCH, k * MOVED, (t * ROWS + r) * 4);
         }
         for (let k = SUBSTEPS - 1; k >= 0; k--) undo(inner, k * MOVED, wanted, byWanted, (t * ROWS + r) * 4, g, p);
         for (let k = 0; k < MOVED; k++) byState[to + k] = g[k];
@@ -335,95 +336,47 @@ export function train({ vehicle, seed }, report) {
   }
 }
 
-/**
- * One physics step of a state, without wind and wrench: physicsStep of dynamics.js without arrays.
- * @param {Float64Array} s @param {number} at @param {Float64Array} wanted @param {number} from
- * @param {import("./vehicle.js").Parameters} p
- */
-export function advance(s, at, wanted, from, p) {
-  const { dt, lift, exact, arms, drag, inertia } = p;
-  let total = 0, tx = 0, ty = 0, tz = 0;
-  for (let k = 0; k < 4; k++) {
-    const old = s[at + M + k], missing = wanted[from + k] - old;
-    const speed = old + missing * (missing > 0 ? p.up : p.down);
-    const thrust = lift * speed * (speed + exact * (old - speed));
-    s[at + M + k] = speed;
-    total += thrust;
-    tx += arms[0][k] * thrust;
-    ty += arms[1][k] * thrust;
-    tz += arms[2][k] * thrust;
-  }
-  const w = s[at + Q], x = s[at + Q + 1], y = s[at + Q + 2], z = s[at + Q + 3];
-  const r0 = 1 - 2 * (y * y + z * z), r1 = 2 * (x * y - w * z), r2 = 2 * (x * z + w * y);
-  const r3 = 2 * (x * y + w * z), r4 = 1 - 2 * (x * x + z * z), r5 = 2 * (y * z - w * x);
-  const r6 = 2 * (x * z - w * y), r7 = 2 * (y * z + w * x), r8 = 1 - 2 * (x * x + y * y);
-  let vx = s[at + V], vy = s[at + V + 1], vz = s[at + V + 2];
-  const fx = -drag[0] * (r0 * vx + r3 * vy + r6 * vz), fy = -drag[1] * (r1 * vx + r4 * vy + r7 * vz);
-  const fz = total - drag[2] * (r2 * vx + r5 * vy + r8 * vz), perForce = dt / p.mass;
-  vx += perForce * (r0 * fx + r1 * fy + r2 * fz);
-  vy += perForce * (r3 * fx + r4 * fy + r5 * fz);
-  vz += perForce * (r6 * fx + r7 * fy + r8 * fz) - p.gravity * dt;
-  const wx = s[at + W], wy = s[at + W + 1], wz = s[at + W + 2];
-  const px = wx + (dt / inertia[0]) * (tx - (inertia[2] - inertia[1]) * wy * wz);
-  const py = wy + (dt / inertia[1]) * (ty - (inertia[0] - inertia[2]) * wz * wx);
-  const pz = wz + (dt / inertia[2]) * (tz - (inertia[1] - inertia[0]) * wx * wy);
-  s[at + V] = vx;
-  s[at + V + 1] = vy;
-  s[at + V + 2] = vz;
-  s[at + W] = px;
-  s[at + W + 1] = py;
-  s[at + W + 2] = pz;
-  s[at + P] += dt * vx;
-  s[at + P + 1] += dt * vy;
-  s[at + P + 2] += dt * vz;
-  const hx = 0.5 * dt * px, hy = 0.5 * dt * py, hz = 0.5 * dt * pz, h2 = hx * hx + hy * hy + hz * hz;
-  const sinc = sincOf(h2), aw = cosineOf(h2), ax = hx * sinc, ay = hy * sinc, az = hz * sinc;
-  const nw = w * aw - x * ax - y * ay - z * az, nx = w * ax + x * aw + y * az - z * ay;
-  const ny = w * ay - x * az + y * aw + z * ax, nz = w * az + x * ay - y * ax + z * aw;
-  const scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz);
-  s[at + Q] = nw * scale;
-  s[at + Q + 1] = nx * scale;
-  s[at + Q + 2] = ny * scale;
-  s[at + Q + 3] = nz * scale;
-}
-
-/** sin(h) / h and cos(h) by h². @param {number} h2 */
-const sincOf = (h2) => 1 - (h2 / 6) * (1 - (h2 / 20) * (1 - (h2 / 42) * (1 - h2 / 72)));
-/** @param {number} h2 */
-const cosineOf = (h2) => 1 - (h2 / 2) * (1 - (h2 / 12) * (1 - (h2 / 30) * (1 - h2 / 56)));
 /** The derivative of sin(h) / h by h². @param {number} h2 */
 const sincSlope = (h2) => -(1 / 6) * (1 - (h2 / 10) * (1 - (h2 / 28) * (1 - h2 / 54)));
 
+// Of the row that is carried back: a rotation matrix, the gradient by it, and thrusts and speeds of the rotors
+const R = new Float64Array(9), byR = new Float64Array(9), driven = new Float64Array(8);
+
 /**
- * Carry a gradient by the state after `advance` back to the one before, in place, and add that by the wanted speeds.
+ * Add byR, the gradient by the rotation matrix of a state, to that by its quaternion.
+ * @param {Float64Array} s @param {number} at @param {Float64Array} g @param {number} to
+ */
+function addByRotation(s, at, g, to) {
+  const w = s[at + Q], x = s[at + Q + 1], y = s[at + Q + 2], z = s[at + Q + 3];
+  const [e0, e1, e2, e3, e4, e5, e6, e7, e8] = byR;
+  g[to + Q] += 2 * (-z * e1 + y * e2 + z * e3 - x * e5 - y * e6 + x * e7);
+  g[to + Q + 1] += 2 * (y * e1 + z * e2 + y * e3 - 2 * x * e4 - w * e5 + z * e6 + w * e7 - 2 * x * e8);
+  g[to + Q + 2] += 2 * (-2 * y * e0 + x * e1 + w * e2 + x * e3 + z * e5 - w * e6 + z * e7 - 2 * y * e8);
+  g[to + Q + 3] += 2 * (-2 * z * e0 - w * e1 + x * e2 + w * e3 - 2 * z * e4 + y * e5 + x * e6 + y * e7);
+}
+
+/**
+ * Carry a gradient by the state after physicsStep, without wind and wrench, back to the one before, in place, and add that by
+ * the wanted speeds.
  * @param {Float64Array} s @param {number} at the state before @param {Float64Array} wanted @param {Float64Array} byWanted @param {number} from
  * @param {Float64Array} g @param {import("./vehicle.js").Parameters} p
  */
 export function undo(s, at, wanted, byWanted, from, g, p) {
   const { dt, lift, exact, arms, drag, inertia } = p;
   // What the step computed
-  let total = 0, tx = 0, ty = 0, tz = 0;
-  for (let k = 0; k < 4; k++) {
-    const old = s[at + M + k], missing = wanted[from + k] - old;
-    const speed = old + missing * (missing > 0 ? p.up : p.down);
-    const thrust = lift * speed * (speed + exact * (old - speed));
-    total += thrust;
-    tx += arms[0][k] * thrust;
-    ty += arms[1][k] * thrust;
-    tz += arms[2][k] * thrust;
-  }
+  drive(s, at, wanted, from, p, driven);
+  rotation(s, at, R);
   const w = s[at + Q], x = s[at + Q + 1], y = s[at + Q + 2], z = s[at + Q + 3];
-  const r0 = 1 - 2 * (y * y + z * z), r1 = 2 * (x * y - w * z), r2 = 2 * (x * z + w * y);
-  const r3 = 2 * (x * y + w * z), r4 = 1 - 2 * (x * x + z * z), r5 = 2 * (y * z - w * x);
-  const r6 = 2 * (x * z - w * y), r7 = 2 * (y * z + w * x), r8 = 1 - 2 * (x * x + y * y);
   const vx = s[at + V], vy = s[at + V + 1], vz = s[at + V + 2];
-  const fx = -drag[0] * (r0 * vx + r3 * vy + r6 * vz), fy = -drag[1] * (r1 * vx + r4 * vy + r7 * vz);
-  const fz = total - drag[2] * (r2 * vx + r5 * vy + r8 * vz);
+  const fx = -drag[0] * (R[0] * vx + R[3] * vy + R[6] * vz), fy = -drag[1] * (R[1] * vx + R[4] * vy + R[7] * vz);
+  const thrust = driven[0] + driven[1] + (driven[2] + driven[3]);
+  const fz = thrust - drag[2] * (R[2] * vx + R[5] * vy + R[8] * vz);
   const wx = s[at + W], wy = s[at + W + 1], wz = s[at + W + 2];
   const gx = inertia[2] - inertia[1], gy = inertia[0] - inertia[2], gz = inertia[1] - inertia[0];
   const ix = dt / inertia[0], iy = dt / inertia[1], iz = dt / inertia[2];
-  const hx = 0.5 * dt * (wx + ix * (tx - gx * wy * wz)), hy = 0.5 * dt * (wy + iy * (ty - gy * wz * wx));
-  const hz = 0.5 * dt * (wz + iz * (tz - gz * wx * wy)), h2 = hx * hx + hy * hy + hz * hz;
+  const hx = 0.5 * dt * (wx + ix * (moment(arms[0], driven) - gx * wy * wz));
+  const hy = 0.5 * dt * (wy + iy * (moment(arms[1], driven) - gy * wz * wx));
+  const hz = 0.5 * dt * (wz + iz * (moment(arms[2], driven) - gz * wx * wy)), h2 = hx * hx + hy * hy + hz * hz;
   const sinc = sincOf(h2), aw = cosineOf(h2), ax = hx * sinc, ay = hy * sinc, az = hz * sinc;
   const nw = w * aw - x * ax - y * ay - z * az, nx = w * ax + x * aw + y * az - z * ay;
   const ny = w * ay - x * az + y * aw + z * ax, nz = w * az + x * ay - y * ax + z * aw;
@@ -432,40 +385,40 @@ export function undo(s, at, wanted, byWanted, from, g, p) {
   const along = nw * g[Q] + nx * g[Q + 1] + ny * g[Q + 2] + nz * g[Q + 3];
   const ew = scale * g[Q] - nw * along, ex = scale * g[Q + 1] - nx * along;
   const ey = scale * g[Q + 2] - ny * along, ez = scale * g[Q + 3] - nz * along;
-  let bw = ew * aw + ex * ax + ey * ay + ez * az, bx = -ew * ax + ex * aw - ey * az + ez * ay;
-  let by = -ew * ay + ex * az + ey * aw - ez * ax, bz = -ew * az - ex * ay + ey * ax + ez * aw;
+  g[Q] = ew * aw + ex * ax + ey * ay + ez * az;
+  g[Q + 1] = -ew * ax + ex * aw - ey * az + ez * ay;
+  g[Q + 2] = -ew * ay + ex * az + ey * aw - ez * ax;
+  g[Q + 3] = -ew * az - ex * ay + ey * ax + ez * aw;
   const cw = ew * w + ex * x + ey * y + ez * z, cx = -ew * x + ex * w + ey * z - ez * y;
   const cy = -ew * y - ex * z + ey * w + ez * x, cz = -ew * z + ex * y - ey * x + ez * w;
   // The turn a by half the angle h, and the body rates after the step
   const common = 2 * (cx * hx + cy * hy + cz * hz) * sincSlope(h2) - cw * sinc;
-  const ax1 = g[W] + 0.5 * dt * (cx * sinc + common * hx), ay1 = g[W + 1] + 0.5 * dt * (cy * sinc + common * hy);
-  const az1 = g[W + 2] + 0.5 * dt * (cz * sinc + common * hz);
-  g[W] = ax1 - iy * gy * wz * ay1 - iz * gz * wy * az1;
-  g[W + 1] = ay1 - ix * gx * wz * ax1 - iz * gz * wx * az1;
-  g[W + 2] = az1 - ix * gx * wy * ax1 - iy * gy * wx * ay1;
+  const bx = g[W] + 0.5 * dt * (cx * sinc + common * hx), by = g[W + 1] + 0.5 * dt * (cy * sinc + common * hy);
+  const bz = g[W + 2] + 0.5 * dt * (cz * sinc + common * hz);
+  g[W] = bx - iy * gy * wz * by - iz * gz * wy * bz;
+  g[W + 1] = by - ix * gx * wz * bx - iz * gz * wx * bz;
+  g[W + 2] = bz - ix * gx * wy * bx - iy * gy * wx * by;
   // The velocity after the step, which moves the position; force and drag in body axes
   const ux = g[V] + dt * g[P], uy = g[V + 1] + dt * g[P + 1], uz = g[V + 2] + dt * g[P + 2], perForce = dt / p.mass;
   const dx = perForce * ux, dy = perForce * uy, dz = perForce * uz; // by the force in world axes
-  const kx = r0 * dx + r3 * dy + r6 * dz, ky = r1 * dx + r4 * dy + r7 * dz, kz = r2 * dx + r5 * dy + r8 * dz;
+  const kx = R[0] * dx + R[3] * dy + R[6] * dz, ky = R[1] * dx + R[4] * dy + R[7] * dz, kz = R[2] * dx + R[5] * dy + R[8] * dz;
   const mx = -drag[0] * kx, my = -drag[1] * ky, mz = -drag[2] * kz; // by the velocity in body axes
-  g[V] = ux + r0 * mx + r1 * my + r2 * mz;
-  g[V + 1] = uy + r3 * mx + r4 * my + r5 * mz;
-  g[V + 2] = uz + r6 * mx + r7 * my + r8 * mz;
-  const e0 = dx * fx + vx * mx, e1 = dx * fy + vx * my, e2 = dx * fz + vx * mz;
-  const e3 = dy * fx + vy * mx, e4 = dy * fy + vy * my, e5 = dy * fz + vy * mz;
-  const e6 = dz * fx + vz * mx, e7 = dz * fy + vz * my, e8 = dz * fz + vz * mz;
-  bw += 2 * (-z * e1 + y * e2 + z * e3 - x * e5 - y * e6 + x * e7);
-  bx += 2 * (y * e1 + z * e2 + y * e3 - 2 * x * e4 - w * e5 + z * e6 + w * e7 - 2 * x * e8);
-  by += 2 * (-2 * y * e0 + x * e1 + w * e2 + x * e3 + z * e5 - w * e6 + z * e7 - 2 * y * e8);
-  bz += 2 * (-2 * z * e0 - w * e1 + x * e2 + w * e3 - 2 * z * e4 + y * e5 + x * e6 + y * e7);
-  g[Q] = bw;
-  g[Q + 1] = bx;
-  g[Q + 2] = by;
-  g[Q + 3] = bz;
+  g[V] = ux + R[0] * mx + R[1] * my + R[2] * mz;
+  g[V + 1] = uy + R[3] * mx + R[4] * my + R[5] * mz;
+  g[V + 2] = uz + R[6] * mx + R[7] * my + R[8] * mz;
+  byR[0] = dx * fx + vx * mx;
+  byR[1] = dx * fy + vx * my;
+  byR[2] = dx * fz + vx * mz;
+  byR[3] = dy * fx + vy * mx;
+  byR[4] = dy * fy + vy * my;
+  byR[5] = dy * fz + vy * mz;
+  byR[6] = dz * fx + vz * mx;
+  byR[7] = dz * fy + vz * my;
+  byR[8] = dz * fz + vz * mz;
+  addByRotation(s, at, g, 0);
   for (let k = 0; k < 4; k++) {
-    const byThrust = kz + ix * arms[0][k] * ax1 + iy * arms[1][k] * ay1 + iz * arms[2][k] * az1;
-    const old = s[at + M + k], missing = wanted[from + k] - old, share = missing > 0 ? p.up : p.down;
-    const speed = old + missing * share;
+    const byThrust = kz + ix * arms[0][k] * bx + iy * arms[1][k] * by + iz * arms[2][k] * bz;
+    const old = s[at + M + k], speed = driven[4 + k], share = wanted[from + k] > old ? p.up : p.down;
     const bySpeed = g[M + k] + byThrust * lift * (2 * speed + exact * (old - 2 * speed));
     g[M + k] = bySpeed * (1 - share) + byThrust * lift * speed * exact;
     byWanted[from + k] += bySpeed * share;
@@ -491,22 +444,15 @@ function addCost(s, at, g, scale) {
 
 /** The features of a state: features of observation.js without arrays. @param {Float64Array} s @param {number} at @param {Float64Array} x @param {number} o */
 function look(s, at, x, o) {
-  const w = s[at + Q], i = s[at + Q + 1], j = s[at + Q + 2], k = s[at + Q + 3];
-  const vx = s[at + V], vy = s[at + V + 1], vz = s[at + V + 2], r = o + F.rotation;
+  rotation(s, at, R);
+  const vx = s[at + V], vy = s[at + V + 1], vz = s[at + V + 2];
   for (let n = 0; n < 3; n++) {
     x[o + F.position + n] = s[at + P + n] - s[at + X.target + n];
     x[o + F.body_rates + n] = s[at + W + n];
+    // World to body, row by row
+    for (let k = 0; k < 3; k++) x[o + F.rotation + 3 * n + k] = R[3 * k + n];
+    x[o + F.velocity + n] = R[n] * vx + R[3 + n] * vy + R[6 + n] * vz;
   }
-  x[r] = 1 - 2 * (j * j + k * k);
-  x[r + 1] = 2 * (i * j + w * k);
-  x[r + 2] = 2 * (i * k - w * j);
-  x[r + 3] = 2 * (i * j - w * k);
-  x[r + 4] = 1 - 2 * (i * i + k * k);
-  x[r + 5] = 2 * (j * k + w * i);
-  x[r + 6] = 2 * (i * k + w * j);
-  x[r + 7] = 2 * (j * k - w * i);
-  x[r + 8] = 1 - 2 * (i * i + j * j);
-  for (let n = 0; n < 3; n++) x[o + F.velocity + n] = x[r + 3 * n] * vx + x[r + 3 * n + 1] * vy + x[r + 3 * n + 2] * vz;
 }
 
 /**
@@ -515,26 +461,17 @@ function look(s, at, x, o) {
  * @param {Float64Array} g @param {number} to
  */
 function lookBack(s, at, factors, o, by, from, g, to) {
-  const w = s[at + Q], x = s[at + Q + 1], y = s[at + Q + 2], z = s[at + Q + 3];
-  const vx = s[at + V], vy = s[at + V + 1], vz = s[at + V + 2];
-  const d = (/** @type {number} */ k) => factors[o + k] * by[from + k];
+  rotation(s, at, R);
   for (let n = 0; n < 3; n++) {
-    g[to + P + n] += d(F.position + n);
-    g[to + W + n] += d(F.body_rates + n);
+    g[to + P + n] += factors[o + F.position + n] * by[from + F.position + n];
+    g[to + W + n] += factors[o + F.body_rates + n] * by[from + F.body_rates + n];
+    // By the velocity in body axes, and by a row of the matrix from world to body
+    const k = F.velocity + n, byVelocity = factors[o + k] * by[from + k];
+    for (let axis = 0; axis < 3; axis++) {
+      const m = F.rotation + 3 * n + axis;
+      g[to + V + axis] += R[3 * axis + n] * byVelocity;
+      byR[3 * axis + n] = factors[o + m] * by[from + m] + s[at + V + axis] * byVelocity;
+    }
   }
-  const bx = d(F.velocity), by1 = d(F.velocity + 1), bz = d(F.velocity + 2), r = F.rotation;
-  const r0 = 1 - 2 * (y * y + z * z), r1 = 2 * (x * y - w * z), r2 = 2 * (x * z + w * y);
-  const r3 = 2 * (x * y + w * z), r4 = 1 - 2 * (x * x + z * z), r5 = 2 * (y * z - w * x);
-  const r6 = 2 * (x * z - w * y), r7 = 2 * (y * z + w * x), r8 = 1 - 2 * (x * x + y * y);
-  g[to + V] += r0 * bx + r1 * by1 + r2 * bz;
-  g[to + V + 1] += r3 * bx + r4 * by1 + r5 * bz;
-  g[to + V + 2] += r6 * bx + r7 * by1 + r8 * bz;
-  // By the rotation from body to world, row by row
-  const e0 = d(r) + vx * bx, e1 = d(r + 3) + vx * by1, e2 = d(r + 6) + vx * bz;
-  const e3 = d(r + 1) + vy * bx, e4 = d(r + 4) + vy * by1, e5 = d(r + 7) + vy * bz;
-  const e6 = d(r + 2) + vz * bx, e7 = d(r + 5) + vz * by1, e8 = d(r + 8) + vz * bz;
-  g[to + Q] += 2 * (-z * e1 + y * e2 + z * e3 - x * e5 - y * e6 + x * e7);
-  g[to + Q + 1] += 2 * (y * e1 + z * e2 + y * e3 - 2 * x * e4 - w * e5 + z * e6 + w * e7 - 2 * x * e8);
-  g[to + Q + 2] += 2 * (-2 * y * e0 + x * e1 + w * e2 + x * e3 + z * e5 - w * e6 + z * e7 - 2 * y * e8);
-  g[to + Q + 3] += 2 * (-2 * z * e0 - w * e1 + x * e2 + w * e3 - 2 * z * e4 + y * e5 + x * e6 + y * e7);
+  addByRotation(s, at, g, to);
 }

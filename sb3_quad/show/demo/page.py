@@ -191,7 +191,7 @@ def pack(network: Network) -> StrDict:
     }
 
 
-def script(modules: Iterable[str] = (*MODEL, *VIEW)) -> str:
+def script(modules: Iterable[str]) -> str:
     """Return the named modules as one script, in this order."""
     text = "\n".join(
         files(__package__).joinpath(f"{name}.js").read_text("utf-8") for name in modules
