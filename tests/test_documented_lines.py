@@ -100,6 +100,7 @@ def folder(tmp_path_factory, trained_runs):
     for name in ("agent.zip", "path/to/agent.zip", "mine.zip"):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(pretrained("thesis-recovery"), place / name)
+    shutil.copy(pretrained("itm-robust"), place / "itm-old.zip")
     for algo, env in (("dagger", "Tracking"), ("dagger", "Recovery"), ("ppo_bc", "Recovery")):
         for number in (1, 2):
             source = trained_runs("ppo_bc" if algo == "ppo_bc" else "dagger")
