@@ -8,7 +8,7 @@ import argparse
 
 from stop_on_signal import StopOnSignal
 
-from sb3_quad import DAgger, PIDExpert, QuadcopterVecEnv, fly
+from sb3_quad import DAgger, QuadcopterVecEnv, fly
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -29,7 +29,7 @@ model.learn(arguments.timesteps, callback=StopOnSignal(arguments.output))
 model.save(arguments.output)
 
 for task in ("state_recovery", "target_tracking"):
-    for name, controller in (("expert", PIDExpert()), ("agent", model)):
+    for name, controller in (("expert", "pid"), ("agent", model)):
         flights = fly(controller, task, n_flights=480, seed=1_000_000)
         print(
             f"{name}, {task}: success {flights.success.mean():.1%},"

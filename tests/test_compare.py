@@ -43,7 +43,7 @@ def test_each_flies_as_it_was_trained_through_the_same_episodes():
         assert metrics[label].own_reward.value == pytest.approx(
             flights.own_reward.mean(), abs=1e-12
         )
-    pid = fly(PIDExpert("crazyflie"), "state_recovery", 6, 3, vehicle="crazyflie")
+    pid = fly("pid", "state_recovery", 6, 3, vehicle="crazyflie")
     assert metrics["PID"].reward.value == pytest.approx(pid.reward.mean(), abs=1e-12)
     assert "hover flies crazyflie" in result.tables[0].caption
     assert "other flies itm" in result.tables[0].caption

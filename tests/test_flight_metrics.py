@@ -36,9 +36,8 @@ def test_flights_of_the_expert_are_measured_as_evaluation_does():
     )
     metrics = FlightMetrics(tolerance=0.5)
     model.learn(1800, callback=metrics)
-    flights = fly(
-        GeometricExpert(), "target_tracking", 6, 0, max_steps=300
-    )  # the model seeds its environments, from 0
+    # The model seeds its environments, from 0.
+    flights = fly("geometric", "target_tracking", 6, 0, max_steps=300)
     assert metrics.metrics() == {
         "rollout/reached_0.5m": 1.0,
         "rollout/collision_rate": 0.0,

@@ -18,6 +18,7 @@ from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict, StrPath
 from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.following import Following
@@ -166,9 +167,10 @@ def fly(
     Number k is the first episode of an environment that is reset with
     ``row_seeds(seed, n_flights)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
 
-    :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model,
-        asked by ``predict(observation, deterministic=True)``; or a function from observations (n,
-        18) to actions (n, 4).
+    :param controller: an expert or its name, such as ``"pid"``, asked by ``actions(state)`` for the
+        true state; an SB3 model, its zip or the name of a shipped one, asked by
+        ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to
+        actions (n, 4).
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
         ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
@@ -182,14 +184,16 @@ def fly(
         instantiated for these episodes and may remember.
     :param record: an ``.npz`` file for the observations and actions of all control steps, which
         ``DAgger(demonstrations=...)`` and ``dataset.load`` take; an existing one is replaced.
-    :raises ConfigError: an unknown backend or keyword, or fewer than one episode.
+    :raises ConfigError: an unknown name, backend or keyword, or fewer than one episode.
     :raises ControllerError: a controller of another kind, or a controller or reward that fails in
         flight.
     """
     if n_flights < 1:
         raise ConfigError(f"n_flights {n_flights}: must be at least 1")
+    layout = environment.get("rotor_layout")
+    controller = resolve_expert(controller, vehicle, "controller", layout)
     # A model flies with its rotors where it knows them.
-    if environment.get("rotor_layout") is None:
+    if layout is None:
         environment["rotor_layout"] = known_layout(controller)
     settings = FlightSettings().with_changes(
         task=task, vehicle=vehicle, noise=noise, max_episode_steps=max_steps, **environment
