@@ -283,6 +283,33 @@ def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path, monkeyp
     assert np.linalg.norm(flight[-1, :3] - flight[-1, 17:20]) < 0.1
 
 
+def reference_rows(env):
+    """The reference of an environment's only row at each step, and somewhat beyond the flight."""
+    table = env.batch.tracks.copy()
+    table[:, :3] += env.true_state().target[0]
+    return [table[k % len(table)].tolist() for k in range(STEPS + 40)]
+
+
+@node
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["itm", "crazyflie"])
+@pytest.mark.parametrize("kind", ["pid", "geometric"])
+def test_the_experts_follow_a_reference_as_in_python(kind, name, tmp_path):
+    vehicle = load_vehicle(name)
+    env = Env(task="target_tracking", vehicle=vehicle, reference="figure_eight")
+    law = resolve_expert(kind, vehicle)
+    path = in_node(
+        tmp_path,
+        vehicle=vehicle.model_dump(mode="json"),
+        agent={"label": kind, "kind": kind},
+        start=start_of(env),
+        rows=reference_rows(env),
+        steps=STEPS,
+    )
+    flight = fly(env, lambda *_: law.actions(env.true_state()))
+    assert apart(path, flight) <= 1e-6
+
+
 def previewing(tmp_path):
     """An agent that previews its reference, and hovers by the weights of one of the package."""
     model = PPO(
@@ -312,17 +339,13 @@ def test_the_agents_follow_a_reference_as_in_python(name, how, tmp_path, monkeyp
     env = Env(
         **{**env_kwargs(zip_file), "task": "target_tracking", "noise": 0.0, "reference": curve}
     )
-    start = start_of(env)
-    table = env.batch.tracks.copy()
-    table[:, :3] += start["target"]
-    rows = [table[k % len(table)].tolist() for k in range(STEPS + 40)]
     source = {"zip": zip_file} if how == "zip" else {"agent": {"label": name, **describe(spec)}}
     path = in_node(
         tmp_path,
         vehicle=load_vehicle("itm").model_dump(mode="json"),
         **source,
-        start=start,
-        rows=rows,
+        start=start_of(env),
+        rows=reference_rows(env),
         steps=STEPS,
     )
     flight = fly(env, lambda observation, _: model.predict(observation, deterministic=True)[0])

@@ -1,11 +1,12 @@
 /**
- * The two experts on the true state, as sb3_quad/experts/{pid,geometric}.py have them. docs/research/experts.md explains their laws.
+ * The two experts on the true state, as sb3_quad/experts/{pid,geometric}.py have them, without a heading that is asked for.
+ * docs/research/experts.md explains their laws.
  *
  * @typedef {import("./vehicle.js").Vehicle} Vehicle
  * @typedef {(state: Float64Array, actions: Float32Array, ahead?: import("./observation.js").Ahead) => void} Law writes the four actions for a state
  */
 import { errorOf, rotation } from "./dynamics.js";
-import { part } from "./tables.js";
+import { AHEAD, part } from "./tables.js";
 import { armsOf, commandLag, hoverShares, hoverThrust, mixerInverse, thrustRange } from "./vehicle.js";
 
 const { sqrt, min, max, abs, atan2, sin, cos } = Math;
@@ -19,6 +20,16 @@ function velocityOf(s) {
   return [...part(s, "velocity")].map((v, k) => v - target[k]);
 }
 
+/**
+ * The reference's acceleration in AHEAD seconds, m/s²; where nobody knows it, as now.
+ * @param {Float64Array} s
+ * @param {Vehicle} v
+ * @param {import("./observation.js").Ahead} [ahead]
+ */
+function later(s, v, ahead) {
+  return ahead ? ahead(Math.round(AHEAD / v.control_step)) : part(s, "target_acceleration");
+}
+
 /** The thesis's PID controller (Table A.1). @param {Vehicle} v @returns {Law} */
 export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) {
   const mixer = mixerInverse(v);
@@ -27,11 +38,11 @@ export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) 
   const stiff = v.inertia.map((i) => i * frequency ** 2), damp = v.inertia.map((i) => i * 2 * damping * frequency);
   const { mass, gravity: g } = v;
   const kiDt = ki * v.control_step;
-  return (s, actions) => {
+  return (s, actions, ahead) => {
     const [ex, ey, ez] = errorOf(s);
     const r = rotation(s);
     const roll = atan2(r[7], r[8]), pitch = Math.asin(clipped(-r[6])), yaw = atan2(r[3], r[0]);
-    const [vx, vy, vz] = velocityOf(s), [rx, ry, rz] = part(s, "target_acceleration");
+    const [vx, vy, vz] = velocityOf(s), [rx, ry, rz] = later(s, v, ahead);
     const rates = part(s, "body_rates");
     const ax = kp * ex - kd * (r[0] * vx + r[3] * vy + r[6] * vz);
     const ay = kp * ey - kd * (r[1] * vx + r[4] * vy + r[7] * vz);
@@ -94,12 +105,15 @@ export function geometric(v) {
   const [low, high] = thrustRange(v);
   const [ixx, iyy, izz] = v.inertia;
   const lag = commandLag(v);
-  // So many control steps from now it has turned to what is asked for.
-  const steps = Math.round((lag + 1 / gains.attitude) / v.control_step);
-  return (s, actions, ahead = () => part(s, "target_acceleration")) => {
+  // A command acts after the lag; sideways, the vehicle must turn to it first. In terms of AHEAD
+  const upwards = lag / AHEAD, sideways = upwards + 1 / (gains.attitude * AHEAD);
+  const shares = [sideways, sideways, upwards];
+  return (s, actions, ahead) => {
     const r = rotation(s);
     const [p, q, w] = part(s, "body_rates");
-    const [fx, fy, fz] = desiredForce([...errorOf(s)], velocityOf(s), ahead(steps), gains, v.gravity);
+    const now = part(s, "target_acceleration"), then = later(s, v, ahead);
+    const acceleration = shares.map((share, k) => now[k] + share * (then[k] - now[k]));
+    const [fx, fy, fz] = desiredForce([...errorOf(s)], velocityOf(s), acceleration, gains, v.gravity);
     const size = sqrt(fx * fx + fy * fy + fz * fz);
     const body = [0, 1, 2].map((k) => (r[k] * fx + r[3 + k] * fy + r[6 + k] * fz) / size);
     const [b1, b2, b3] = rotated(body, p, q, w, lag);

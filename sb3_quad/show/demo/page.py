@@ -26,7 +26,7 @@ from sb3_quad.evaluation.results import COLOURS, colours_of
 from sb3_quad.export.check import Reference
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
-from sb3_quad.simulation.state import STATE, STATE_SIZE, X
+from sb3_quad.simulation.state import AHEAD, STATE, STATE_SIZE, X
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
 DEFAULT_AGENTS = (
@@ -70,6 +70,7 @@ TABLES = {
     "X": X._asdict(),
     "SIZES": STATE,
     "STATE_SIZE": STATE_SIZE,
+    "AHEAD": AHEAD,
     "F": F._asdict(),
     "OBSERVATION_SIZE": OBSERVATION_SIZE,
     "DEFAULT_STD": DEFAULT_STD.tolist(),

@@ -9,6 +9,7 @@
  * @property {StateRows} X the first row of each quantity; the attitude is a quaternion (w, x, y, z), body to world
  * @property {StateRows} SIZES how many rows each takes
  * @property {number} STATE_SIZE
+ * @property {number} AHEAD s, after which the experts look at the acceleration of the reference
  * @property {FeatureRows} F the first row of each group of features
  * @property {number} OBSERVATION_SIZE
  * @property {number[]} DEFAULT_STD σ of Eq. 3.16 (Table A.2)
@@ -16,7 +17,7 @@
 
 /** @type {Tables} */
 const TABLES = JSON.parse("TABLES");
-export const { X, SIZES, STATE_SIZE, F, OBSERVATION_SIZE, DEFAULT_STD } = TABLES;
+export const { X, SIZES, STATE_SIZE, AHEAD, F, OBSERVATION_SIZE, DEFAULT_STD } = TABLES;
 
 /** A quantity of a state, such as its position; a view. @param {Float64Array} s @param {keyof StateRows} name */
 export const part = (s, name) => s.subarray(X[name], X[name] + SIZES[name]);
