@@ -8,6 +8,7 @@ from torch.nn.functional import avg_pool1d, pad
 
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.state import STATE
+from sb3_quad.vehicles.vehicle import GRAVITY
 
 # Distances, m, at which half of the coarse and of the fine part of the position's cost is due.
 COARSE, FINE = 0.5, 0.05
@@ -18,7 +19,6 @@ CALM = 0.03
 HEADING = 0.1
 # Below this height, m, a flight is in danger.
 LOW = 1.5
-GRAVITY = 9.81  # m/s²
 # How much the mean specific force along body z may lack of 1 g, and over how many seconds
 LACK = 0.45
 WINDOW = 0.8

@@ -28,7 +28,7 @@ from sb3_quad.simulation.state import (
     rotation_matrices,
 )
 from sb3_quad.vehicles.layout import find_turn
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
+from sb3_quad.vehicles.vehicle import GRAVITY, Vehicle, first_vehicle
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
 # Commands before a window that turn the rotors, s.
@@ -114,7 +114,7 @@ def read_log(path: Path, step: float) -> Log:
     flying &= np.isfinite(thrusts).all(axis=1)
     if flying.any():
         force = np.gradient(motion[:, VELOCITY], step, axis=0)
-        force[:, 2] += 9.81
+        force[:, 2] += GRAVITY
         x, y, z = np.einsum("nji,nj->ni", rotation, force)[flying].mean(axis=0)
         motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
         mean = thrusts[flying].mean(axis=0)

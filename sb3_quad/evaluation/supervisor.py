@@ -11,9 +11,8 @@ import numpy as np
 
 from sb3_quad.base.types import BoolArray
 from sb3_quad.simulation.state import QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.vehicles.vehicle import GRAVITY, Vehicle
 
-G = 9.81  # m/s^2, the unit of what follows
 # Specific forces in g, and the times in s that they may last
 LOW = 0.5
 LOW_TIME = 1.0
@@ -50,7 +49,7 @@ class Supervisor:
         """See the state after a control step; only the flights (n,) that continue count."""
         if not self._watched.any():
             return
-        force = state.specific_force / G
+        force = state.specific_force / GRAVITY
         along_z = force[:, 2]
         falls = (np.abs(force) < FREE_FALL).all(axis=1)
         self._steps += 1.0

@@ -18,6 +18,7 @@ from sb3_quad.vehicles.layout import NamedLayout, Turn, find_turn
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 # Physics steps in a control step.
 MAX_SUBSTEPS = 1000
+GRAVITY = 9.81  # m/s²; 1 g
 # Published moments of inertia are inaccurate: the largest may be this many times the other two.
 INACCURACY = 1.05
 # Where kF is unknown, this is the speed of a rotor that gives m g / 4, rad/s.
@@ -129,7 +130,7 @@ class Vehicle(Frozen):
     """euler: Eq. 4.1 as printed; exact: the speed's exponential, and the thrust of its middle"""
     drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
     """d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"""
-    gravity: PositiveFloat = 9.81
+    gravity: PositiveFloat = GRAVITY
     """g, m/s^2"""
     thrust_limits: Limits = _NO_LIMITS
     """least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"""
