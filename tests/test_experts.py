@@ -141,6 +141,7 @@ def test_predict_on_noise_free_observations_equals_actions_on_the_true_state(exp
         assert state is None and actions.shape == (64, 4) and actions.dtype == np.float32
         np.testing.assert_allclose(actions, expected, atol=2e-3)
         np.testing.assert_array_equal(expert.predict(observations[0])[0], actions[0])
+        assert expert.predict(observations[:0])[0].shape == (0, 4)
         observations, *_ = env.step(expected)
 
 

@@ -70,7 +70,7 @@ class Expert(ABC):
         # One observation is a batch of one.
         rows = np.atleast_2d(array)
         actions = self.actions(observed_state(rows, self.observation_mean, self.observation_std))
-        return actions.reshape(*array.shape[:-1], -1), state
+        return actions.reshape(*array.shape[:-1], actions.shape[1]), state
 
 
 def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -> QuadcopterState:
@@ -81,7 +81,7 @@ def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -
     """
     features = observation * std + mean
     part = {name: features[:, columns] for name, columns in GROUPS.items()}
-    if not part["rotation"][:, 2::3].any():
+    if len(features) > 0 and not part["rotation"][:, 2::3].any():
         raise ExpertError(
             "an expert cannot read observations of features: px4; let it act on the true state"
         )
