@@ -82,21 +82,21 @@ class App:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(done.stderr)
-        self.library = ctypes.CDLL(str(library))
-        self.library.app_thrust_max.restype = ctypes.c_float
-        self.library.app_thrust_min.restype = ctypes.c_float
-        self.library.app_count.restype = ctypes.c_long
+        self.code = ctypes.CDLL(str(library))
+        self.code.app_thrust_max.restype = ctypes.c_float
+        self.code.app_thrust_min.restype = ctypes.c_float
+        self.code.app_count.restype = ctypes.c_long
         self.apps = None
 
     def __call__(self, rows, fly=1, mode=POSITION, velocity_body=0):
         """Motors' thrusts, N, (n, 2, 4), in the first and the last call of a control step."""
         rows = np.ascontiguousarray(rows, dtype=np.float32)
         if self.apps is None:
-            self.apps = np.zeros((len(rows), self.library.app_size()), dtype=np.uint8)
+            self.apps = np.zeros((len(rows), self.code.app_size()), dtype=np.uint8)
         motors = np.zeros((len(rows), 2, 4), dtype=np.float32)
         arrays = [np.ctypeslib.as_ctypes(array) for array in (rows, self.apps, motors)]
         modes = (ctypes.c_int * 7)(*mode)
-        self.library.app_run(
+        self.code.app_run(
             arrays[0], fly, modes, velocity_body, arrays[1], arrays[2], ctypes.c_long(len(rows))
         )
         return motors
@@ -188,7 +188,7 @@ def test_it_commands_what_the_header_does(apps, kind):
         features = np.hstack([physical_features(state), previews]).astype(np.float32)
         motors = app(rows, mode=FULL_STATE if step % 2 else POSITION)
         expected, memory = header(features, memory, references)
-        floor = app.library.app_thrust_min() * 1.0003
+        floor = app.code.app_thrust_min() * 1.0003
         np.testing.assert_allclose(motors[:, 1], expected.clip(floor), atol=5e-6)
     assert motors[:, 1].std() > 0.02
 
@@ -199,7 +199,7 @@ def test_the_pid_flies_until_it_is_asked_and_gets_back_what_is_not_a_position(ap
     state = states(1)
     rows = rows_of(state)
     features = np.hstack([physical_features(state), np.zeros((1, 6), np.float32)])
-    assert (app(rows, fly=0) == -1.0).all() and app.library.app_count(0) == 10
+    assert (app(rows, fly=0) == -1.0).all() and app.code.app_count(0) == 10
     # The policy computes over some calls before its first command. Until then the PID flies.
     first = app(rows)
     assert (first[:, 0] == -1.0).all() and (first[:, 1] >= 0.0).all()
@@ -211,10 +211,10 @@ def test_the_pid_flies_until_it_is_asked_and_gets_back_what_is_not_a_position(ap
         (DISABLED,) * 7,
     ):
         app(rows)
-        resets = app.library.app_count(1)
+        resets = app.code.app_count(1)
         assert (app(rows, mode=mode) == -1.0).all()
         stopped = 10 * (mode == (DISABLED,) * 7)
-        assert app.library.app_count(1) == resets + 1 + stopped  # the PID begins anew, once
+        assert app.code.app_count(1) == resets + 1 + stopped  # the PID begins anew, once
         # The policy's state begins anew, too.
         again = app(rows)
         np.testing.assert_array_equal(again, first)
@@ -255,11 +255,11 @@ def test_the_firmwares_pid_flies_on_at_once_when_it_gets_back(apps):
 def test_thrusts_are_those_of_the_platform(apps, flag, greatest):
     folder, _ = apps["small"]
     app = App(folder, [flag])
-    assert app.library.app_thrust_max() == np.float32(greatest)
+    assert app.code.app_thrust_max() == np.float32(greatest)
     motors = app(rows_of(states(500)))[:, 0]
     usual = App(folder)(rows_of(states(500)))[:, 0]
     # No motor is told to stop, and none gets more than the vehicle's limit.
-    least = max(app.library.app_thrust_min(), CRAZYFLIE.thrust_range[0])
+    least = max(app.code.app_thrust_min(), CRAZYFLIE.thrust_range[0])
     assert motors.min() >= least - greatest / 65535 and motors.max() < 0.11251
     np.testing.assert_allclose(motors, usual.clip(least), atol=2e-5)
 
