@@ -79,8 +79,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     From Visual Features Using Differentiable Simulation" (2024).
 
     In each update every environment flies ``n_steps`` control steps by the mean action of the
-    policy. The optimiser, Adam, then takes one step along the gradient of the mean cost. Only the
-    actor learns; the critic stays as it is.
+    policy. The optimiser then takes one step along the gradient of the mean cost. Only the actor
+    learns; the critic stays as it is.
 
     ``env`` must be differentiable: a :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` with any of
     its settings, or an environment of your own whose ``record(n_steps, substeps)`` returns a
@@ -89,7 +89,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
     Arguments that are not listed here mean what they mean in :class:`stable_baselines3.PPO`.
 
-    :param learning_rate: of Adam; a schedule of the remaining progress. The default falls to
+    :param learning_rate: A rate, or a schedule of the remaining progress. The default falls to
         a fiftieth.
     :param n_steps: Control steps of each flight in an update. Whole flights take some 300.
     :param max_grad_norm: The gradient is scaled down to this length where it is longer.
@@ -108,6 +108,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which is added to the cost: for
         vehicles whose firmware takes a thrust that stays low for a crash.
     :param substeps: Physics steps in a control step of the training; None: those of the vehicle.
+    :param optimizer: ``"soap"``, :class:`~sb3_quad.algorithms.soap.SOAP`, or ``"adam"``. An
+        ``optimizer_class`` in ``policy_kwargs`` holds in place of both.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a gradient that is not finite, in every environment.
     """
@@ -136,6 +138,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         low_force_coef: float = 0.0,
         substeps: int | None = 2,
+        optimizer: str = "soap",
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -153,9 +156,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             sde_sample_freq=-1,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            # Gradients of whole flights change quickly: a short memory of their size.
-            policy_kwargs={"optimizer_kwargs": {"betas": (0.9, 0.99)}}
-            | policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0),
+            policy_kwargs=policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0),
             verbose=verbose,
             seed=seed,
             device=device,
@@ -167,6 +168,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.cost = cost
         self.low_force_coef = low_force_coef
         self.substeps = substeps
+        self.optimizer = optimizer
 
         if _init_setup_model:
             self._begin(initial)

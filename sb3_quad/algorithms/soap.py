@@ -1,0 +1,90 @@
+"""SOAP: Adam in the basis in which the gradients of a layer are uncorrelated."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch as th
+
+# Names that the algorithms take
+OPTIMIZERS = ("adam", "soap")
+# How slowly the second moments of a matrix's gradients change, and updates between two bases
+MOMENT_DECAY = 0.95
+REFRESH = 5
+
+
+class SOAP(th.optim.Adam):
+    """Adam that scales a weight matrix in the eigenbasis of its gradients' second moments.
+
+    Adam scales each weight by the size of its own gradients. Here the weights of a layer are first
+    turned to the eigenvectors of ``E[G Gᵀ]`` and ``E[Gᵀ G]``, where the gradients G hardly
+    correlate, so that an update of the same length lowers the cost further. Biases have Adam's own
+    updates. Source: N. Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam" (2024,
+    arXiv 2409.11321).
+
+    Its state holds all that Adam's does, so that ``PPO.load`` takes it for Adam's.
+
+    Arguments are those of :class:`torch.optim.Adam`; those that choose how Adam computes, such as
+    ``fused``, have no effect.
+    """
+
+    @th.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        """Take one step along the gradients; ``closure`` is evaluated first, as in PyTorch."""
+        loss = None
+        if closure is not None:
+            with th.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._update(parameter, group)
+        return loss
+
+    def _update(self, parameter: th.Tensor, group: dict[str, Any]) -> None:
+        gradient = parameter.grad
+        assert gradient is not None
+        is_matrix = parameter.ndim == 2
+        state = self.state[parameter]
+        # One of Adam's, from a zip, knows nothing of the matrices.
+        if not state or (is_matrix and "moments" not in state):
+            state["step"] = th.tensor(0.0)
+            state["exp_avg"] = th.zeros_like(parameter)
+            state["exp_avg_sq"] = th.zeros_like(parameter)
+            if is_matrix:
+                state["turned_sq"] = th.zeros_like(parameter)
+                state["moments"] = [parameter.new_zeros(n, n) for n in parameter.shape]
+        beta, beta_squared = group["betas"]
+        state["step"] += 1
+        state["exp_avg"].lerp_(gradient, 1.0 - beta)
+        state["exp_avg_sq"].lerp_(gradient.square(), 1.0 - beta_squared)
+        momentum, squares = state["exp_avg"], state["exp_avg_sq"]
+        if is_matrix:
+            left, right = self._bases(state, gradient)
+            squares = state["turned_sq"]
+            squares.lerp_((left.T @ gradient @ right).square(), 1.0 - MOMENT_DECAY)
+            beta_squared = MOMENT_DECAY
+            momentum = left.T @ momentum @ right
+        n = state["step"].item()
+        deviation = (squares / (1.0 - beta_squared**n)).sqrt() + group["eps"]
+        update = momentum / (1.0 - beta**n) / deviation
+        if is_matrix:
+            update = left @ update @ right.T
+        parameter.sub_(update, alpha=group["lr"])
+
+    @staticmethod
+    def _bases(state: dict[str, Any], gradient: th.Tensor) -> list[th.Tensor]:
+        """Return the eigenvectors of both second moments, the columns of two matrices."""
+        for moment, product in zip(
+            state["moments"], (gradient @ gradient.T, gradient.T @ gradient), strict=True
+        ):
+            moment.lerp_(product, 1.0 - MOMENT_DECAY)
+        if "bases" not in state:
+            state["bases"] = [th.linalg.eigh(moment)[1] for moment in state["moments"]]
+        elif state["step"] % REFRESH == 0:
+            # One step of the power iteration: the moments have changed little since the last one.
+            state["bases"] = [
+                th.linalg.qr(moment @ basis)[0]
+                for moment, basis in zip(state["moments"], state["bases"], strict=True)
+            ]
+        bases: list[th.Tensor] = state["bases"]
+        return bases

@@ -1,0 +1,96 @@
+"""SOAP against Adam, and what its state says to other optimizers."""
+
+import copy
+
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+
+from sb3_quad import APG, DAgger, QuadcopterVecEnv
+from sb3_quad.algorithms.soap import SOAP
+from sb3_quad.base.errors import ConfigError
+
+
+def problem(seed: int):
+    """Return a loss whose curvature is large in a few directions, none of them an axis."""
+    generator = th.Generator().manual_seed(seed)
+
+    def skewed(n: int) -> th.Tensor:
+        turn = th.linalg.qr(th.randn(n, n, generator=generator))[0]
+        return turn * th.logspace(0.0, -2.0, n)
+
+    left, right = skewed(12), skewed(8)
+    return lambda weight, bias: (left.T @ weight @ right).square().sum() + bias.square().sum()
+
+
+def start() -> list[th.Tensor]:
+    return [th.ones(12, 8, requires_grad=True), th.ones(8, requires_grad=True)]
+
+
+def descend(optimizer, parameters, loss, steps: int) -> float:
+    for _ in range(steps):
+        optimizer.zero_grad()
+        loss(*parameters).backward()
+        optimizer.step()
+    return loss(*parameters).item()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_descends_further_than_adam_where_weights_are_correlated(seed: int):
+    losses = {}
+    for kind in (th.optim.Adam, SOAP):
+        losses[kind] = []
+        for rate in (0.1, 0.2, 0.4):
+            parameters = start()
+            losses[kind].append(descend(kind(parameters, lr=rate), parameters, problem(seed), 100))
+    assert min(losses[SOAP]) < 0.75 * min(losses[th.optim.Adam])
+
+
+def test_its_state_resumes_exactly():
+    whole, parts = start(), start()
+    loss = problem(0)
+    descend(SOAP(whole, lr=0.02), whole, loss, 23)
+    first = SOAP(parts, lr=0.02)
+    descend(first, parts, loss, 11)
+    second = SOAP(parts, lr=0.5)
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    descend(second, parts, loss, 12)
+    for a, b in zip(whole, parts, strict=True):
+        th.testing.assert_close(a, b, rtol=0.0, atol=0.0)
+
+
+def test_adam_and_soap_take_the_state_of_the_other():
+    for before, after in ((SOAP, th.optim.Adam), (th.optim.Adam, SOAP)):
+        parameters = start()
+        first = before(parameters, lr=0.02)
+        middle = descend(first, parameters, problem(1), 20)
+        second = after(parameters, lr=0.02)
+        second.load_state_dict(first.state_dict())
+        assert descend(second, parameters, problem(1), 40) < middle
+
+
+@pytest.mark.parametrize("algorithm", [APG, DAgger])
+def test_a_zip_names_adam_and_loads_in_plain_sb3(tmp_path, algorithm):
+    env = QuadcopterVecEnv(2, seed=0)
+    expert = {"expert": "pid", "batch_size": 20} if algorithm is DAgger else {}
+    model = algorithm("MlpPolicy", env, n_steps=10, optimizer="soap", seed=0, **expert)
+    model.learn(40)
+    assert isinstance(model.policy.optimizer, SOAP)
+    model.save(tmp_path / "agent")
+
+    stock = PPO.load(tmp_path / "agent")
+    assert type(stock.policy.optimizer) is th.optim.Adam
+    again = algorithm.load(tmp_path / "agent", env=env)
+    assert isinstance(again.policy.optimizer, SOAP)
+    assert str(again.policy.optimizer.state_dict()) == str(model.policy.optimizer.state_dict())
+
+
+def test_an_optimizer_class_of_the_user_holds():
+    kwargs = {"optimizer_class": th.optim.SGD}
+    model = APG("MlpPolicy", QuadcopterVecEnv(2, seed=0), n_steps=10, policy_kwargs=kwargs)
+    assert type(model.policy.optimizer) is th.optim.SGD
+
+
+def test_an_unknown_optimizer_is_refused():
+    with pytest.raises(ConfigError, match="unknown optimizer 'sopa': did you mean 'soap'"):
+        APG("MlpPolicy", QuadcopterVecEnv(2, seed=0), n_steps=10, optimizer="sopa")
