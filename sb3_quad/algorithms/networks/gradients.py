@@ -108,8 +108,10 @@ def network_of(policy: ActorCriticPolicy) -> Network:
     That is compiled perceptrons where it is two of them on the CPU, else the policy itself.
     """
     extractor: Any = policy.mlp_extractor
+    # A subclass may compute something else.
     if (
-        type(extractor) is not MlpExtractor
+        type(policy) is not ActorCriticPolicy
+        or type(extractor) is not MlpExtractor
         or type(policy.action_dist) is not DiagGaussianDistribution
         or type(policy.features_extractor) is not FlattenExtractor
         or policy.observation_space.dtype != np.float32
@@ -117,7 +119,7 @@ def network_of(policy: ActorCriticPolicy) -> Network:
         return policy
     actor = [*extractor.policy_net, policy.action_net]
     critic = [*extractor.value_net, policy.value_net]
-    if not (Perceptron.fits(actor) and Perceptron.fits(critic)):
+    if not (Perceptron.fits(actor) and Perceptron.fits(critic) and policy.log_std.requires_grad):
         return policy
     network = Perceptrons(Perceptron(actor), Perceptron(critic), policy.log_std)
     # A policy with further parameters is computed by PyTorch.

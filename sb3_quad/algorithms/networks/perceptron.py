@@ -86,7 +86,7 @@ class Perceptron:
     def fits(modules: Sequence[nn.Module]) -> bool:
         """Return whether these are linear layers and activations in turn that can be compiled.
 
-        Parameters must be float32 on the CPU, and no module may have hooks.
+        Parameters must be float32 on the CPU, none may be frozen, and no module may have hooks.
         """
         for i, module in enumerate(modules):
             if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks:
@@ -98,6 +98,7 @@ class Perceptron:
                 fits = type(module) is nn.Linear and len(parameters) == 2
                 for parameter in parameters:
                     fits &= parameter.dtype == th.float32 and parameter.device.type == "cpu"
+                    fits &= parameter.requires_grad
             if not fits:
                 return False
         return len(modules) % 2 == 1
