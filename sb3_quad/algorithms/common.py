@@ -119,7 +119,8 @@ class ExpertMixin:
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Learn in another environment from now on; see SB3's ``set_env``.
 
-        The model's zips say from then on that its agent flies as this environment does.
+        The model's zips say from then on that its agent flies as this environment does, or nothing
+        of how it flies where that cannot be read.
         """
         super().set_env(env, force_reset)  # type: ignore[misc]
         self._note_flight_settings()
@@ -236,6 +237,8 @@ class ExpertMixin:
         settings = flight_settings_of(self.env)
         if settings is not None:
             settings.write_into(self)
+        elif hasattr(self, KEY):
+            delattr(self, KEY)  # those of an environment before
         # BaseAlgorithm has them by this name, which no zip holds.
         setattr(self, STATISTICS, self._vec_normalize_env)
 
