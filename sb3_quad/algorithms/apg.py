@@ -100,8 +100,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. From scratch, whole flights learn badly: clone an expert first (DAgger), or
         fly short windows with ``carry_on``.
-    :param carry_on: Let each update continue the flights of the one before; what crashed begins
-        again.
+    :param carry_on: Let each update continue the flights of the one before. A flight that crashed
+        or reached its time limit begins again.
     :param cost: The cost of each control step, (steps, n), as a function of
         :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved.
     :param low_force_coef: Weight of

@@ -50,7 +50,7 @@ class FlightTape:
 
     A row that crashes or leaves the range costs nothing from there on and has no gradient.
 
-    :param batch: flies. Its episodes have no time limit here.
+    :param batch: flies. No time limit ends an episode within a recording.
     :param n_steps: control steps of a recording.
     :param substeps: physics steps in a control step; None: those of the batch. Two take half the
         time of four, and differ little.
@@ -77,10 +77,12 @@ class FlightTape:
     def reset(self, carry_on: bool = False) -> Float32Array:
         """Begin a recording; return the observations, float32 (n, size).
 
-        :param carry_on: let the rows that still fly continue their episodes.
+        :param carry_on: let the rows that still fly continue their episodes, unless these have
+            reached their time limit.
         """
         batch = self.batch
-        observations = batch.reset(np.flatnonzero(self.lost) if carry_on else None)
+        ended = self.lost | (batch.streams[STEP] >= batch.limits)
+        observations = batch.reset(np.flatnonzero(ended) if carry_on else None)
         # A rotor must not overshoot its commanded speed because the physics steps are long.
         vehicles = batch.vehicles
         gains = vehicles[[P.motor_gain_up, P.motor_gain_down]]
