@@ -329,6 +329,13 @@ def test_a_loaded_model_predicts_without_environment_or_expert(tmp_path):
         DAgger.load(tmp_path / "model", env=pendulum()).learn(ROLLOUT)
 
 
+def test_an_expert_can_be_taken_away():
+    model = build(beta=0.0).learn(ROLLOUT)
+    model.set_expert(None)
+    model.learn(ROLLOUT)
+    assert len(model.dataset) == ROLLOUT
+
+
 # --- Faults
 # ------------------------------------------------------------------------------------------
 

@@ -249,11 +249,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.dataset.action_range = limits_of(self.action_space)
 
     def set_expert(self, expert: ExpertLike | None) -> None:
-        """Learn from ``expert`` from now on.
+        """Learn from ``expert`` from now on. None: from the pairs that the dataset holds alone.
 
         :raises ExpertError: an expert that does not fit the environment
         """
-        if self.env is not None:
+        if expert is not None and self.env is not None:
             self._labeller = Controller.for_env(expert, self.env, self._labeller)
         self.expert = expert
 
@@ -293,8 +293,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """
-        if self.will_clone():
-            self.set_expert(self.expert)
+        if self.will_clone() and self.env is not None:
+            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
         if reset_num_timesteps:
             self._n_rollouts = 0
         return super().learn(
