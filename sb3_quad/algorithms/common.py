@@ -258,13 +258,6 @@ class ExpertMixin:
         with th.enable_grad():  # SB3's loops have no gradients, which an expert may need
             return self._labeller.labels(self._last_obs, self._last_episode_starts)
 
-    def _update_info_buffer(self, infos: list[Any], dones: Any = None) -> None:
-        # SB3 would look at all infos, and only those of episodes that have ended say anything.
-        ended = np.flatnonzero(dones)
-        super()._update_info_buffer(  # type: ignore[misc]
-            [infos[row] for row in ended], np.ones(len(ended), dtype=np.bool_)
-        )
-
     def _refuse_dict_observations(self) -> None:
         space = self.observation_space
         if isinstance(space, spaces.Dict):
