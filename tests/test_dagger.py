@@ -140,7 +140,7 @@ def test_the_deviation_stops_at_its_floor():
     model = build(bc_loss="nll", log_std_min=-1.98, learning_rate=1e-2, n_epochs=20).learn(
         ROLLOUT * 4
     )
-    # It is meant in half ranges, and Pendulum's torque has limits of 2.
+    # It is meant for actions in [-1, 1], and Pendulum's torque has limits of 2.
     assert model.policy.log_std.min().item() == pytest.approx(-1.98 + math.log(2.0))
 
 

@@ -32,7 +32,9 @@ def perceptron(widths, activation="tanh", seed=0):
 
 
 def cloning(net, x, labels, index):
-    """The loss "mse" over some rows, and its gradient by each parameter, from compiled code."""
+    """The loss "mse" over some rows, and its gradient with respect to each parameter, from
+    compiled code.
+    """
     log_std = nn.Parameter(th.zeros(labels.shape[1]))
     terms = Perceptron([*net]).gradient(
         x.numpy(), index, labels.numpy(), Loss(bc_coef=1.0), log_std

@@ -24,8 +24,8 @@ from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZ
 from sb3_quad.simulation.settings import FlightSettings
 
 _POSITION = GROUPS["position"]
-# The offset is the mean of the last positions of so many flights to random targets. It is measured
-# again after each correction.
+# The offset is the mean of the last positions of this many flights to random targets. It is
+# measured again after each correction.
 N_OFFSETS = 120
 ROUNDS = 3
 
