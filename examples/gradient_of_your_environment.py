@@ -63,20 +63,20 @@ class CartTape:
         return -costs.detach().numpy(), np.full(n, self.n_steps), np.zeros(n, dtype=bool)
 
     def begin(self, cost):
-        """Begin the way back; return the mean cost. The environment has a cost of its own."""
-        self.by_state = th.zeros(self.env.num_envs, 2)
+        """Begin the backward pass; return the mean cost. The environment has a cost of its own."""
+        self.grad_state = th.zeros(self.env.num_envs, 2)
         return float(th.stack([cost for *_, cost in self.steps]).detach().mean())
 
-    def backward(self, step, by_observation):
-        """Return the gradient by the actions of a step, (n, 1)."""
+    def backward(self, step, grad_observation):
+        """Return the gradient with respect to the actions of a step, (n, 1)."""
         before, action, after, cost = self.steps[step]
         # The observation is the state.
-        by_after = self.by_state + th.from_numpy(by_observation)
-        by_cost = th.full_like(cost, 1.0 / (self.n_steps * self.env.num_envs))
-        self.by_state, by_action = th.autograd.grad(
-            (after, cost), (before, action), (by_after, by_cost)
+        grad_after = self.grad_state + th.from_numpy(grad_observation)
+        grad_cost = th.full_like(cost, 1.0 / (self.n_steps * self.env.num_envs))
+        self.grad_state, grad_action = th.autograd.grad(
+            (after, cost), (before, action), (grad_after, grad_cost)
         )
-        return by_action.numpy()
+        return grad_action.numpy()
 
 
 class Carts(BatchVecEnv):

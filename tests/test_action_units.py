@@ -1,4 +1,4 @@
-"""Actions in other units than [-1, 1]: losses, labels and new actors in half ranges."""
+"""Actions in other units than [-1, 1]: losses, labels and new actors count them in [-1, 1]."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ def trained(algorithm, low, high, dtype="float32", steps=800, **keywords):
     return algorithm("MlpPolicy", env, expert=throttle(low, high), **keywords).learn(steps)
 
 
-def in_half_ranges(model, observations):
+def unit_actions(model, observations):
     """Mean actions of a model, as a stock PPO with its zip gives them, from -1 to 1."""
     space = model.action_space
     with th.no_grad():
@@ -76,7 +76,7 @@ def in_half_ranges(model, observations):
     ("box", "bc_loss"),
     [*(("PWM", kind) for kind in CLONING_LOSSES), ("torque", "huber"), ("rpm", "nll")],
 )
-def test_a_training_in_other_units_is_the_one_in_half_ranges(
+def test_a_training_in_other_units_is_the_one_with_unit_actions(
     monkeypatch, box, compiled, algorithm, bc_loss
 ):
     if not compiled:
@@ -88,7 +88,7 @@ def test_a_training_in_other_units_is_the_one_in_half_ranges(
     plain = trained(algorithm, -1.0, 1.0, **keywords)
     other = trained(algorithm, *BOXES[box], **keywords)
     seen = np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)
-    np.testing.assert_allclose(in_half_ranges(other, seen), in_half_ranges(plain, seen), atol=0.01)
+    np.testing.assert_allclose(unit_actions(other, seen), unit_actions(plain, seen), atol=0.01)
     half = 0.5 * (BOXES[box][1] - BOXES[box][0])
     stds = [model.policy.log_std.detach().exp().numpy() for model in (plain, other)]
     np.testing.assert_allclose(stds[1] / half, stds[0], rtol=0.01)
@@ -103,7 +103,7 @@ def test_the_agent_becomes_the_expert_in_any_units(box, algorithm):
     model = trained(algorithm, *BOXES[box], steps=8000, **keywords)
     seen = np.random.default_rng(0).uniform(-0.5, 0.5, size=(100, 2)).astype(np.float32)
     wanted = throttle(-1.0, 1.0)(seen)
-    assert np.sqrt(np.square(in_half_ranges(model, seen) - wanted).mean()) < 0.15
+    assert np.sqrt(np.square(unit_actions(model, seen) - wanted).mean()) < 0.15
 
 
 def test_the_dataset_holds_actions_in_the_units_of_the_environment():
@@ -116,7 +116,7 @@ def test_state_dependent_exploration_in_other_units():
     plain = trained(PPOBC, -1.0, 1.0, **keywords)
     other = trained(PPOBC, 1000.0, 2000.0, **keywords)
     seen = np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)
-    np.testing.assert_allclose(in_half_ranges(other, seen), in_half_ranges(plain, seen), atol=0.02)
+    np.testing.assert_allclose(unit_actions(other, seen), unit_actions(plain, seen), atol=0.02)
 
 
 def test_a_stock_ppo_flies_the_zip_in_the_units_of_the_environment(tmp_path):

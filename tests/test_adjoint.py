@@ -17,7 +17,7 @@ from torch import nn
 
 from sb3_quad.algorithms.apg import APG
 from sb3_quad.algorithms.flight_cost import FlownStates, flight_cost
-from sb3_quad.algorithms.networks.gradients import Passes, Perceptrons, network_of
+from sb3_quad.algorithms.networks.gradients import Perceptrons, RecordedPolicy, network_of
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.simulation.adjoint import MOVING
 from sb3_quad.simulation.batch import QuadcopterBatch
@@ -90,12 +90,12 @@ class LinearCost:
 
 
 def gradients(tape, cost):
-    """Return the gradients by actions (steps, n, 4) and by the start state (17, n)."""
+    """Return the gradients with respect to actions (steps, n, 4) and to the start state (17, n)."""
     tape.begin(cost)
-    by_actions = [
+    grad_actions = [
         tape.backward(step, cost.observations[step + 1]) for step in reversed(range(tape.n_steps))
     ]
-    return np.array(by_actions[::-1]), tape.by_start.copy()
+    return np.array(grad_actions[::-1]), tape.grad_start.copy()
 
 
 def assert_close(ours, theirs, relative, axis):
@@ -111,7 +111,7 @@ def record_and_compare(tape, actions, seed):
     observations = [batch.observe(), *(tape.step(action) for action in actions)]
     after = batch.snapshot()
     cost = LinearCost(tape, seed)
-    by_actions, by_start = gradients(tape, cost)
+    grad_actions, grad_start = gradients(tape, cost)
 
     batch.restore(before)
     free = th.tensor(actions).double().requires_grad_()
@@ -125,11 +125,11 @@ def record_and_compare(tape, actions, seed):
         observations[:-1], flight.observations.detach(), rtol=2e-6, atol=2e-6
     )
     expected = th.autograd.grad(cost.of(flight), (free, start))
-    # Noise is float32, and all else of the way back float64.
+    # Noise is float32, and all else of the backward pass float64.
     tolerance = 1e-6 if batch.scaling[-2:].any() else 1e-11
-    assert_close(by_actions, expected[0].numpy(), tolerance, (0, 2))
-    assert_close(by_start * SCALE[:, None], expected[1].numpy().T * SCALE[:, None], tolerance, 0)
-    return by_actions
+    assert_close(grad_actions, expected[0].numpy(), tolerance, (0, 2))
+    assert_close(grad_start * SCALE[:, None], expected[1].numpy().T * SCALE[:, None], tolerance, 0)
+    return grad_actions
 
 
 SHARED = load_vehicle("cf21B_500").model_copy(update={"saturation": "shared"})
@@ -277,7 +277,7 @@ def test_the_gradient_by_the_start_is_that_of_differences(vehicle, substeps):
         tape.step(action)
     # Observations are float32, which no difference of 1e-6 survives.
     cost = LinearCost(tape, 1, observed=False)
-    _, by_start = gradients(tape, cost)
+    _, grad_start = gradients(tape, cost)
 
     def costs(row, change):
         batch.restore(start)
@@ -292,8 +292,8 @@ def test_the_gradient_by_the_start_is_that_of_differences(vehicle, substeps):
         h = 1e-3 * scale
         # Exact but for h⁴
         slope = 8 * (costs(row, h) - costs(row, -h)) - (costs(row, 2 * h) - costs(row, -2 * h))
-        error = np.abs(slope / (12 * h) - by_start[row]) * scale
-        assert (error <= 1e-6 * np.abs(by_start * SCALE[:, None]).max(axis=0)).all(), row
+        error = np.abs(slope / (12 * h) - grad_start[row]) * scale
+        assert (error <= 1e-6 * np.abs(grad_start * SCALE[:, None]).max(axis=0)).all(), row
 
 
 def test_the_number_of_threads_changes_no_bit():
@@ -312,11 +312,11 @@ def test_the_number_of_threads_changes_no_bit():
         for action in random_actions(steps, n, 0):
             tape.step(action)
         found.append((tape, *gradients(tape, LinearCost(tape, 1))))
-    for tape, by_actions, by_start in found[1:]:
+    for tape, grad_actions, grad_start in found[1:]:
         np.testing.assert_array_equal(tape.states, found[0][0].states)
-        np.testing.assert_array_equal(by_actions, found[0][1])
-        np.testing.assert_array_equal(by_start, found[0][2])
-    assert by_actions.any(axis=(0, 2)).all() and by_start.any(axis=0).all()
+        np.testing.assert_array_equal(grad_actions, found[0][1])
+        np.testing.assert_array_equal(grad_start, found[0][2])
+    assert grad_actions.any(axis=(0, 2)).all() and grad_start.any(axis=0).all()
 
 
 CARRIED = {
@@ -414,14 +414,14 @@ def test_a_gradient_goes_through_a_policy_as_by_autograd(
     is_compiled = isinstance(network_of(policy), Perceptrons)
     assert is_compiled == (activation is not nn.ELU or not widths)
     twin = deepcopy(policy)
-    passes = Passes(policy, calls, rows)
+    recorded = RecordedPolicy(policy, calls, rows)
     observed, given = th.randn(calls, rows, inputs), th.randn(calls, rows, outputs).double()
     for step in range(calls):
-        actions = passes.forward(step, observed[step].numpy())
+        actions = recorded.forward(step, observed[step].numpy())
         means = twin.get_distribution(observed[step]).mode()
         np.testing.assert_allclose(actions, means.detach(), rtol=1e-4, atol=2e-6)
     for step in reversed(range(calls)):
-        ours = passes.backward(step, given[step].numpy())
+        ours = recorded.backward(step, given[step].numpy())
         free = observed[step].clone().requires_grad_()
         twin.get_distribution(free).mode().backward(given[step].float())
         assert ours.dtype == np.float32

@@ -14,6 +14,7 @@ from sb3_quad import APG, DAgger, QuadcopterVecEnv, fly, load_pretrained
 from sb3_quad.algorithms.flight_cost import flight_cost
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.controllers.zips import load_model, saved_algorithm
+from sb3_quad.simulation.random import STEP
 
 TASKS = {"state_recovery": 0.5, "target_tracking": 0.5}
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples/gradient_of_your_environment.py"
@@ -82,6 +83,16 @@ def test_flights_that_carry_on_continue_where_they_were():
     np.testing.assert_array_equal(env.batch.state, end)
     tape.reset(carry_on=False)
     assert not np.array_equal(env.batch.state, end)
+
+
+def test_flights_that_carry_on_end_at_their_time_limit():
+    env = QuadcopterVecEnv(8, task="target_tracking", max_episode_steps=12, seed=0)
+    tape = env.record(5)
+    for steps_before in (0, 5, 10, 0):
+        tape.reset(carry_on=True)
+        assert (env.batch.streams[STEP] == steps_before).all()
+        for _ in range(5):
+            tape.step(np.zeros((8, 4), np.float32))
 
 
 def test_a_cost_of_ones_own_is_what_is_minimised():

@@ -11,6 +11,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.flights import fly, fly_settings
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.tasks import Task
 
 
 def hover(observation):
@@ -60,6 +61,20 @@ def test_settings_for_all_override_those_of_the_agents():
     assert "true state" in result.tables[0].title and "flies" not in result.tables[0].caption
 
 
+@pytest.mark.parametrize(
+    ("noise", "title"),
+    [
+        ([0.0, 0.0], "true state"),
+        ({"relative": 0.0}, "true state"),
+        ({"additive": 0.1}, "the same for all"),
+        ([0.0, 0.1], "the same for all"),
+    ],
+)
+def test_a_table_says_where_the_state_is_the_true_one(noise, title):
+    result = compare({"PID": "pid"}, ["target_tracking"], 2, noise=noise, max_episode_steps=5)
+    assert result.tables[0].title.endswith(title)
+
+
 def test_a_comparison_is_plain_text_and_a_table_in_notebooks():
     mixture = {"target_tracking": 1, "state_recovery": 3}
     result = compare(
@@ -85,6 +100,7 @@ def test_a_comparison_is_plain_text_and_a_table_in_notebooks():
         ({"PID": "pidd"}, {}, "did you mean 'pid'"),
         ({"PID": "pid"}, {"vehicel": "itm"}, "did you mean 'vehicle'"),
         ({"PID": "pid"}, {"tasks": ["recovery"]}, "unknown task 'recovery'"),
+        ({"PID": "pid"}, {"tasks": [Task(), Task()]}, "several tasks are named custom"),
         ({"PID": "pid"}, {"n_flights": 0}, "n_flights is 0, must be at least 1"),
         ({}, {}, "give at least one controller"),
         ({"PID": "pid"}, {"reward": "no_such_module:reward"}, "reward no_such_module:reward"),

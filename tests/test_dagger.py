@@ -140,7 +140,7 @@ def test_the_deviation_stops_at_its_floor():
     model = build(bc_loss="nll", log_std_min=-1.98, learning_rate=1e-2, n_epochs=20).learn(
         ROLLOUT * 4
     )
-    # It is meant in half ranges, and Pendulum's torque has limits of 2.
+    # It is meant for actions in [-1, 1], and Pendulum's torque has limits of 2.
     assert model.policy.log_std.min().item() == pytest.approx(-1.98 + math.log(2.0))
 
 
@@ -327,6 +327,13 @@ def test_a_loaded_model_predicts_without_environment_or_expert(tmp_path):
     )
     with pytest.raises(ExpertError, match="set_expert"):
         DAgger.load(tmp_path / "model", env=pendulum()).learn(ROLLOUT)
+
+
+def test_an_expert_can_be_taken_away():
+    model = build(beta=0.0).learn(ROLLOUT)
+    model.set_expert(None)
+    model.learn(ROLLOUT)
+    assert len(model.dataset) == ROLLOUT
 
 
 # --- Faults

@@ -23,6 +23,7 @@ from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
+from sb3_quad.evaluation.evaluate import evaluate as evaluate_suite
 from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.results import load_results
@@ -257,6 +258,28 @@ def test_an_interrupted_evaluation_goes_on_by_the_same_command_alone(here, capsy
         assert code == 0 and kept == (["pid", "pid"] if again == command else [])
         assert len(load_results("out").entries) == 4 and load_results("out").finished
         shutil.rmtree("out")
+
+
+def test_an_interrupted_evaluation_with_a_function_as_reward_resumes(here):
+    def own_reward():
+        """A function that lies elsewhere each time, as it does in another process."""
+
+        def calm(state, actions):
+            return np.zeros(len(actions))
+
+        return calm
+
+    def interrupt(done, total, name):
+        if done == 1:
+            raise KeyboardInterrupt
+
+    suite = load_suite("small.yaml")
+    pid = parse_controllers(["pid"])
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_suite(suite, pid, "out", reward=own_reward(), progress=interrupt)
+    assert not load_results("out").finished
+    evaluate_suite(suite, pid, "out", reward=own_reward())
+    assert load_results("out").finished and load_results("out").reward == "calm"
 
 
 def test_failures_are_one_line_each_and_the_others_fly(here, capsys):

@@ -9,10 +9,11 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from sb3_quad import PPOBC, DAgger, GeometricExpert
+from sb3_quad import APG, PPOBC, DAgger, GeometricExpert
 from sb3_quad.algorithms import dagger, ppo_bc
 from sb3_quad.algorithms.networks import gradients as networks
 from sb3_quad.algorithms.networks import losses
@@ -31,7 +32,9 @@ def perceptron(widths, activation="tanh", seed=0):
 
 
 def cloning(net, x, labels, index):
-    """The loss "mse" over some rows, and its gradient by each parameter, from compiled code."""
+    """The loss "mse" over some rows, and its gradient with respect to each parameter, from
+    compiled code.
+    """
     log_std = nn.Parameter(th.zeros(labels.shape[1]))
     terms = Perceptron([*net]).gradient(
         x.numpy(), index, labels.numpy(), Loss(bc_coef=1.0), log_std
@@ -321,6 +324,40 @@ def test_policies_give_what_their_own_methods_give(keywords, computed):
     th.manual_seed(1)
     for one, other in zip(ours, policy(x), strict=True):
         th.testing.assert_close(one, other.detach(), rtol=1e-4, atol=1e-5)
+
+
+class HalfPolicy(ActorCriticPolicy):
+    """Gives half of what its actor does."""
+
+    def _get_action_dist_from_latent(self, latent_pi):
+        mean = 0.5 * self.action_net(latent_pi)
+        return self.action_dist.proba_distribution(mean, self.log_std)
+
+
+def test_a_policy_with_methods_of_its_own_is_left_to_pytorch():
+    model = DAgger(HalfPolicy, QuadcopterVecEnv(4, seed=0), device="cpu")
+    assert networks.network_of(model.policy) is model.policy
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "keywords"),
+    [
+        (PPOBC, {"expert": "pid", "critic_warmup": 0, "bc_loss": "nll", "bc_filter": "none"}),
+        (DAgger, {"expert": "pid", "bc_loss": "nll"}),
+        (APG, {}),
+    ],
+)
+@pytest.mark.parametrize("frozen", ["mlp_extractor.policy_net.0.weight", "log_std"])
+def test_a_frozen_parameter_stays(algorithm, keywords, frozen):
+    model = algorithm(
+        "MlpPolicy", QuadcopterVecEnv(8, seed=0), n_steps=16, seed=0, device="cpu", **keywords
+    )
+    parameters = dict(model.policy.named_parameters())
+    parameters[frozen].requires_grad = False
+    before = {name: parameter.detach().clone() for name, parameter in parameters.items()}
+    model.learn(128)
+    assert th.equal(parameters[frozen], before[frozen])
+    assert not th.equal(parameters["action_net.bias"], before["action_net.bias"])
 
 
 def test_layers_with_hooks_or_of_other_types_are_left_to_pytorch():

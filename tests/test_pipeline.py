@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.offset_correction import (
     Correction,
@@ -204,6 +205,24 @@ def test_moved_and_scaled_positions_are_part_of_the_actor():
     np.testing.assert_allclose(
         model.predict(observations, deterministic=True)[0], before, atol=1e-5
     )
+
+
+@pytest.mark.parametrize("variance", [0.04, 1.0, 9.0])
+def test_the_correction_counts_the_scale_of_vec_normalize(monkeypatch, variance):
+    env = VecNormalize(QuadcopterVecEnv(16, noise=0.0, seed=1))
+    env.obs_rms.var[:] = variance
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    offsets = iter([np.array([0.3, -0.2, 0.5]), *np.zeros((3, 3))])
+    monkeypatch.setattr(
+        "sb3_quad.algorithms.offset_correction.hover_offset", lambda *_, **__: next(offsets)
+    )
+    raw = env.venv.reset()
+    moved = raw.copy()
+    moved[:, :3] += (np.array([0.3, -0.2, 0.5]) / (10 / np.sqrt(3))).astype(np.float32)
+    before = model.predict(env.normalize_obs(moved), deterministic=True)[0]
+    correct_offset(model)
+    after = model.predict(env.normalize_obs(raw), deterministic=True)[0]
+    np.testing.assert_allclose(after, before, atol=1e-5)
 
 
 def test_the_offset_of_an_agent_that_crashes_cannot_be_measured():

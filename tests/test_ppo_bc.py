@@ -308,7 +308,7 @@ def test_state_dependent_exploration_clones_by_the_mean():
     data = next(model.rollout_buffer.get())
     with th.no_grad():
         mean = model.policy.get_distribution(data.observations).mode()
-    expected = 5.0 * 2.0 * (mean - data.expert_actions).mean(dim=0) / 2.0  # a half range
+    expected = 5.0 * 2.0 * (mean - data.expert_actions).mean(dim=0) / 2.0  # scaled to [-1, 1]
     assert expected.abs() > 0.05
     th.testing.assert_close(by_mean[1] - by_mean[0], expected, rtol=1e-3, atol=1e-4)
     th.testing.assert_close(*by_deviation)
@@ -457,6 +457,8 @@ def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tm
         return TransformObservation(gym.make("QuadTargetTracking-v0"), lambda x: -x, box)
 
     assert flights_of(PPOBC("MlpPolicy", make_vec_env(turned, 1))) is None
+    normalised.set_env(make_vec_env(turned, 2))
+    assert flights_of(normalised) is None
 
 
 def test_an_offset_is_corrected_by_the_settings_of_the_own_environment(monkeypatch):

@@ -264,5 +264,8 @@ def test_a_pipeline_whose_stages_do_not_fit_is_refused_before_the_first(tmp_path
     two = {"name": "two", "algo": "ppo_bc", "env": ENV}
     with pytest.raises(ConfigError, match="stage 'two': normalize: must be as in"):
         stage_jobs(Pipeline(stages=[one, two]), {})
+    settings = {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan"}
     with pytest.raises(ConfigError, match="stage 'one': correct_offset: flies without wrappers"):
-        stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0}]), {})
+        stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0, "settings": settings}]), {})
+    (job,) = stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0}]), {})
+    assert job.config.normalize

@@ -25,7 +25,7 @@ from sb3_quad.algorithms.flight_cost import (
     flight_cost,
     low_force_cost,
 )
-from sb3_quad.algorithms.networks.gradients import Passes
+from sb3_quad.algorithms.networks.gradients import RecordedPolicy
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.simulation.tape import FlightCost
@@ -35,7 +35,7 @@ class Tape(Protocol):
     """Records flights of n environments, and carries gradients back through their steps.
 
     An environment that ``APG`` can train on has ``record(n_steps, substeps)``, which returns one.
-    A recording is :meth:`reset`, then :meth:`step` once for each step; the way back is
+    A recording is :meth:`reset`, then :meth:`step` once for each step; the backward pass is
     :meth:`begin`, then :meth:`backward` once for each step, the last one first.
     """
 
@@ -52,31 +52,31 @@ class Tape(Protocol):
         """Return the sum of the rewards, the length, and whether it was lost, of each flight."""
 
     def begin(self, cost: FlightCost) -> float:
-        """Begin the way back; return the mean cost of a step.
+        """Begin the backward pass; return the mean cost of a step.
 
         :param cost: that of a quadcopter's states. An environment with a cost of its own ignores
             it.
         """
 
-    def backward(self, step: int, by_observation: Float32Array) -> FloatArray:
-        """Return the gradient of the mean cost by the actions of a step, (n, a).
+    def backward(self, step: int, grad_observation: Float32Array) -> FloatArray:
+        """Return the gradient of the mean cost with respect to the actions of a step, (n, a).
 
         It includes what these actions do in later steps, of which the tape keeps account.
 
-        :param by_observation: the gradient by the observations after the step, (n, ...), by way of
-            the actions that the policy took on them.
+        :param grad_observation: the gradient with respect to the observations after the step,
+            (n, ...). It comes through the actions that the policy took on them.
         """
 
 
 class APG(ExpertMixin, OnPolicyAlgorithm):
     """Analytic policy gradient (APG): differentiate whole flights, and descend.
 
-    The equations of motion are known and smooth, so the gradient of a flight's cost by the policy's
-    weights can be computed exactly: the flight is recorded, then the derivative is carried back
-    through policy, observation, delay, rotors and rigid body. There is no critic, no teacher and no
-    exploration. Relatives are backpropagation through time (Werbos, 1990), SHAC (Xu et al., 2022),
-    which adds a critic to short windows, and Heeg, Song and Scaramuzza, "Learning Quadrotor Control
-    From Visual Features Using Differentiable Simulation" (2024).
+    The equations of motion are known and smooth, so the gradient of a flight's cost with respect to
+    the policy's weights can be computed exactly: the flight is recorded, then the derivative is
+    carried back through policy, observation, delay, rotors and rigid body. There is no critic,
+    no teacher and no exploration. Relatives are backpropagation through time (Werbos, 1990),
+    SHAC (Xu et al., 2022), which adds a critic to short windows, and Heeg, Song and Scaramuzza,
+    "Learning Quadrotor Control From Visual Features Using Differentiable Simulation" (2024).
 
     In each update every environment flies ``n_steps`` control steps by the mean action of the
     policy. The optimiser then takes one step along the gradient of the mean cost. Only the actor
@@ -93,15 +93,15 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         a fiftieth.
     :param n_steps: Control steps of each flight in an update. Whole flights take some 300.
     :param max_grad_norm: The gradient is scaled down to this length where it is longer.
-    :param max_row_ratio: At each step the gradient by the actions of an environment is scaled down
-        to this many times the median length over all of them. With a vehicle for each episode a few
-        flights on the verge of chaos outweigh the others without it; 3 is a good value. None: it is
-        left as it is.
+    :param max_row_ratio: At each step the gradient with respect to the actions of an environment is
+        scaled down to this many times the median length over all of them. With a vehicle for each
+        episode a few flights on the verge of chaos outweigh the others without it; 3 is a good
+        value. None: it is left as it is.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. From scratch, whole flights learn badly: clone an expert first (DAgger), or
         fly short windows with ``carry_on``.
-    :param carry_on: Let each update continue the flights of the one before; what crashed begins
-        again.
+    :param carry_on: Let each update continue the flights of the one before. A flight that crashed
+        or reached its time limit begins again.
     :param cost: The cost of each control step, (steps, n), as a function of
         :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved.
     :param low_force_coef: Weight of
@@ -115,7 +115,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
-    _unsaved = ("cost", "_tape", "_passes")
+    _not_saved = ("cost", "_tape", "_recorded_policy")
     _tape: Tape
 
     def __init__(
@@ -171,7 +171,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.optimizer = optimizer
 
         if _init_setup_model:
-            self._begin(initial)
+            self._set_up(initial)
 
     def learn(
         self,
@@ -206,7 +206,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             raise ConfigError(
                 f"{type(env).__name__}: low_force_coef is a cost of quadcopters; remove it"
             )
-        self._passes = Passes(self.policy, self.n_steps, self.n_envs)
+        self._recorded_policy = RecordedPolicy(self.policy, self.n_steps, self.n_envs)
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
@@ -224,7 +224,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         observations = self._tape.reset(self.carry_on)
         infos: list[StrDict] = [{} for _ in range(env.num_envs)]
         for step in range(n_rollout_steps):
-            observations = self._tape.step(self._passes.forward(step, observations))
+            observations = self._tape.step(self._recorded_policy.forward(step, observations))
             self.num_timesteps += env.num_envs
             # Callbacks find every flight to end with the recording.
             dones = np.full(env.num_envs, step == n_rollout_steps - 1)
@@ -254,10 +254,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         # What the critic or an earlier update has left; autograd adds to it.
         self.policy.optimizer.zero_grad()
         # The observation after the last step leads to no action.
-        by_observations = np.zeros_like(self._last_obs)
+        grad_observations = np.zeros_like(self._last_obs)
         for step in reversed(range(self.n_steps)):
-            by_actions = self._limited(self._tape.backward(step, by_observations))
-            by_observations = self._passes.backward(step, by_actions)
+            grad_actions = self._limited(self._tape.backward(step, grad_observations))
+            grad_observations = self._recorded_policy.backward(step, grad_actions)
 
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         if not (np.isfinite(cost) and th.isfinite(norm)):

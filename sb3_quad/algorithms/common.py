@@ -69,25 +69,25 @@ History = dict[str, list[float]]
 """The terms of an update's losses in each of its mini-batches, by logged name."""
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
-# A half range beyond this is no limit at all.
+# A limit further than this from the middle of the range is none at all.
 _UNLIMITED = 1e9
 
 
-def in_half_ranges(train: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Let an update count actions in half ranges of the action space, from its middle.
+def with_unit_actions(train: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Rescale actions to [-1, 1] during an update, and back after it.
 
-    The losses and their constants are meant so. And Adam moves all weights by about the same, which
-    is nothing to an actor that gives 1,000 to 2,000, and too much to one that gives ±0.002. So the
-    last layer is scaled for the update, and back after it. In a Box of [-1, 1] nothing is done.
+    The losses assume that scale, and Adam's steps do not adapt to any other: it moves all weights
+    by about the same, which is nothing to an actor that gives 1,000 to 2,000, and too much to one
+    that gives ±0.002. In a Box of [-1, 1] nothing is done.
     """
 
     @wraps(train)
     def scaled(self: Any) -> None:
-        self._rescale(True)
+        self._scale_actions()
         try:
             train(self)
         finally:
-            self._rescale(False)
+            self._scale_actions(inverse=True)
 
     return scaled
 
@@ -116,7 +116,7 @@ class ExpertMixin:
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
     # What else of an algorithm no zip holds.
-    _unsaved: tuple[str, ...] = ()
+    _not_saved: tuple[str, ...] = ()
 
     def set_expert(self, expert: ExpertLike | None) -> None:
         """Learn from ``expert`` from now on, as a model must that was loaded without one."""
@@ -125,7 +125,8 @@ class ExpertMixin:
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Learn in another environment from now on; see SB3's ``set_env``.
 
-        The model's zips say from then on that its agent flies as this environment does.
+        The model's zips say from then on that its agent flies as this environment does, or nothing
+        of how it flies where that cannot be read.
         """
         super().set_env(env, force_reset)  # type: ignore[misc]
         self._note_flight_settings()
@@ -151,7 +152,7 @@ class ExpertMixin:
         return offset_correction.correct_offset(self, seed, settings, scale)  # type: ignore[arg-type]
 
     def _check_arguments(self) -> None:
-        # SB3 would pickle NumPy's numbers into the zip, and takes not all of them.
+        # SB3 would pickle NumPy numbers into the zip, and does not accept all of them.
         for name, value in [*vars(self).items()]:
             if isinstance(value, np.generic):
                 setattr(self, name, value.item())
@@ -164,7 +165,7 @@ class ExpertMixin:
                 continue
             if not isinstance(value, (int, float)) or not value >= least:
                 raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
-        # DAgger's None is nothing that PPO could load.
+        # PPO cannot load the None that DAgger allows.
         if getattr(self, "max_grad_norm", 0.0) is None:
             self.max_grad_norm = math.inf
         # Rows are sampled all at once.
@@ -189,7 +190,7 @@ class ExpertMixin:
             if value not in names:
                 raise ConfigError(unknown(argument, value, names))
 
-    def _begin(self, initial: BaseAlgorithm | None) -> None:
+    def _set_up(self, initial: BaseAlgorithm | None) -> None:
         """Set the model up, with the policy of the agent that it starts from."""
         self._setup_model()
         if initial is not None:
@@ -225,32 +226,36 @@ class ExpertMixin:
         except RuntimeError as error:
             raise RuntimeError(f"set_parameters: {one_line(error)}") from None
 
-    def _rescale(self, into: bool) -> None:
-        """Let actor and rollout count actions in half ranges from the middle, or as they are again.
+    def _scale_actions(self, inverse: bool = False) -> None:
+        """Rescale actions to [-1, 1] during an update. The losses assume that scale, and Adam's
+        steps do not adapt to any other.
 
+        :param inverse: scale them back.
         :raises ConfigError: no limits to speak of, or an actor without a plain last layer.
         """
-        half, middle = half_ranges(self.action_space, into)
-        if (half == 1.0).all() and not middle.any():
+        factor, offset = unit_action_transform(self.action_space, inverse)
+        if (factor == 1.0).all() and not offset.any():
             return
         policy = self.policy
         buffer = self.rollout_buffer
-        buffer.expert_actions = buffer.expert_actions * half + middle
-        if policy.squash_output:  # which gives half ranges already
+        buffer.expert_actions = buffer.expert_actions * factor + offset
+        if policy.squash_output:  # which gives actions in [-1, 1] already
             return
-        buffer.actions = buffer.actions * half + middle
-        buffer.log_probs = buffer.log_probs - np.log(half).sum()
-        scale = th.as_tensor(half, device=policy.device)
+        buffer.actions = buffer.actions * factor + offset
+        buffer.log_probs = buffer.log_probs - np.log(factor).sum()
+        scale = th.as_tensor(factor, device=policy.device)
         unfit = f"action space {self.action_space}: wrap it in RescaleAction(env, -1, 1)"
         with raised_as(ConfigError, unfit), th.no_grad():
             policy.action_net.weight *= scale[:, None]
-            policy.action_net.bias.mul_(scale).add_(th.as_tensor(middle, device=policy.device))
+            policy.action_net.bias.mul_(scale).add_(th.as_tensor(offset, device=policy.device))
             policy.log_std += scale.log()
 
     def _note_flight_settings(self) -> None:
         settings = flight_settings_of(self.env)
         if settings is not None:
             settings.write_into(self)
+        elif hasattr(self, KEY):
+            delattr(self, KEY)  # those of an environment before
         # BaseAlgorithm has them by this name, which no zip holds.
         setattr(self, STATISTICS, self._vec_normalize_env)
 
@@ -269,13 +274,6 @@ class ExpertMixin:
         self._labeller = Controller.for_env(self.expert, env, self._labeller)
         with th.enable_grad():  # SB3's loops have no gradients, which an expert may need
             return self._labeller.labels(self._last_obs, self._last_episode_starts)
-
-    def _update_info_buffer(self, infos: list[Any], dones: Any = None) -> None:
-        # SB3 would look at all infos, and only those of episodes that have ended say anything.
-        ended = np.flatnonzero(dones)
-        super()._update_info_buffer(  # type: ignore[misc]
-            [infos[row] for row in ended], np.ones(len(ended), dtype=np.bool_)
-        )
 
     def _refuse_dict_observations(self) -> None:
         space = self.observation_space
@@ -311,13 +309,15 @@ class ExpertMixin:
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
-        return [*super()._excluded_save_params(), *own, *self._unsaved]  # type: ignore[misc]
+        return [*super()._excluded_save_params(), *own, *self._not_saved]  # type: ignore[misc]
 
 
-def half_ranges(space: spaces.Box, into: bool) -> tuple[Float32Array, Float32Array]:
-    """Return factors and offsets, (a,) each, that make actions of half ranges from the middle.
+def unit_action_transform(
+    space: spaces.Box, inverse: bool = False
+) -> tuple[Float32Array, Float32Array]:
+    """Return factors and offsets, (a,) each, that take actions of a space to [-1, 1].
 
-    :param into: False: the other way round.
+    :param inverse: return those that take actions in [-1, 1] to the space.
     :raises ConfigError: limits so far apart that they are none.
     """
     low, high = limits_of(space)
@@ -326,7 +326,7 @@ def half_ranges(space: spaces.Box, into: bool) -> tuple[Float32Array, Float32Arr
     if not (half < _UNLIMITED).all():
         raise ConfigError(f"action space {space}: give it the limits of the actuators")
     half[half == 0.0] = 1.0  # an action that cannot change
-    if not into:
+    if inverse:
         return half, middle
     return 1.0 / half, -middle / half
 

@@ -25,10 +25,10 @@ from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
     actor_and_critic_parameters,
-    half_ranges,
-    in_half_ranges,
     model_of,
     policy_arguments,
+    unit_action_transform,
+    with_unit_actions,
 )
 from sb3_quad.algorithms.networks.gradients import (
     Batch,
@@ -69,7 +69,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     with Σw² over the weight matrices of both networks, without biases and log_std.
 
     For any environment with a Box action space and observations that are not a Dict. Errors of
-    actions and log_std count in half ranges of that Box, from its middle. Papers:
+    actions and log_std are those of actions scaled to [-1, 1]. Papers:
     https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
 
     A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from
@@ -129,7 +129,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
-    _unsaved = ("dataset",)
+    _not_saved = ("dataset",)
 
     def __init__(
         self,
@@ -211,7 +211,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if expert is not None:
             self.set_expert(expert)
         if _init_setup_model:
-            self._begin(initial)
+            self._set_up(initial)
             if demonstrations is not None:
                 self.dataset.load(demonstrations)
 
@@ -239,7 +239,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             raise ConfigError(
                 f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy"
             )
-        self._rescale(False)
+        self._scale_actions(inverse=True)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         dtype = self.rollout_buffer.observations.dtype
@@ -254,11 +254,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.dataset.action_range = limits_of(self.action_space)
 
     def set_expert(self, expert: ExpertLike | None) -> None:
-        """Learn from ``expert`` from now on.
+        """Learn from ``expert`` from now on. None: from the pairs that the dataset holds alone.
 
         :raises ExpertError: an expert that does not fit the environment
         """
-        if self.env is not None:
+        if expert is not None and self.env is not None:
             self._labeller = Controller.for_env(expert, self.env, self._labeller)
         self.expert = expert
 
@@ -298,8 +298,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """
-        if self.will_clone():
-            self.set_expert(self.expert)
+        if self.will_clone() and self.env is not None:
+            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
         if reset_num_timesteps:
             self._n_rollouts = 0
         return super().learn(
@@ -393,7 +393,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    @in_half_ranges
+    @with_unit_actions
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
 
@@ -421,9 +421,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         )
         actor_parameters, critic_parameters = actor_and_critic_parameters(self.policy)
 
-        # + Labels in half ranges, and rows of the dataset for the actor
-        half, middle = half_ranges(self.action_space, into=True)
-        labels = self.dataset.filled["actions"] * half + middle
+        # + Labels in [-1, 1], and rows of the dataset for the actor
+        factor, offset = unit_action_transform(self.action_space)
+        labels = self.dataset.filled["actions"] * factor + offset
         buffer = self.rollout_buffer
         rng = self._generator(1)
         n_rows = buffer.buffer_size * buffer.n_envs
@@ -431,7 +431,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         n_passes = self.n_epochs * math.ceil(n_rows / self.batch_size)
         n_batches = min(self.gradient_steps or n_passes, self.n_epochs * n_rows)
         actor_rows = sample_rows(len(self.dataset), n_batches * batch_size, rng, self.shuffle)
-        # + Rows of the rollout for the critic, which takes part in every so many steps
+        # + Rows of the rollout for the critic, which takes part in some of the steps
         n_critic = min(n_passes, n_batches)
         critic_rows = sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle)
         critic_batches = iter(np.array_split(critic_rows, n_critic))

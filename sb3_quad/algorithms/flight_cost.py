@@ -14,13 +14,13 @@ from sb3_quad.vehicles.vehicle import GRAVITY
 COARSE, FINE = 0.5, 0.05
 # Weight of the body rates at the target. Without it an agent oscillates there with delays or motors
 # that it has not seen often.
-CALM = 0.03
-# Weight of the heading's error, rad, at the target, where a heading is asked for
+BODY_RATES_WEIGHT = 0.03
+# Weight of the heading's error, rad, at the target, where one is commanded
 HEADING = 0.1
 # Below this height, m, a flight is in danger.
-LOW = 1.5
+SAFE_HEIGHT = 1.5
 # How much the mean specific force along body z may lack of 1 g, and over how many seconds
-LACK = 0.45
+FORCE_DEFICIT = 0.45
 WINDOW = 0.8
 
 
@@ -38,7 +38,7 @@ class FlownStates(NamedTuple):
     target: th.Tensor  # (..., 3), m: the position of the reference
     target_velocity: th.Tensor  # (..., 3), m/s
     target_acceleration: th.Tensor  # (..., 3), m/s²
-    target_heading: th.Tensor  # (..., 2), cosine and sine; zeros where none is asked for
+    target_heading: th.Tensor  # (..., 2), cosine and sine; zeros where none is commanded
     target_heading_rate: th.Tensor  # (..., 1), rad/s
     target_ahead: th.Tensor  # (..., 3), m/s², the acceleration in AHEAD seconds
     actions: th.Tensor  # (..., 4), before they are clipped to [-1, 1]
@@ -55,14 +55,14 @@ class FlownStates(NamedTuple):
 
     @property
     def heading_error(self) -> th.Tensor:
-        """2 sin(e / 2) of the angle e between the heading and the one that is asked for, if any,
-        and 0 if none is; the vehicle's nose is projected on the ground.
+        """2 sin(e / 2) of the angle e between the heading and the commanded one, and 0 if none
+        is commanded; the vehicle's nose is projected on the ground.
         """
         w, x, y, z = self.quaternion.unbind(dim=-1)
         nose = th.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], dim=-1)
         nose = nose / (nose.square().sum(dim=-1, keepdim=True) + 1e-6).sqrt()
-        asked = self.target_heading
-        return length(asked - nose * asked.square().sum(dim=-1, keepdim=True))
+        commanded = self.target_heading
+        return length(commanded - nose * commanded.square().sum(dim=-1, keepdim=True))
 
 
 def cost_and_gradients(
@@ -72,14 +72,14 @@ def cost_and_gradients(
     counts: BoolArray,
 ) -> tuple[float, FloatArray, FloatArray]:
     """Evaluate a cost as :data:`~sb3_quad.simulation.tape.FlightCost` says, by autograd."""
-    by_states = th.from_numpy(states).requires_grad_()
-    by_actions = th.from_numpy(actions).double().requires_grad_()
+    state_tensor = th.from_numpy(states).requires_grad_()
+    action_tensor = th.from_numpy(actions).double().requires_grad_()
     # One split: the gradients of slices would be added up in an array of all states each.
-    parts = [part.transpose(1, 2) for part in th.split(by_states, [*STATE.values()], dim=1)]
-    each = cost(FlownStates._make([*parts, by_actions]))
-    mean = th.where(th.from_numpy(counts), each, 0.0).mean()
+    parts = [part.transpose(1, 2) for part in th.split(state_tensor, [*STATE.values()], dim=1)]
+    costs = cost(FlownStates._make([*parts, action_tensor]))
+    mean = th.where(th.from_numpy(counts), costs, 0.0).mean()
     gradients = th.autograd.grad(
-        mean, (by_states, by_actions), allow_unused=True, materialize_grads=True
+        mean, (state_tensor, action_tensor), allow_unused=True, materialize_grads=True
     )
     return mean.item(), gradients[0].numpy(), gradients[1].numpy()
 
@@ -95,18 +95,18 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     The distance costs d / (d + 0.5) + d / (d + 0.05), which is steep in the last metre and flat
     far away, so that no target is too far to matter. Body rates cost little on the way, and more
     within half a metre of the target. Small terms stand against a tilt and against actions beyond
-    their limits, and against another heading than the one that is asked for. Below a height of
+    their limits, and against another heading than the commanded one. Below a height of
     1.5 m the ground costs, since the crash itself has no gradient.
     """
     d = flown.distance
     cost = d / (d + COARSE) + d / (d + FINE)
     near = 1.0 / (1.0 + (d / COARSE) ** 2)
-    weight = 0.002 + CALM * near
+    weight = 0.002 + BODY_RATES_WEIGHT * near
     cost = cost + weight * length(flown.body_rates) + 0.001 * (1.0 - flown.r33)
     cost = cost + HEADING * near * flown.heading_error
     beyond = flown.actions - flown.actions.clamp(-1.0, 1.0)
     cost = cost + 0.01 * beyond.square().sum(dim=-1)
-    return cost + 0.5 * (LOW - flown.position[..., 2]).clamp(min=0.0)
+    return cost + 0.5 * (SAFE_HEIGHT - flown.position[..., 2]).clamp(min=0.0)
 
 
 def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
@@ -126,4 +126,4 @@ def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
     lack = 1.0 - flown.r33[1:] - (acceleration * up[1:]).sum(dim=-1)
     window = round(WINDOW / control_step)
     mean = avg_pool1d(pad(lack, (0, 0, window, 0)).T, window, 1).T
-    return (mean - LACK).clamp(min=0.0).square()
+    return (mean - FORCE_DEFICIT).clamp(min=0.0).square()

@@ -18,13 +18,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import FloatArray
+from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings
 
 _POSITION = GROUPS["position"]
-# The offset is the mean of the last positions of so many flights to random targets. It is measured
-# again after each correction.
+# The offset is the mean of the last positions of this many flights to random targets. It is
+# measured again after each correction.
 N_OFFSETS = 120
 ROUNDS = 3
 
@@ -54,6 +55,10 @@ def correct_offset(
     own = settings or FlightSettings()
     first_layer(model)
     std = DEFAULT_STD if own.observation_std is None else np.asarray(own.observation_std)
+    statistics = statistics_of(model)
+    if statistics is not None:
+        # VecNormalize scales what the environment has scaled.
+        std = std * np.sqrt(statistics.obs_rms.var + statistics.epsilon)
     before = after = hover_offset(model, seed=seed, settings=own)
     if scale != 1.0:
         scale_position(model, scale)
@@ -91,7 +96,7 @@ def hover_offset(
 def shift_position(model: BaseAlgorithm, offset: FloatArray, std: FloatArray) -> None:
     """Let the actor see its position moved by ``offset`` (m, world frame).
 
-    :param std: σ of the position features, shape (3,).
+    :param std: of the position features, shape (3,): what they are divided by.
     """
     layer = first_layer(model)
     with th.no_grad():

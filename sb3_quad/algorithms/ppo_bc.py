@@ -24,10 +24,10 @@ from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
     actor_and_critic_parameters,
-    in_half_ranges,
     is_ever_nonzero,
     model_of,
     policy_arguments,
+    with_unit_actions,
 )
 from sb3_quad.algorithms.networks.gradients import Perceptrons, act, network_of
 from sb3_quad.algorithms.networks.losses import (
@@ -45,7 +45,7 @@ from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
-# By default a rollout is so many mini-batches, but none has less than so many rows.
+# By default a rollout is this many mini-batches, but none has less than this many rows.
 N_MINIBATCHES = 16
 LEAST_ROWS = 64
 
@@ -69,7 +69,7 @@ class PPOBC(ExpertMixin, PPO):
     equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model
     loads with ``PPO.load``, even where this package is not installed.
 
-    Where it clones, errors of actions and log_std count in half ranges of the Box action space.
+    Where it clones, errors of actions and log_std are those of actions scaled to [-1, 1].
 
     :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
     :param policy_kwargs: unless it holds ``log_std_init``, that is -0.9. ``log_std_init=None``:
@@ -188,7 +188,7 @@ class PPOBC(ExpertMixin, PPO):
         self._n_rollouts_trained = 0
 
         if _init_setup_model:
-            self._begin(initial)
+            self._set_up(initial)
 
     def _setup_model(self) -> None:
         filters = [name for name in BC_FILTERS if name != "q"]
@@ -211,7 +211,7 @@ class PPOBC(ExpertMixin, PPO):
                 "PPOBC clones into a Box action space only, this environment has"
                 f" {self.action_space}"
             )
-        self._rescale(False)
+        self._scale_actions(inverse=True)
         if self.expert is not None and self.will_clone():
             self._check_cloning()
 
@@ -242,11 +242,11 @@ class PPOBC(ExpertMixin, PPO):
         """
         return is_ever_nonzero(self.bc_coef)
 
-    def _rescale(self, into: bool) -> None:
+    def _scale_actions(self, inverse: bool = False) -> None:
         # Without a cloning term it is PPO, which counts actions as they are.
         may_clone = self.will_clone() or self.rollout_buffer.bc_coef
         if isinstance(self.action_space, spaces.Box) and may_clone:
-            super()._rescale(into)
+            super()._scale_actions(inverse)
 
     def _check_cloning(self) -> None:
         if self.expert is None:
@@ -313,7 +313,7 @@ class PPOBC(ExpertMixin, PPO):
         finally:
             del self.policy.forward
 
-    @in_half_ranges  # +
+    @with_unit_actions  # +
     def train(self) -> None:
         """Update the policy on the rollout just flown, by PPO's lines. Additions are marked ``+``.
 

@@ -84,7 +84,7 @@ class SACBC(ExpertMixin, SAC):
     :raises TrainingError: a loss that is not finite.
     """
 
-    _unsaved = ("_scaled_labels",)
+    _not_saved = ("_scaled_labels",)
 
     def __init__(
         self,
@@ -167,7 +167,7 @@ class SACBC(ExpertMixin, SAC):
         self._scaled_labels: Float32Array | None = None
 
         if _init_setup_model:
-            self._begin(initial)
+            self._set_up(initial)
 
     def _setup_model(self) -> None:
         # The negative log-likelihood is no error of an action that tanh squashes.

@@ -80,10 +80,10 @@ def _add_preview(theirs: StrDict, ours: StrDict, settings: StrMapping) -> None:
             theirs[name] = th.nn.functional.pad(weights, (0, added))
 
 
-# At least so many states are flown for a clone, and so many steps in each environment.
+# A clone flies at least this many states, and at least this many steps in each environment.
 CLONE_ROWS = 20_000
 CLONE_FLIGHT = 500
-# Steps of Adam, spread over so many rounds of flying, then fitting.
+# Steps of Adam, spread over this many rounds of flying, then fitting
 CLONE_STEPS = 2_500
 CLONE_ROUNDS = 10
 CLONE_BATCH = 1024
@@ -101,8 +101,8 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     error of their arctanh would be all about the limits. One half of the environments is flown by
     the teacher, the other by the present clone, as in DAgger, so that the clone learns from the
     states that it gets into itself. The deviation of a SAC actor becomes e to the ``log_std_init``
-    of its ``policy_kwargs`` everywhere, e^-2 without one. Whoever learns next resets the
-    environments.
+    of its ``policy_kwargs`` everywhere, e^-2 without one. Reset the environments before
+    learning.
 
     :param teacher: a source of :class:`~sb3_quad.controllers.controller.Controller`.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.

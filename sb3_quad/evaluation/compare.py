@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Group
 
 from sb3_quad.base.errors import ConfigError
@@ -19,7 +20,7 @@ from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
-from sb3_quad.simulation.settings import KEY, FlightSettings
+from sb3_quad.simulation.settings import KEY, FlightSettings, levels
 from sb3_quad.simulation.tasks import in_words
 from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
@@ -86,13 +87,18 @@ def compare(
         all controllers, such as ``vehicle`` or ``noise``.
     :return: ``result[label][task]`` are :class:`~sb3_quad.evaluation.metrics.Metrics`, each with
         its 95 % interval; ``print(result)`` shows the tables.
-    :raises ConfigError: no controllers, an unknown name or keyword, a zip that cannot be read.
+    :raises ConfigError: no controllers, an unknown name or keyword, several tasks of one name, a
+        zip that cannot be read.
     :raises ControllerError: a controller or reward that fails in flight.
     """
     if not controllers:
         raise ConfigError("compare: give at least one controller, such as {'PID': 'pid'}")
     if n_flights < 1:
         raise ConfigError(f"compare: n_flights is {n_flights}, must be at least 1")
+    names = [in_words(task) for task in tasks]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"compare: several tasks are named {name}; name them differently")
     if seed is None:
         seed = seed_for("table")
     seeds = row_seeds(seed, n_flights)
@@ -106,8 +112,7 @@ def compare(
 
     comparison = Comparison()
     comparison.tables = []
-    for task in tasks:
-        name = in_words(task)
+    for name, task in zip(names, tasks, strict=True):
         metrics = {}
         for label, pilot in pilots.items():
             how = settings[label].with_changes(task=task)
@@ -176,7 +181,7 @@ def _task_table(
     rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], published)
 
     title = f"{task}: {n_flights} fresh episodes, the same for all"
-    if not any(how.noise for how in settings.values()):
+    if not any(np.hstack(levels(how.noise)).any() for how in settings.values()):
         title += ", true state"
     caption = CAPTION
     if others.count(first) < len(others):

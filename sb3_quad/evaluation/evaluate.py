@@ -121,7 +121,7 @@ def evaluate(
         suite=suite.name,
         description=suite.description,
         source=suite.source,
-        reward=str(getattr(reward, "__name__", reward or "")),
+        reward=_name_of(reward),
         package_version=__version__,
         controllers=[*records.values()],
         scenarios=suite.scenarios,
@@ -356,12 +356,20 @@ def _digest(jobs: Sequence[Job], records: Mapping[ControllerSpec, ControllerReco
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
             digest.update(path.read_bytes())
     for job in jobs:
-        inputs = job, records[job.spec], job.spec.own, _vehicle(job.spec, job.scenario)
+        # The text of a function has its address, which is another one in each process.
+        named = job._replace(reward=_name_of(job.reward))
+        inputs = named, records[job.spec], job.spec.own, _vehicle(job.spec, job.scenario)
         digest.update(repr(inputs).encode())
         reference = job.scenario.reference
         if reference and reference.file:
             digest.update(Path(reference.file).read_bytes())
     return digest.hexdigest()
+
+
+def _name_of(reward: OwnReward) -> str:
+    if reward is None or isinstance(reward, str):
+        return reward or ""
+    return str(getattr(reward, "__name__", type(reward).__name__))
 
 
 def _failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:

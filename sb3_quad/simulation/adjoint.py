@@ -1,9 +1,10 @@
 """The adjoint of a control step: carry the gradient of a flight's cost from the state after the
 step to the state before it.
 
-``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost by the first
-``MOVING`` rows of a block's state. Each function here undoes one function of :mod:`.physics` or
-:mod:`.observation`: it turns the gradient by the results into the gradient by the arguments.
+``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost with respect to
+the first ``MOVING`` rows of a block's state. Each function here undoes one function of
+:mod:`.physics` or :mod:`.observation`: it turns the gradient with respect to the results into the
+gradient with respect to the arguments.
 
 The states between the physics steps of a control step are computed again: that costs less than
 keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as 1.
@@ -32,7 +33,9 @@ MOVING = X.target  # the rows of the state that a flight changes
 
 @compiled(inline="always")
 def _add_rotation(quaternion, gradient, lane, x, y, z):
-    """Add the gradient by a quaternion, given that by its rotation matrix, row by row."""
+    """Add the gradient with respect to a quaternion, given that with respect to its rotation
+    matrix, row by row.
+    """
     qw, qx, qy, qz = four(quaternion, lane)
     (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = x, y, z
     k = X.quaternion
@@ -107,17 +110,18 @@ def undo_move(before, after, gradient, dt):
 
 
 @compiled(fastmath=True)
-def undo_accelerate(b, before, after, gradient, by_wanted):
+def undo_accelerate(b, before, after, gradient, grad_wanted):
     """Undo :func:`.physics.accelerate`, in place.
 
     :param b: a block whose vehicle, wrench, wind and wanted speeds are loaded.
     :param before: the state before the physics step, (MOVING, LANES), and ``after`` that after it.
-    :param by_wanted: (4, LANES), the gradient by the wanted rotor speeds is added to it.
+    :param grad_wanted: (4, LANES), the gradient with respect to the wanted rotor speeds is added.
     """
     for lane in range(LANES):
         r = rotation(before[X.quaternion :], lane)
 
-        # By the torque in the body frame, and through the gyroscopic terms by the body rates.
+        # With respect to the torque in the body frame, and through the gyroscopic terms to the body
+        # rates
         gain_x, gain_y, gain_z = vector(b.rates_gain, lane)
         tx, ty, tz = vector(gradient[X.body_rates :], lane)
         tx, ty, tz = gain_x * tx, gain_y * ty, gain_z * tz
@@ -133,27 +137,30 @@ def undo_accelerate(b, before, after, gradient, by_wanted):
             -(gx * wy + gy * wx),
         )
 
-        # By the force: p in the world frame, c in the body frame.
+        # With respect to the force: p in the world frame, c in the body frame
         px, py, pz = vector(gradient[X.velocity :], lane)
         gain = b.velocity_gain[lane]
         px, py, pz = gain * px, gain * py, gain * pz
         cx, cy, cz = to_body(r, px, py, pz)
 
-        # By the rotors: each thrust acts along the body's z axis and about all three axes.
+        # With respect to the rotors: each thrust acts along the body's z axis and about all
+        # three axes.
         for k in range(4):
             old, new = before[X.rotor_speeds + k, lane], after[X.rotor_speeds + k, lane]
-            by_thrust = (
+            grad_thrust = (
                 cz + b.arm[0, k, lane] * tx + b.arm[1, k, lane] * ty + b.arm[2, k, lane] * tz
             )
             lift, exact = b.lift[lane], b.exact[lane]
-            by_thrust *= lift
+            grad_thrust *= lift
             b.thrust[k, lane] = lift * new * (new + exact * (old - new))
-            by_new = gradient[X.rotor_speeds + k, lane]
-            by_new += by_thrust * (2.0 * new * (1.0 - exact) + exact * old)
+            grad_new = gradient[X.rotor_speeds + k, lane]
+            grad_new += grad_thrust * (2.0 * new * (1.0 - exact) + exact * old)
             speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
             factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
-            by_wanted[k, lane] += factor * by_new
-            gradient[X.rotor_speeds + k, lane] = (1.0 - factor) * by_new + by_thrust * exact * new
+            grad_wanted[k, lane] += factor * grad_new
+            gradient[X.rotor_speeds + k, lane] = (
+                1.0 - factor
+            ) * grad_new + grad_thrust * exact * new
 
         # The force in the body frame, as it was: drag of the airspeed u, and the thrusts.
         vx, vy, vz = vector(before[X.velocity :], lane)
@@ -166,7 +173,8 @@ def undo_accelerate(b, before, after, gradient, by_wanted):
         fy -= dy * by
         fz += total_thrust(b, lane) - dz * bz
 
-        # By the velocity, through the drag, and by the attitude: forces, drag and torques turn.
+        # With respect to the velocity, through the drag, and to the attitude: forces, drag and
+        # torques turn.
         cx, cy, cz = -dx * cx, -dy * cy, -dz * cz
         x, y, z = to_world(r, cx, cy, cz)
         _add(gradient, X.velocity, lane, x, y, z)
@@ -182,29 +190,31 @@ def undo_accelerate(b, before, after, gradient, by_wanted):
 
 
 @compiled
-def undo_flight(b, passed, gradient, by_wanted, dt, substeps):
+def undo_flight(b, substep_states, gradient, grad_wanted, dt, substeps):
     """Undo :func:`.physics.fly`: the physics steps of a control step, the last one first.
 
     :param b: a block with the state before the control step; its flight is computed again.
-    :param passed: room for the states in between, (substeps + 1, MOVING, LANES).
-    :param by_wanted: (4, LANES), is set to the gradient by the wanted rotor speeds.
+    :param substep_states: memory for the states in between, (substeps + 1, MOVING, LANES).
+    :param grad_wanted: (4, LANES), is set to the gradient with respect to the wanted rotor speeds.
     """
     for substep in range(substeps):
-        passed[substep] = b.state[:MOVING]
+        substep_states[substep] = b.state[:MOVING]
         fly(b, dt, 1)
-    passed[substeps] = b.state[:MOVING]
-    by_wanted[:, :] = 0.0
+    substep_states[substeps] = b.state[:MOVING]
+    grad_wanted[:, :] = 0.0
     for substep in range(substeps - 1, -1, -1):
-        undo_move(passed[substep], passed[substep + 1], gradient, dt)
-        undo_accelerate(b, passed[substep], passed[substep + 1], gradient, by_wanted)
+        undo_move(substep_states[substep], substep_states[substep + 1], gradient, dt)
+        undo_accelerate(
+            b, substep_states[substep], substep_states[substep + 1], gradient, grad_wanted
+        )
 
 
 @compiled
-def undo_limits(b, by_speed):
+def undo_limits(b, grad_speed):
     """Undo :func:`.physics.limit_speeds`, in place.
 
     :param b: a block with the speeds before it, ``command``, and after it, ``wanted_speeds``.
-    :param by_speed: (4, LANES), by the speeds after it.
+    :param grad_speed: (4, LANES), with respect to the speeds after it.
     """
     for lane in range(LANES):
         fastest = 0
@@ -220,18 +230,18 @@ def undo_limits(b, by_speed):
             # What is taken off all may stop a rotor.
             stops = b.wanted_speeds[k, lane] == 0.0
             if stops or (b.command[k, lane] > greatest and not is_shared):
-                by_speed[k, lane] = 0.0
-            taken += by_speed[k, lane]
+                grad_speed[k, lane] = 0.0
+            taken += grad_speed[k, lane]
         if is_shared:
-            by_speed[fastest, lane] -= taken
+            grad_speed[fastest, lane] -= taken
 
 
 @compiled(fastmath=True)
-def undo_noise(b, by_feature):
+def undo_noise(b, grad_feature):
     """Undo noise and scaling of the features (Eq. 3.16), in place.
 
     :param b: a block whose features without noise, noise and scaling are computed.
-    :param by_feature: float64 (OBSERVATION_SIZE, LANES), by the scaled features.
+    :param grad_feature: float64 (OBSERVATION_SIZE, LANES), with respect to the scaled features.
     """
     for k in range(OBSERVATION_SIZE):
         for lane in range(LANES):
@@ -242,13 +252,13 @@ def undo_noise(b, by_feature):
                 fixed = b.additive[lane] / b.inverse_std[k, lane]
                 both = math.sqrt(relative * relative + fixed * fixed)
                 slope = 1.0 + noise * level * relative / both
-            by_feature[k, lane] *= slope * b.inverse_std[k, lane]
+            grad_feature[k, lane] *= slope * b.inverse_std[k, lane]
 
 
 @compiled(fastmath=True)
-def undo_relation(b, by_feature):
+def undo_relation(b, grad_feature):
     """Undo what :func:`.observation.features` does for a reference that moves, in place."""
-    f = by_feature
+    f = grad_feature
     for lane in range(LANES):
         cosine, sine = heading_of(b, lane)
         rate = b.target_heading_rate[0, lane]
@@ -266,13 +276,15 @@ def undo_relation(b, by_feature):
 
 
 @compiled(fastmath=True)
-def undo_features(b, by_feature, gradient, for_px4):
-    """Undo :func:`.observation.features`: add to the gradient by the state of a loaded block.
+def undo_features(b, grad_feature, gradient, for_px4):
+    """Undo :func:`.observation.features`: add to the gradient with respect to the state of a
+    loaded block.
 
-    :param by_feature: float64 (OBSERVATION_SIZE, LANES), by the features in their units.
+    :param grad_feature: float64 (OBSERVATION_SIZE, LANES), with respect to the features in
+        their units.
     :param for_px4: whether the velocity has world axes.
     """
-    f = by_feature
+    f = grad_feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
         for k in range(3):

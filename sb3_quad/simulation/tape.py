@@ -38,19 +38,20 @@ from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
 
 FlightCost = Callable[[FloatArray, Float32Array, BoolArray], tuple[float, FloatArray, FloatArray]]
 """A cost and its gradients, of the states after each step (steps, STATE_SIZE, n), the actions
-(steps, n, 4), and whether each counts (steps, n): the mean, the gradient by states, by actions.
+(steps, n, 4), and whether each counts (steps, n): the mean, the gradient
+with respect to the states, that with respect to the actions.
 """
 
 
 class FlightTape:
-    """The flights of a batch for some control steps, and the way back through these steps.
+    """The flights of a batch for some control steps, and the backward pass through these steps.
 
     Record with :meth:`reset` and a :meth:`step` for each control step. Then :meth:`begin` takes the
     cost, and :meth:`backward` is called for each step, the last one first.
 
     A row that crashes or leaves the range costs nothing from there on and has no gradient.
 
-    :param batch: flies. Its episodes have no time limit here.
+    :param batch: flies. No time limit ends an episode within a recording.
     :param n_steps: control steps of a recording.
     :param substeps: physics steps in a control step; None: those of the batch. Two take half the
         time of four, and differ little.
@@ -77,10 +78,12 @@ class FlightTape:
     def reset(self, carry_on: bool = False) -> Float32Array:
         """Begin a recording; return the observations, float32 (n, size).
 
-        :param carry_on: let the rows that still fly continue their episodes.
+        :param carry_on: let the rows that still fly continue their episodes, unless these have
+            reached their time limit.
         """
         batch = self.batch
-        observations = batch.reset(np.flatnonzero(self.lost) if carry_on else None)
+        ended = self.lost | (batch.streams[STEP] >= batch.limits)
+        observations = batch.reset(np.flatnonzero(ended) if carry_on else None)
         # A rotor must not overshoot its commanded speed because the physics steps are long.
         vehicles = batch.vehicles
         gains = vehicles[[P.motor_gain_up, P.motor_gain_down]]
@@ -131,26 +134,26 @@ class FlightTape:
         return (self.rewards * flown).sum(axis=0), self.lengths, self.lost
 
     def begin(self, cost: FlightCost) -> float:
-        """Begin the way back; return the mean cost of a control step."""
-        value, by_states, by_actions = cost(self.states[1:], self.actions, self.counts)
+        """Begin the backward pass; return the mean cost of a control step."""
+        value, grad_states, grad_actions = cost(self.states[1:], self.actions, self.counts)
         batch = self.batch
-        self._by_states = by_states
-        self._by_actions = by_actions
-        # The gradient by the state before the step that backward() was last called for, without
-        # what comes through the observation of that state.
-        self.by_start = np.zeros((MOVING, batch.n))
-        self._by_frames = np.zeros((batch.ages[-1] + 1, batch.n, batch.observation.frame_size))
-        self._by_integral = np.zeros_like(batch.integral)
+        self._grad_states = grad_states
+        self._grad_actions = grad_actions
+        # The gradient with respect to the state before the step that backward() was last called
+        # for, without what comes through the observation of that state
+        self.grad_start = np.zeros((MOVING, batch.n))
+        self._grad_frames = np.zeros((batch.ages[-1] + 1, batch.n, batch.observation.frame_size))
+        self._grad_integral = np.zeros_like(batch.integral)
         return value
 
-    def backward(self, step: int, by_observation: Float32Array) -> FloatArray:
-        """Return the gradient by the actions of a control step, (n, 4).
+    def backward(self, step: int, grad_observation: Float32Array) -> FloatArray:
+        """Return the gradient with respect to the actions of a control step, (n, 4).
 
-        :param by_observation: the gradient by the observations after it, float32 (n, size), which
-            comes from the later actions.
+        :param grad_observation: the gradient with respect to the observations after it, float32
+            (n, size), which comes from the later actions.
         """
         batch = self.batch
-        self.by_start += self._by_states[step, :MOVING]
+        self.grad_start += self._grad_states[step, :MOVING]
         share_out(
             undo,
             batch.helpers,
@@ -169,43 +172,45 @@ class FlightTape:
             batch.ages,
             self._integrals,
             batch.integral_numbers,
-            by_observation,
-            self._by_frames,
-            self._by_integral,
-            self.by_start,
-            self._by_actions,
+            grad_observation,
+            self._grad_frames,
+            self._grad_integral,
+            self.grad_start,
+            self._grad_actions,
             self.physics_step,
             self.substeps,
         )
-        result: FloatArray = self._by_actions[step]
+        result: FloatArray = self._grad_actions[step]
         return result
 
 
 @compiled
 def undo(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
-    moves, for_px4, ages, integrals, integral_numbers, by_observation, by_frames, by_integral,
-    gradient, by_actions, physics_step, substeps,
+    moves, for_px4, ages, integrals, integral_numbers, grad_observation, grad_frames, grad_integral,
+    gradient, grad_actions, physics_step, substeps,
 ):  # fmt: skip
     """Undo a control step and the observation after it; see :class:`FlightTape`.
 
     The arguments are as in :func:`.kernel.step`, with a leading axis for the control steps, and:
 
-    :param by_frames: (depth, n, frame size), by the frames of the latest control steps, step s in
-        slot s % depth.
-    :param by_integral: (0 or 3, n), by the position integral.
-    :param gradient: (MOVING, n), by the state after the step; becomes that by the state before.
-    :param by_actions: (steps, n, 4), is added to where an earlier action acts late or is observed.
+    :param grad_frames: (depth, n, frame size), with respect to the frames of the latest control
+        steps, step s in slot s % depth.
+    :param grad_integral: (0 or 3, n), with respect to the position integral.
+    :param gradient: (MOVING, n), with respect to the state after the step; becomes that with
+        respect to the state before.
+    :param grad_actions: (steps, n, 4), is added to where an earlier action acts late or is
+        observed.
     """
     n = states.shape[2]
     chunks = (n + CHUNK - 1) // CHUNK
     if leads:
         control[LEFT] = chunks
     blocks = new_block()
-    passed = np.empty((substeps + 1, MOVING, LANES))
+    substep_states = np.empty((substeps + 1, MOVING, LANES))
     own = np.empty((MOVING, LANES))
-    by_feature = np.empty((OBSERVATION_SIZE, LANES))
-    by_wanted = np.empty((4, LANES))
+    grad_feature = np.empty((OBSERVATION_SIZE, LANES))
+    grad_wanted = np.empty((4, LANES))
     taken = 0
     while True:
         left = atomic_add(control, LEFT, -1)
@@ -230,14 +235,14 @@ def undo(
                 standard_normals(b)
                 _undo_frames(
                     b, first, count, step + 1, lengths, actions, ages, integrals, integral_numbers,
-                    by_observation, by_frames, by_integral, by_feature, by_actions,
+                    grad_observation, grad_frames, grad_integral, grad_feature, grad_actions,
                 )  # fmt: skip
                 if for_px4:
-                    clear_hidden(by_feature)
-                undo_noise(b, by_feature)
+                    clear_hidden(grad_feature)
+                undo_noise(b, grad_feature)
                 if moves and not for_px4:
-                    undo_relation(b, by_feature)
-                undo_features(b, by_feature, own, for_px4)
+                    undo_relation(b, grad_feature)
+                undo_features(b, grad_feature, own, for_px4)
 
             load_rows(states[step], first, count, b.state)
             load_rows(wrench, first, count, b.wrench)
@@ -254,8 +259,8 @@ def undo(
                 limit_speeds(b, b.wanted_speeds, lane)
                 if step >= lengths[i]:
                     own[:, lane] = 0.0
-            undo_flight(b, passed, own, by_wanted, physics_step, substeps)
-            undo_limits(b, by_wanted)
+            undo_flight(b, substep_states, own, grad_wanted, physics_step, substeps)
+            undo_limits(b, grad_wanted)
             for lane in range(count):
                 i = first + lane
                 for k in range(MOVING):
@@ -264,7 +269,7 @@ def undo(
                 for k in range(4):
                     if acted >= 0 and abs(actions[acted, i, k]) < float32(1.0):
                         slope = b.thrust_half_range[lane] / (2.0 * b.command[k, lane])
-                        by_actions[acted, i, k] += slope * by_wanted[k, lane]
+                        grad_actions[acted, i, k] += slope * grad_wanted[k, lane]
     atomic_add(control, DONE, taken)
     if leads:
         finish(control, chunks)
@@ -273,14 +278,14 @@ def undo(
 
 @compiled
 def _undo_frames(
-    b, first, count, step, lengths, actions, ages, integrals, numbers, by_observation, by_frames,
-    by_integral, by_feature, by_actions,
+    b, first, count, step, lengths, actions, ages, integrals, numbers, grad_observation,
+    grad_frames, grad_integral, grad_feature, grad_actions,
 ):  # fmt: skip
-    """Carry the gradient by an observation to the frames in it, and that by the present frame to
-    its features, the last action and the position integral.
+    """Carry the gradient with respect to an observation to the frames in it, and that with respect
+    to the present frame to its features, the last action and the position integral.
     """
-    by_feature[:, :] = 0.0
-    depth, size = by_frames.shape[0], by_frames.shape[2]
+    grad_feature[:, :] = 0.0
+    depth, size = grad_frames.shape[0], grad_frames.shape[2]
     for lane in range(count):
         i = first + lane
         if step >= lengths[i]:
@@ -289,22 +294,24 @@ def _undo_frames(
         for age in ages:
             if age <= step:
                 for k in range(size):
-                    by_frames[(step - age) % depth, i, k] += by_observation[i, at + k]
+                    grad_frames[(step - age) % depth, i, k] += grad_observation[i, at + k]
             at += size
-        frame = by_frames[step % depth, i]
+        frame = grad_frames[step % depth, i]
         for k in range(size - OBSERVATION_SIZE):
             if abs(actions[step - 1, i, k]) < float32(1.0):
-                by_actions[step - 1, i, k] += frame[OBSERVATION_SIZE + k]
-        if by_integral.shape[0] > 0:
-            _undo_integral(b, lane, i, integrals[step], numbers, frame, by_integral)
+                grad_actions[step - 1, i, k] += frame[OBSERVATION_SIZE + k]
+        if grad_integral.shape[0] > 0:
+            _undo_integral(b, lane, i, integrals[step], numbers, frame, grad_integral)
         for k in range(OBSERVATION_SIZE):
-            by_feature[k, lane] = frame[k]
+            grad_feature[k, lane] = frame[k]
         frame[:] = 0.0
 
 
 @compiled
-def _undo_integral(b, lane, i, integral, numbers, frame, by_integral):
-    """Undo :func:`.frames.integrate_position` of a row; ``frame`` is the gradient by its frame."""
+def _undo_integral(b, lane, i, integral, numbers, frame, grad_integral):
+    """Undo :func:`.frames.integrate_position` of a row; ``frame`` is the gradient with respect
+    to its frame.
+    """
     error2 = speed2 = 0.0
     for axis in range(3):
         error = with_noise(b, F.position + axis, lane)
@@ -314,8 +321,8 @@ def _undo_integral(b, lane, i, integral, numbers, frame, by_integral):
     near = error2 < numbers[1] and speed2 < numbers[2]
     for axis in range(3):
         k = F.position + axis
-        by_integral[axis, i] += frame[k] * b.inverse_std[k, lane]
+        grad_integral[axis, i] += frame[k] * b.inverse_std[k, lane]
         if abs(integral[axis, i]) >= numbers[3]:
-            by_integral[axis, i] = 0.0
+            grad_integral[axis, i] = 0.0
         elif near:
-            frame[k] += by_integral[axis, i] * numbers[0] / b.inverse_std[k, lane]
+            frame[k] += grad_integral[axis, i] * numbers[0] / b.inverse_std[k, lane]

@@ -190,10 +190,8 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
                     raise ConfigError(
                         f"correct_offset: {config.env_id} is not an environment of this package"
                     )
-                if config.env_wrapper or config.vec_env_wrappers:
-                    raise ConfigError(
-                        "correct_offset: flies without wrappers; remove them, and normalize"
-                    )
+                if config.env_wrapper or config.vec_env_wrapper:
+                    raise ConfigError("correct_offset: flies without wrappers; remove them")
                 if config.flight_settings.size != OBSERVATION_SIZE:
                     raise ConfigError(
                         f"correct_offset is for agents that see the {OBSERVATION_SIZE} features "

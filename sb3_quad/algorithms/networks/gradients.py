@@ -108,8 +108,10 @@ def network_of(policy: ActorCriticPolicy) -> Network:
     That is compiled perceptrons where it is two of them on the CPU, else the policy itself.
     """
     extractor: Any = policy.mlp_extractor
+    # A subclass may compute something else.
     if (
-        type(extractor) is not MlpExtractor
+        type(policy) is not ActorCriticPolicy
+        or type(extractor) is not MlpExtractor
         or type(policy.action_dist) is not DiagGaussianDistribution
         or type(policy.features_extractor) is not FlattenExtractor
         or policy.observation_space.dtype != np.float32
@@ -117,7 +119,7 @@ def network_of(policy: ActorCriticPolicy) -> Network:
         return policy
     actor = [*extractor.policy_net, policy.action_net]
     critic = [*extractor.value_net, policy.value_net]
-    if not (Perceptron.fits(actor) and Perceptron.fits(critic)):
+    if not (Perceptron.fits(actor) and Perceptron.fits(critic) and policy.log_std.requires_grad):
         return policy
     network = Perceptrons(Perceptron(actor), Perceptron(critic), policy.log_std)
     # A policy with further parameters is computed by PyTorch.
@@ -157,12 +159,12 @@ def act(network: Perceptrons, observations: th.Tensor) -> tuple[th.Tensor, th.Te
     return actions, values, -losses.gaussian_nll(mean, log_std, actions)
 
 
-class Passes:
-    """Computes a policy's mean actions step by step, and carries gradients by them back to the
-    observations and to the policy's parameters.
+class RecordedPolicy:
+    """Computes a policy's mean actions step by step, and carries gradients with respect to them
+    back to the observations and to the policy's parameters.
 
     Compiled perceptrons keep what their layers gave in each step: to compute it again would take
-    a third of the way back.
+    a third of the backward pass.
 
     :param n_steps: of a flight.
     :param n: rows of each step.
@@ -172,10 +174,10 @@ class Passes:
         network = network_of(policy)
         self._policy = policy
         self._actor = network.actor if isinstance(network, Perceptrons) else None
-        # What the way back needs of each step: what the layers gave, or the observations.
-        self._passed: Any = {}
+        # What the backward pass needs of each step: what the layers gave, or the observations.
+        self._activations: Any = {}
         if self._actor:
-            self._passed, self._sums = self._actor.room(n_steps, n)
+            self._activations, self._sums = self._actor.allocate(n_steps, n)
 
     def forward(self, step: int, observations: AnyArray) -> Float32Array:
         """Return the mean actions (n, a) for the observations (n, ...) of a step.
@@ -186,22 +188,25 @@ class Passes:
             if step == 0:
                 self._actor.pack()
                 self._sums.fill(0.0)
-            return self._actor(_flat(observations), self._passed[step])
-        self._passed[step] = observations
+            return self._actor(_flat(observations), self._activations[step])
+        self._activations[step] = observations
         return mean_actions(self._policy, observations)
 
-    def backward(self, step: int, by_actions: FloatArray) -> Float32Array:
-        """Return the gradient by the observations of a step, given that by its actions (n, a).
+    def backward(self, step: int, grad_actions: FloatArray) -> Float32Array:
+        """Return the gradient with respect to the observations of a step.
+
+        :param grad_actions: the gradient with respect to the actions of the step, (n, a).
 
         The last step comes first. After step 0, the actor's parameters have their ``.grad``.
         """
-        given = by_actions.astype(np.float32)
+        given = grad_actions.astype(np.float32)
         if self._actor:
-            by_observations = self._actor.pullback(self._passed[step], given, self._sums)
+            grad_observations = self._actor.pullback(self._activations[step], given, self._sums)
             if step == 0:
                 self._actor.set_gradients(self._sums)
-            return by_observations
-        inputs: Any = th.as_tensor(self._passed[step], device=self._policy.device).requires_grad_()
+            return grad_observations
+        inputs: Any = th.as_tensor(self._activations[step], device=self._policy.device)
+        inputs.requires_grad_()
         means = self._policy.get_distribution(inputs).mode()
         means.backward(th.as_tensor(given, device=means.device))  # type: ignore[no-untyped-call]
         return np.asarray(inputs.grad.cpu().numpy())

@@ -203,11 +203,11 @@ def _forward(scratch, x, index, first, count, layers):
 
 
 @compiled
-def _backward(passed, scratch, layers, sums, last_layer):
-    """Add the gradient of a block by the parameters to ``sums``.
+def _backward(activations, scratch, layers, sums, last_layer):
+    """Add the gradient of a block with respect to the parameters to ``sums``.
 
-    The block's layers lie in ``passed``. The gradient by the outputs lies in ``scratch``, behind
-    room for the layers. From there on, two layers' gradients take turns.
+    The block's layers lie in ``activations``. The gradient with respect to the outputs lies in
+    ``scratch``, behind the memory for the layers. From there on, two layers' gradients take turns.
 
     :param last_layer: 1: stop at the parameters of the first layer; 0: go on to the inputs.
     :return: where the gradient of that layer begins.
@@ -221,12 +221,14 @@ def _backward(passed, scratch, layers, sums, last_layer):
         rows = widths[layer]
         columns = widths[layer - 1]
         g = _layer(scratch, here, rows)
-        h = _layer(passed, at, rows)
+        h = _layer(activations, at, rows)
         at -= columns * ROWS
         place -= rows * (columns + 1)
         middle = place + rows * columns
         _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows])
-        _add_products(g, _layer(passed, at, columns), sums[place:middle].reshape(rows, columns))
+        _add_products(
+            g, _layer(activations, at, columns), sums[place:middle].reshape(rows, columns)
+        )
         if layer > last_layer:
             _multiply(
                 transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns)
@@ -236,7 +238,7 @@ def _backward(passed, scratch, layers, sums, last_layer):
 
 
 @compiled
-def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, passed):
+def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations):
     """Write the outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs) into ``out``.
 
     It does so for the chunks from ``first_chunk`` to ``last_chunk`` of all ``chunks``.
@@ -244,15 +246,15 @@ def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, pas
     :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each unit of
         all layers, and twice for the widest layer's gradients.
     :param layers: :class:`Layers`.
-    :param passed: (blocks, ``ROWS`` numbers for each unit), is written for :func:`pullback`; or
-        (0, any).
+    :param activations: (blocks, ``ROWS`` numbers for each unit), is written for :func:`pullback`;
+        or (0, any).
     """
     n = len(index)
     blocks = (n + ROWS - 1) // ROWS
     for block in range(first_chunk * blocks // chunks, last_chunk * blocks // chunks):
         first = block * ROWS
         count = min(ROWS, n - first)
-        own = passed[block] if len(passed) else scratch
+        own = activations[block] if len(activations) else scratch
         at = _forward(own, x, index, first, count, layers)
         h = _layer(own, at, layers.widths[-1])
         for i in range(count):
@@ -264,9 +266,9 @@ def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, pas
 def gradient(
     first_chunk, last_chunk, chunks, scratch, layers, x, index, targets, loss, log_std, sums, terms
 ):
-    """Write the gradient of a loss (:mod:`.losses`) by all parameters into ``sums``.
+    """Write the gradient of a loss (:mod:`.losses`) with respect to all parameters into ``sums``.
 
-    A block stays in the cache for its way forth and back. Further arguments are as for
+    A block stays in the cache for its forward and its backward pass. Further arguments are as for
     :func:`forward`.
 
     :param targets: (m, columns) of the loss, of the same rows.
@@ -303,15 +305,17 @@ def gradient(
 
 @compiled
 def pullback(
-    first_chunk, last_chunk, chunks, scratch, layers, passed, index, by_outputs, by_inputs, sums
-):
-    """Carry a gradient by the outputs back to the inputs, and add that by all parameters.
+    first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
+    grad_inputs, sums,
+):  # fmt: skip
+    """Carry a gradient with respect to the outputs back to the inputs, and add the one with respect
+    to all parameters.
 
     Arguments are as for :func:`forward`, and:
 
-    :param passed: what :func:`forward` has written for the same rows.
-    :param by_outputs: (m, outputs).
-    :param by_inputs: float32 (m, inputs), is written.
+    :param activations: what :func:`forward` has written for the same rows.
+    :param grad_outputs: (m, outputs).
+    :param grad_inputs: float32 (m, inputs), is written.
     :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
     """
     blocks = (len(index) + ROWS - 1) // ROWS
@@ -321,9 +325,9 @@ def pullback(
             first = block * ROWS
             count = min(ROWS, len(index) - first)
             g = _layer(scratch, behind, layers.widths[-1])
-            _load(by_outputs, index, first, count, g)
-            here = _backward(passed[block], scratch, layers, sums[chunk], 0)
+            _load(grad_outputs, index, first, count, g)
+            here = _backward(activations[block], scratch, layers, sums[chunk], 0)
             g = _layer(scratch, here, layers.widths[0])
             for i in range(count):
-                for k in range(by_inputs.shape[1]):
-                    by_inputs[index[first + i], k] = g[k, i]
+                for k in range(grad_inputs.shape[1]):
+                    grad_inputs[index[first + i], k] = g[k, i]

@@ -96,7 +96,8 @@ def cloning_errors(
 
 @compiled
 def cloning_error(kind, error, log_std):
-    """Return the error of one dimension of an action and its derivatives by mean and log_std.
+    """Return the error of one dimension of an action, and its derivatives with respect to mean and
+    log_std.
 
     It is :func:`cloning_errors` compiled. For all kinds but ``"nll"``, the caller divides the three
     by the action's dimension.
@@ -165,7 +166,8 @@ def l2_loss(parameters: list[th.nn.Parameter]) -> th.Tensor:
 def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, terms):
     """Add an actor's loss over ``count`` rows of a mini-batch, from ``first`` on, to the terms.
 
-    Its gradient is added to ``g`` by the means and to ``g_log_std`` by log_std.
+    Its gradient with respect to the means is added to ``g``, that with respect to log_std to
+    ``g_log_std``.
 
     :param mean: (a, ROWS), and so is ``g``.
     """

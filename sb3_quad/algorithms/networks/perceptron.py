@@ -22,7 +22,7 @@ from sb3_quad.algorithms.networks.kernel import (
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
 from sb3_quad.base.types import Float32Array, FloatArray, IntArray
 
-# A mini-batch is cut into at most so many chunks. Their sums are added up in order, so that the
+# A mini-batch is cut into at most this many chunks. Their sums are added up in order, so that the
 # number of threads changes no bit.
 CHUNKS = 16
 # Fewer blocks than this are done before another thread has woken.
@@ -53,8 +53,8 @@ class Perceptron:
         before = self._widths[:-1]
         after = self._widths[1:]
         self._size = int((after * (before + 1)).sum())
-        room = self._widths.sum() + 2 * self._widths.max()
-        self._scratch_size = int(room) * ROWS
+        units = self._widths.sum() + 2 * self._widths.max()
+        self._scratch_size = int(units) * ROWS
         # Parameters with the weights as they are, and with the weights transposed
         self._packed = np.zeros((2, self._size), np.float32)
         # Views of those and of PyTorch's memory, which :meth:`pack` copies into them
@@ -86,7 +86,7 @@ class Perceptron:
     def fits(modules: Sequence[nn.Module]) -> bool:
         """Return whether these are linear layers and activations in turn that can be compiled.
 
-        Parameters must be float32 on the CPU, and no module may have hooks.
+        Parameters must be float32 on the CPU, none may be frozen, and no module may have hooks.
         """
         for i, module in enumerate(modules):
             if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks:
@@ -98,6 +98,7 @@ class Perceptron:
                 fits = type(module) is nn.Linear and len(parameters) == 2
                 for parameter in parameters:
                     fits &= parameter.dtype == th.float32 and parameter.device.type == "cpu"
+                    fits &= parameter.requires_grad
             if not fits:
                 return False
         return len(modules) % 2 == 1
@@ -107,16 +108,16 @@ class Perceptron:
         for packed, parameter in self._copies:
             packed[...] = parameter
 
-    def __call__(self, x: Float32Array, passed: Float32Array = _NOT_KEPT) -> Float32Array:
+    def __call__(self, x: Float32Array, activations: Float32Array = _NOT_KEPT) -> Float32Array:
         """Return the outputs (n, outputs) for x (n, inputs).
 
-        :param passed: of :meth:`room`, is written for :meth:`pullback`. The parameters are then
-            those of the last :meth:`pack`, else those of now.
+        :param activations: of :meth:`allocate`, is written for :meth:`pullback`. The parameters are
+            then those of the last :meth:`pack`, else those of now.
         """
-        if passed is _NOT_KEPT:
+        if activations is _NOT_KEPT:
             self.pack()
         out = np.empty((len(x), self._layers[-1].out_features), np.float32)
-        self._compute(forward, len(x), x, np.arange(len(x)), out, passed)
+        self._compute(forward, len(x), x, np.arange(len(x)), out, activations)
         return out
 
     def gradient(
@@ -146,29 +147,29 @@ class Perceptron:
         result: FloatArray = terms.sum(axis=0)
         return result
 
-    def room(self, calls: int, n: int) -> tuple[Float32Array, Float32Array]:
-        """Return room for what :meth:`pullback` needs of some calls with n rows each.
+    def allocate(self, calls: int, n: int) -> tuple[Float32Array, Float32Array]:
+        """Return memory for what :meth:`pullback` needs of some calls with n rows each.
 
         :return: for what the layers give, (calls, ...), and for the sums of all calls.
         """
         blocks = -(-n // ROWS)
         size = int(self._widths.sum()) * ROWS
-        passed = _aligned(calls * blocks * size).reshape(calls, blocks, size)
-        return passed, np.empty((_chunks(n), self._size), np.float32)
+        activations = _aligned(calls * blocks * size).reshape(calls, blocks, size)
+        return activations, np.empty((_chunks(n), self._size), np.float32)
 
     def pullback(
-        self, passed: Float32Array, by_outputs: Float32Array, sums: Float32Array
+        self, activations: Float32Array, grad_outputs: Float32Array, sums: Float32Array
     ) -> Float32Array:
-        """Carry a gradient by the outputs (n, outputs) back to the inputs.
+        """Carry a gradient with respect to the outputs (n, outputs) back to the inputs.
 
-        :param passed: what a call has written.
-        :param sums: the gradient by the parameters is added to it.
-        :return: the gradient by the inputs, (n, inputs).
+        :param activations: what a call has written.
+        :param sums: the gradient with respect to the parameters is added to it.
+        :return: the gradient with respect to the inputs, (n, inputs).
         """
-        n = len(by_outputs)
-        by_inputs = np.empty((n, self._layers[0].in_features), np.float32)
-        self._compute(pullback, n, passed, np.arange(n), by_outputs, by_inputs, sums)
-        return by_inputs
+        n = len(grad_outputs)
+        grad_inputs = np.empty((n, self._layers[0].in_features), np.float32)
+        self._compute(pullback, n, activations, np.arange(n), grad_outputs, grad_inputs, sums)
+        return grad_inputs
 
     def set_gradients(self, sums: Float32Array) -> th.Tensor:
         """Set ``.grad`` of all parameters, given sums (chunks, size); return their sum."""
@@ -211,10 +212,10 @@ def _chunks(n: int) -> int:
 
 
 def _aligned(size: int) -> Float32Array:
-    """Return room for ``size`` numbers that begins with a cache line."""
-    room = np.empty(size + CACHE_LINE // 4, np.float32)
-    to_next_line = -room.ctypes.data % CACHE_LINE // 4
-    return room[to_next_line : to_next_line + size]
+    """Return memory for ``size`` numbers that begins with a cache line."""
+    memory = np.empty(size + CACHE_LINE // 4, np.float32)
+    to_next_line = -memory.ctypes.data % CACHE_LINE // 4
+    return memory[to_next_line : to_next_line + size]
 
 
 # Threads that share the work of every perceptron, and the pool of all but the first. None of its

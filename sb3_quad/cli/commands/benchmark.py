@@ -2,7 +2,7 @@
 
 The environments are the compiled batch and, where it is installed, PyBullet's,
 alone and vectorised. A training loop is a rollout with its update; APG's
-includes the way back through the recorded flights.
+includes the backward pass through the recorded flights.
 
 The last line compares a core of your machine with one of the machine that the
 documentation's CPU seconds are from: at 0.5, expect twice as many. It needs the
