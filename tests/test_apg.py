@@ -143,3 +143,31 @@ def test_the_protocol_serves_an_environment_in_pytorch():
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     before, after = (float(line.split("cost ")[1].split(",")[0]) for line in lines)
     assert after < 0.5 * before
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda flown: flight_cost(flown).mean(),
+        lambda flown: flight_cost(flown)[1:],
+        lambda flown: flight_cost(flown).detach(),
+        lambda flown: flight_cost(flown).detach().numpy(),
+    ],
+)
+def test_a_cost_of_another_shape_or_without_a_gradient_is_refused(cost):
+    model = APG("MlpPolicy", QuadcopterVecEnv(2, seed=0), n_steps=5, cost=cost)
+    with pytest.raises(ConfigError, match=r"cost: returned .* \(steps, n\) = \(5, 2\)"):
+        model.learn(10)
+
+
+def test_an_own_cost_must_be_given_again(tmp_path):
+    env = QuadcopterVecEnv(2, seed=0)
+
+    def cost(flown):
+        return 2.0 * flight_cost(flown)
+
+    APG("MlpPolicy", env, n_steps=5, cost=cost).learn(10).save(tmp_path / "agent")
+    with pytest.raises(ConfigError, match="a cost of your own, which no zip holds"):
+        APG.load(tmp_path / "agent", env=env).learn(10)
+    APG.load(tmp_path / "agent", env=env, cost=cost).learn(10)
+    APG.load(tmp_path / "agent", env=env, own_cost=False).learn(10)

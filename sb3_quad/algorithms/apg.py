@@ -26,6 +26,7 @@ from sb3_quad.algorithms.flight_cost import (
     low_force_cost,
 )
 from sb3_quad.algorithms.networks.gradients import RecordedPolicy
+from sb3_quad.algorithms.soap import SOAP
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.simulation.tape import FlightCost
@@ -79,8 +80,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     "Learning Quadrotor Control From Visual Features Using Differentiable Simulation" (2024).
 
     In each update every environment flies ``n_steps`` control steps by the mean action of the
-    policy. The optimiser then takes one step along the gradient of the mean cost. Only the actor
-    learns; the critic stays as it is.
+    policy. The optimiser then takes one step along the gradient of the mean cost. It is
+    :class:`~sb3_quad.algorithms.soap.SOAP`, unless ``policy_kwargs`` has an ``optimizer_class``.
+    Only the actor learns; the critic stays as it is.
 
     ``env`` must be differentiable: a :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` with any of
     its settings, or an environment of your own whose ``record(n_steps, substeps)`` returns a
@@ -103,13 +105,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     :param carry_on: Let each update continue the flights of the one before. A flight that crashed
         or reached its time limit begins again.
     :param cost: The cost of each control step, (steps, n), as a function of
-        :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved.
+        :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved:
+        give it to ``load``, too.
     :param low_force_coef: Weight of
         :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which is added to the cost: for
         vehicles whose firmware takes a thrust that stays low for a crash.
     :param substeps: Physics steps in a control step of the training; None: those of the vehicle.
-    :param optimizer: ``"soap"``, :class:`~sb3_quad.algorithms.soap.SOAP`, or ``"adam"``. An
-        ``optimizer_class`` in ``policy_kwargs`` holds in place of both.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a gradient that is not finite, in every environment.
     """
@@ -138,7 +139,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         low_force_coef: float = 0.0,
         substeps: int | None = 2,
-        optimizer: str = "soap",
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -166,12 +166,20 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.max_row_ratio = max_row_ratio
         self.carry_on = carry_on
         self.cost = cost
+        self.own_cost = False
         self.low_force_coef = low_force_coef
         self.substeps = substeps
-        self.optimizer = optimizer
 
         if _init_setup_model:
             self._set_up(initial)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        # policy_kwargs do not name SOAP, so that a zip loads where this package is missing.
+        if "optimizer_class" not in self.policy_kwargs:
+            policy = self.policy
+            rate = self.lr_schedule(1.0)
+            policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
 
     def learn(
         self,
@@ -201,6 +209,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 f"{type(env).__name__}: APG differentiates flights, and this environment has no"
                 " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
             )
+        if self.own_cost and self.cost is flight_cost:
+            raise ConfigError(
+                "cost: this agent was trained with a cost of your own, which no zip holds; give it"
+                " to APG.load(..., cost=...), or own_cost=False for the default"
+            )
+        self.own_cost = self.cost is not flight_cost
         self._tape = env.record(self.n_steps, self.substeps)
         if self.low_force_coef and not hasattr(self._tape, "control_step"):
             raise ConfigError(

@@ -22,7 +22,6 @@ from typing_extensions import Self
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import Terms, network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
-from sb3_quad.algorithms.soap import OPTIMIZERS, SOAP
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as, unknown
 from sb3_quad.base.files import one_line
@@ -111,8 +110,6 @@ class ExpertMixin:
     expert: ExpertLike | None
     bc_coef: Any
     batch_size: Any
-    lr_schedule: Schedule
-    optimizer: str = "adam"
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
     # What else of an algorithm no zip holds.
@@ -201,20 +198,11 @@ class ExpertMixin:
         # The orthogonal weights of a new network depend on the number of threads that make them.
         with one_torch_thread(compiled=True):
             super()._setup_model()  # type: ignore[misc]
-        self._choose_optimizer()
         if self.env is not None:
             # A zip's statistics, which are read before this, go on in the environment.
             if hasattr(self, STATISTICS):
                 share_statistics(getattr(self, STATISTICS), self.env, training=True)
             self._note_flight_settings()
-
-    def _choose_optimizer(self) -> None:
-        self._check_names(optimizer=OPTIMIZERS)
-        policy = self.policy
-        if self.optimizer == "soap" and policy.optimizer_class is th.optim.Adam:
-            # policy_kwargs still name Adam, so that a zip loads where this package is missing.
-            rate = self.lr_schedule(1.0)
-            policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
 
     def set_parameters(self, *arguments: Any, **keywords: Any) -> None:
         """Take the parameters of another model by SB3's ``set_parameters``.

@@ -121,9 +121,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     :param demonstrations: a file of flights that the dataset begins with, as ``dataset.load`` takes
         it. With ``beta=0`` no expert is needed: the agent clones these flights alone, and its own
         flights train the critic
-    :param optimizer: ``"adam"``, or ``"soap"``, :class:`~sb3_quad.algorithms.soap.SOAP`, which
-        needs about half of the gradient steps. An ``optimizer_class`` in ``policy_kwargs`` holds in
-        place of both
     :raises ConfigError: an argument out of range, or observations that are a Dict
     :raises ExpertError: an expert that does not fit the environment
     """
@@ -164,7 +161,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         dataset_capacity: int = 500_000,
         shuffle: bool = True,
         demonstrations: StrPath | None = None,
-        optimizer: str = "adam",
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -202,7 +198,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
-        self.optimizer = optimizer
         self.expert = None
         self._n_rollouts = 0
         # Seeds the generators where no seed is given.

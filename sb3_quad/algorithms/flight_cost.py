@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch as th
 from torch.nn.functional import avg_pool1d, pad
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.state import STATE
 from sb3_quad.vehicles.vehicle import GRAVITY
@@ -71,12 +72,22 @@ def cost_and_gradients(
     actions: Float32Array,
     counts: BoolArray,
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Evaluate a cost as :data:`~sb3_quad.simulation.tape.FlightCost` says, by autograd."""
+    """Evaluate a cost as :data:`~sb3_quad.simulation.tape.FlightCost` says, by autograd.
+
+    :raises ConfigError: the cost is not a tensor (steps, n) that depends on states or actions.
+    """
     state_tensor = th.from_numpy(states).requires_grad_()
     action_tensor = th.from_numpy(actions).double().requires_grad_()
     # One split: the gradients of slices would be added up in an array of all states each.
     parts = [part.transpose(1, 2) for part in th.split(state_tensor, [*STATE.values()], dim=1)]
     costs = cost(FlownStates._make([*parts, action_tensor]))
+    shape = tuple(counts.shape)
+    if not isinstance(costs, th.Tensor) or costs.shape != shape or not costs.requires_grad:
+        given = getattr(costs, "shape", type(costs).__name__)
+        raise ConfigError(
+            f"cost: returned {given}; it must return a tensor of shape (steps, n) = {shape} that"
+            " depends on the states or the actions"
+        )
     mean = th.where(th.from_numpy(counts), costs, 0.0).mean()
     gradients = th.autograd.grad(
         mean, (state_tensor, action_tensor), allow_unused=True, materialize_grads=True

@@ -5,10 +5,8 @@ from typing import Any
 
 import torch as th
 
-# Names that the algorithms take
-OPTIMIZERS = ("adam", "soap")
 # How slowly the second moments of a matrix's gradients change, and updates between two bases
-MOMENT_DECAY = 0.95
+MOMENT_DECAY = 0.98
 REFRESH = 5
 
 
