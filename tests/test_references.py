@@ -3,6 +3,7 @@ follow.
 """
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ import pytest
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli.app import main
+from sb3_quad.controllers.agent_settings import settings_of_record
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.controllers import parse_controllers
@@ -24,6 +26,7 @@ from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.report.scenario_plots import paths_plot
 from sb3_quad.simulation.motions import read_points
 from sb3_quad.simulation.references import Reference
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
 
 DT = 0.01
@@ -383,3 +386,12 @@ def test_the_heading_of_a_file_goes_the_shorter_way(tmp_path):
     file.write_text("t,x,y,z,heading\n0,0,0,0,3.1\n1,0,0,0,-3.1\n")
     heading = read_points(file)[1][:, 3]
     np.testing.assert_allclose(np.diff(heading), 2 * np.pi - 6.2)
+def test_a_zip_keeps_a_curve_and_no_file_or_function(csv):
+    model = SimpleNamespace()
+    for reference, kept in ((csv, None), (spiral, None), ("helix", Reference(curve="helix"))):
+        settings = FlightSettings(reference=reference, preview=[0, 5])
+        settings.write_into(model)
+        own = settings_of_record(model.flight_settings, "model")
+        assert own.reference == kept and own.preview == settings.preview
+
+

@@ -147,7 +147,7 @@ class FlightSettings(ObservationSettings):
 
     def write_into(self, model: Any) -> None:
         """Write these settings into an SB3 model: ``model.flight_settings``, plain JSON with the
-        parameters of the vehicle, of several the first.
+        parameters of the vehicle, of several the first. A reference stays if it is a curve by name.
 
         From then on its zips hold them, and ``load`` of Stable-Baselines3 keeps them, even without
         this package.
@@ -157,8 +157,9 @@ class FlightSettings(ObservationSettings):
         changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
         if self.rotor_layout is not None:
             changes["rotor_layout"] = load_vehicle(self.rotor_layout)
-        if self.reference is not None and self.reference.function is not None:
-            # A function cannot be written, and an agent flies any reference.
+        if self.reference is not None and self.reference.curve in ("file", "function"):
+            # A function cannot be written, and the file may not be where the zip is read. The agent
+            # does not need either: it follows any reference.
             changes["reference"] = None
         setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
 
