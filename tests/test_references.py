@@ -150,6 +150,37 @@ def test_a_file_and_a_function_give_the_same_table(csv):
 
 
 @pytest.mark.parametrize(
+    "fields",
+    [
+        {"curve": "function", "function": spiral, "duration": 3.0},
+        {"curve": "helix", "duration": 3.0},
+        {"curve": "polynomial", "waypoints": WAYPOINTS, "heading": "path"},
+        "csv",
+    ],
+)
+def test_what_does_not_loop_rests_at_its_end(fields, csv):
+    reference = Reference.model_validate(csv if fields == "csv" else fields)
+    motion, seconds = reference._motion(DT)
+    table = reference.tracks(DT).table
+    # The last control step may begin half a step before or after the end.
+    ends = motion(np.array([0.0, seconds - DT / 2, seconds, seconds + DT / 2]))[:, :3]
+    gap = np.linalg.norm(table[-1, :3] - (ends[2] - ends[0]))
+    assert gap <= np.linalg.norm(ends[3] - ends[1]) + 1e-9
+    assert not table[-1, 3:9].any() and not table[-1, 11].any()
+    if seconds == 3.0 or fields == "csv":
+        assert gap < 1e-9
+
+
+def test_random_pieces_that_rest_do_not_turn_along_their_path():
+    reference = Reference(curve="random_smooth", resting=0.5, heading="path")
+    tracks = reference.tracks(DT)
+    pieces = tracks.table.reshape(-1, tracks.length, tracks.table.shape[1])
+    resting = pieces[~pieces[..., 3:6].any(axis=(1, 2))]
+    assert len(resting) == len(pieces) / 2
+    assert (resting[..., 9] == 1.0).all() and not resting[..., 10:12].any()
+
+
+@pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"curve": "polynomial"}, "needs waypoints"),
