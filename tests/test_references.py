@@ -195,6 +195,15 @@ def test_what_is_no_reference_is_refused(fields, message):
         QuadcopterVecEnv(1, reference=fields)
 
 
+def test_the_rate_of_no_heading_is_refused_in_flight_as_well():
+    env = QuadcopterVecEnv(2, seed=0)
+    env.reset()
+    before = env.true_state().array.copy()
+    with pytest.raises(ConfigError, match="heading_rate: needs a heading"):
+        env.set_reference((0, 0, 15), heading_rate=[0.0, 2.0])
+    np.testing.assert_array_equal(env.true_state().array, before)
+
+
 # Environments
 
 

@@ -132,7 +132,7 @@ class Hook:
     ) -> None:
         """See the state before a control step.
 
-        :param observation: (n, 18).
+        :param observation: (n, observation size).
         :param wrench: (n, WRENCH_SIZE), acts during the step.
         :param flying: (n,), the flights that are still in the air.
         """
@@ -169,9 +169,9 @@ def fly(
 
     :param controller: an expert or its name, such as ``"pid"``, asked by ``actions(state)`` for the
         true state; an SB3 model, its zip or the name of a shipped one, asked by
-        ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to
-        actions (n, 4). An agent does not bring the vehicle and the observations that it was trained
-        with: give them by :func:`~sb3_quad.env_kwargs`, or call
+        ``predict(observation, deterministic=True)``; or a function from observations
+        (n, observation size) to actions (n, 4). An agent does not bring the vehicle and the
+        observations that it was trained with: give them by :func:`~sb3_quad.env_kwargs`, or call
         :func:`~sb3_quad.evaluation.compare.compare`.
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
