@@ -63,7 +63,7 @@ def watched(table, delay=0, aside=0.0, turned=0.0, flying=True):
         half = 0.5 * (math.atan2(table[step, 10], table[step, 9]) + turned)
         array[QUATERNION, 0] = math.cos(half), 0.0, 0.0, math.sin(half)
         array[REFERENCE, 0] = table[step]
-        following.see(step, QuadcopterState(array), np.array([flying]))
+        following.update(step, QuadcopterState(array), np.array([flying]))
     errors = following.errors(np.array([flying]))
     return {name: float(values[0]) for name, values in errors.items()}
 
@@ -402,6 +402,15 @@ def test_enjoy_follows_a_reference(tmp_path, capsys):
     assert "remove" in capsys.readouterr().err
 
 
+def test_a_zip_keeps_a_curve_and_no_file_or_function(csv):
+    model = SimpleNamespace()
+    for reference, kept in ((csv, None), (spiral, None), ("helix", Reference(curve="helix"))):
+        settings = FlightSettings(reference=reference, preview=[0, 5])
+        settings.write_into(model)
+        own = settings_of_record(model.flight_settings, "model")
+        assert own.reference == kept and own.preview == settings.preview
+
+
 def test_a_snapshot_keeps_how_targets_move():
     flown = QuadcopterVecEnv(3, seed=0)
     other = QuadcopterVecEnv(3, seed=1)
@@ -426,12 +435,3 @@ def test_the_heading_of_a_file_goes_the_shorter_way(tmp_path):
     file.write_text("t,x,y,z,heading\n0,0,0,0,3.1\n1,0,0,0,-3.1\n")
     heading = read_points(file)[1][:, 3]
     np.testing.assert_allclose(np.diff(heading), 2 * np.pi - 6.2)
-def test_a_zip_keeps_a_curve_and_no_file_or_function(csv):
-    model = SimpleNamespace()
-    for reference, kept in ((csv, None), (spiral, None), ("helix", Reference(curve="helix"))):
-        settings = FlightSettings(reference=reference, preview=[0, 5])
-        settings.write_into(model)
-        own = settings_of_record(model.flight_settings, "model")
-        assert own.reference == kept and own.preview == settings.preview
-
-
