@@ -111,7 +111,7 @@ class QuadcopterBatch:
         self.physics_step = vehicles[0].physics_step
         self.substeps = vehicles[0].substeps
         self.randomize_numbers = self.randomize.numbers(control_step)
-        # An array without columns stands for gusts, frames or an integral that nobody asked for.
+        # An array without columns stands for gusts, frames or an integral that are switched off.
         self.gust = np.zeros((GUST_SIZE, n * bool(self.randomize.gusts)))
         self.wind = np.zeros((3, n))
         self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
@@ -390,7 +390,7 @@ class QuadcopterBatch:
             self.course[: C.begin] = values
 
     def set_reference(self, reference: FloatArray, rows: IntArray) -> None:
-        """Let rows follow what they are told, (REFERENCE_SIZE, rows), from now on."""
+        """Set the reference of these rows, (REFERENCE_SIZE, rows)."""
         self.state[REFERENCE, rows] = reference
         if self.course.size:
             self.course[C.begin, rows] = -1.0
