@@ -139,19 +139,22 @@ class BatchEnv:
         :param velocity: likewise, m/s.
         :param acceleration: likewise, m/s².
         :param heading: of the body's x axis from the world's, one number or one for each of these
-            rows, rad. None: nothing is asked of it.
+            rows, rad. None: none is commanded.
         :param heading_rate: likewise, rad/s.
-        :raises ConfigError: a wrong shape, or a number that is not finite.
+        :raises ConfigError: a wrong shape, a number that is not finite, or a heading_rate without a
+            heading.
         """
         rows = self.batch.rows(indices)
         n = rows.size
         positions = per_row("position", position, n, 3)
         velocities = per_row("velocity", velocity, n, 3)
         accelerations = per_row("acceleration", acceleration, n, 3)
+        rate = per_row("heading_rate", heading_rate, n)[0]
         turning = np.zeros((3, n))
+        if heading is None and rate.any():
+            raise ConfigError("heading_rate: needs a heading")
         if heading is not None:
             angle = per_row("heading", heading, n)[0]
-            rate = per_row("heading_rate", heading_rate, n)[0]
             turning = np.stack([np.cos(angle), np.sin(angle), rate])
         # Nobody knows its future, so the acceleration ahead is the present one.
         parts = [positions, velocities, accelerations, turning, accelerations]

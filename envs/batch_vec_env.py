@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
@@ -28,7 +29,16 @@ class BatchVecEnv(VecEnv):
     #: Steps after which an episode is truncated; set your own.
     max_episode_steps = ENDLESS
     #: Random numbers for your episodes, which :meth:`seed` seeds.
-    rng = np.random.default_rng()
+    rng: np.random.Generator
+
+    def __init__(
+        self,
+        num_envs: int,
+        observation_space: "spaces.Space[Any]",
+        action_space: "spaces.Space[Any]",
+    ) -> None:
+        super().__init__(num_envs, observation_space, action_space)
+        self.rng = np.random.default_rng()
 
     def begin(self, rows: IntArray) -> Any:
         """Begin a new episode in the given rows (k,); return their observations (k, ...)."""

@@ -48,7 +48,7 @@ class BulletBody:
 
     :param vehicle: mass, inertia, gravity, collision radius and physics step.
     :param window: width and height in pixels of PyBullet's window, one per process; None: no
-        window. Without a display no window opens either, and a line on stderr tells so.
+        window. Without a display no window opens either, and a line on stderr says why.
     :raises ConfigError: the window cannot be opened.
     """
 

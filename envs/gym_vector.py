@@ -32,7 +32,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
     :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. With ``"SameStep"`` a
         row that ends returns the first observation and infos of its next episode; the last ones are
         in ``final_obs[i]`` and ``final_info``. With ``"NextStep"`` it returns the last ones, and
-        the next step begins its next episode, whatever its action is.
+        the next step begins its next episode; its action then does not count, but must be finite.
     :raises ConfigError: an argument that does not fit.
     """
 
@@ -106,7 +106,8 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         """Fly one control step.
 
         :param actions: (n, 4), clipped to [-1, 1].
-        :return: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos.
+        :return: observations (n, observation size), rewards (n,), terminated (n,), truncated (n,),
+            infos.
         """
         observations, rewards, done = self.batch.step(actions)
         # In mode NextStep a step of a row that has ended is its reset, without reward.

@@ -330,7 +330,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     def _draw(self) -> Image | None:
         if self._renderer is None:
             return None
-        return self._renderer.render(self.batch.state[:, 0], self.wrench)
+        return self._renderer.render(self.batch.state[:, 0], self.batch.total_wrench()[:, 0])
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
@@ -338,7 +338,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         self._body.close()
 
     def observe(self) -> Float32Array:
-        """Return the current observation, (18,).
+        """Return the current observation, (observation size,).
 
         The numbers stay the same until the next step, unless you set something in between.
         """

@@ -86,7 +86,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         super().__init__(self.batch.n, *quadcopter_spaces(self.batch.observation.size))
 
     def reset(self) -> VecEnvObs:
-        """Begin a new episode in every row; observations float32 (n, 18)."""
+        """Begin a new episode in every row; observations float32 (n, observation size)."""
         # SB3 passes options through a method of their own, before the reset.
         if any(self._options):
             self._reset_options()
@@ -105,7 +105,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Fly one control step.
 
-        :return: observations (n, 18), rewards (n,), done (n,), infos.
+        :return: observations (n, observation size), rewards (n,), done (n,), infos.
         """
         # An info holds until the next step.
         for row in self._ended:

@@ -47,6 +47,14 @@ class Rows(BatchVecEnv):
         return self.state, -np.abs(self.state[:, 0]), np.abs(self.state[:, 0]) > 2.0
 
 
+def test_environments_share_no_random_numbers():
+    first, second = Rows(2), Rows(2)
+    assert first.rng is not second.rng
+    first.seed(3)
+    second.seed(3)
+    assert first.rng.normal() == second.rng.normal()
+
+
 def test_it_is_what_sb3_makes_of_single_environments():
     batch = Rows(5)
     single = make_vec_env(

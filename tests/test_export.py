@@ -29,7 +29,7 @@ from sb3_quad.controllers.pretrained import agent_path, load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export import c_header, network, policy
-from sb3_quad.export.check import Reference
+from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
@@ -538,7 +538,7 @@ SEEN, DONE = spaces.Box(-np.inf, np.inf, (18,), np.float32), spaces.Box(-1.0, 1.
 )
 def test_a_policy_that_cannot_fly_so_is_refused(make, message):
     with pytest.raises(ConfigError, match=message):
-        build_network(Reference(make(), FlightSettings(), ITM))
+        build_network(TrainedPolicy(make(), FlightSettings(), ITM))
 
 
 @pytest.mark.parametrize(

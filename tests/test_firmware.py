@@ -47,7 +47,7 @@ def watched(forces, vehicles=(CRAZYFLIE,), flying=True):
         along_z = np.append([0.2, 0.0], force)
         wrench[FORCE_BODY] = WEIGHT * along_z[-3:, None]
         state = QuadcopterState(array, parameters, wrench)
-        supervisor.see(state, np.full(len(vehicles), flying))
+        supervisor.update(state, np.full(len(vehicles), flying))
     return supervisor
 
 

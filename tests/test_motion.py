@@ -27,7 +27,7 @@ def state(position=(0, 0, 0), target=(10, 0, 0), tilt=0.0, rate=0.0):
 def watched(states, flying=True):
     motion = Motion(states[0], 0.01)
     for step, each in enumerate(states[1:], 1):
-        motion.see(step, each, np.array([flying]))
+        motion.update(step, each, np.array([flying]))
     return motion
 
 
@@ -57,7 +57,7 @@ def test_arrival_and_settling_times_are_those_of_each_tolerance():
     arrivals = Arrivals((0.1, 1.0), np.array([0.05, 2.0, 2.0]))
     # The first leaves 0.1 m and returns, the second overshoots within 1 m, the third never arrives.
     for step, distance in enumerate([[0.3, 0.5, 1.5], [0.08, 0.9, 1.2], [0.02, 0.09, 1.1]], 1):
-        arrivals.see(float(step), np.array(distance))
+        arrivals.update(float(step), np.array(distance))
     np.testing.assert_array_equal(arrivals.time_to, [[0, 3, np.nan], [0, 1, np.nan]])
     np.testing.assert_array_equal(arrivals.settling_time, [[2, 3, np.nan], [0, 1, np.nan]])
     np.testing.assert_array_equal(arrivals.overshoot, [0.3, 0.09, np.nan])

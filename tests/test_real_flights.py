@@ -15,16 +15,16 @@ from real_flights import Cascade, Run, estimates, fit, lagged, started
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.evaluation.real_flights import (
-    FELT,
+    CAPTURE_COLUMNS,
+    GYRO_COLUMNS,
     PWM,
-    SEEN,
     THRUST_BY_VOLTAGE,
     THRUSTS,
     errors,
     motor_thrusts,
     open_loop,
     read_logs,
-    turned_on,
+    rotated_by,
 )
 from sb3_quad.simulation.state import QUATERNION
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -51,7 +51,7 @@ def flown(vehicle, seconds=12.0, seed=0):
         parts = (state.position, state.quaternion, state.velocity, state.body_rates, thrusts)
         rows.append(np.concatenate([[now * STEP], *(part[0] for part in parts)]))
         batch.step(vehicle.thrust_to_action(thrusts))
-    return pd.DataFrame(rows, columns=["t", *SEEN, *FELT, *THRUSTS])
+    return pd.DataFrame(rows, columns=["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS, *THRUSTS])
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def raw(logs, folder):
     """Return the logs without calibration, which is for instruments: here, there are none."""
     for log in logs:
         table = pd.read_csv(log.path)[: len(log.flying)]
-        log.motion[:] = table[SEEN + FELT]
+        log.motion[:] = table[CAPTURE_COLUMNS + GYRO_COLUMNS]
         log.thrusts[:] = table[THRUSTS]
     return logs
 
@@ -83,7 +83,7 @@ def test_calibration_leaves_a_log_without_faults_nearly_alone(folder):
         assert abs(log.offset) <= 0.005 and log.flying.all()
         table = pd.read_csv(log.path)[: len(log.flying)]
         np.testing.assert_allclose(log.thrusts, table[THRUSTS], rtol=0.01)
-        gap = log.motion[:, QUATERNION] - table[SEEN[QUATERNION]]
+        gap = log.motion[:, QUATERNION] - table[CAPTURE_COLUMNS[QUATERNION]]
         # Half the angle
         assert np.linalg.norm(gap, axis=1).max() < np.radians(1.0)
 
@@ -91,10 +91,12 @@ def test_calibration_leaves_a_log_without_faults_nearly_alone(folder):
 def test_a_late_clock_tilted_markers_and_an_uneven_motor_are_calibrated(folder, tmp_path):
     table = pd.read_csv(folder / "flight_0.csv")
     late = table.copy()
-    late[[*FELT, *THRUSTS]] = table[[*FELT, *THRUSTS]].shift(3).bfill()
+    late[[*GYRO_COLUMNS, *THRUSTS]] = table[[*GYRO_COLUMNS, *THRUSTS]].shift(3).bfill()
     late[THRUSTS[0]] *= 1.1
     tilt = np.tile([[0.03, -0.02, 0.0]], (len(table), 1))
-    late[SEEN[QUATERNION]] = turned_on(table[SEEN[QUATERNION]].to_numpy(), tilt)
+    late[CAPTURE_COLUMNS[QUATERNION]] = rotated_by(
+        table[CAPTURE_COLUMNS[QUATERNION]].to_numpy(), tilt
+    )
     late.to_csv(tmp_path / "late.csv", index=False)
     (log,) = read_logs(tmp_path, STEP)
     (true,) = [each for each in read_logs(folder, STEP) if each.path.stem == "flight_0"]

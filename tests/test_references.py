@@ -3,6 +3,7 @@ follow.
 """
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ import pytest
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli.app import main
+from sb3_quad.controllers.agent_settings import settings_of_record
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.controllers import parse_controllers
@@ -24,6 +26,7 @@ from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.report.scenario_plots import paths_plot
 from sb3_quad.simulation.motions import read_points
 from sb3_quad.simulation.references import Reference
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
 
 DT = 0.01
@@ -60,7 +63,7 @@ def watched(table, delay=0, aside=0.0, turned=0.0, flying=True):
         half = 0.5 * (math.atan2(table[step, 10], table[step, 9]) + turned)
         array[QUATERNION, 0] = math.cos(half), 0.0, 0.0, math.sin(half)
         array[REFERENCE, 0] = table[step]
-        following.see(step, QuadcopterState(array), np.array([flying]))
+        following.update(step, QuadcopterState(array), np.array([flying]))
     errors = following.errors(np.array([flying]))
     return {name: float(values[0]) for name, values in errors.items()}
 
@@ -147,6 +150,37 @@ def test_a_file_and_a_function_give_the_same_table(csv):
 
 
 @pytest.mark.parametrize(
+    "fields",
+    [
+        {"curve": "function", "function": spiral, "duration": 3.0},
+        {"curve": "helix", "duration": 3.0},
+        {"curve": "polynomial", "waypoints": WAYPOINTS, "heading": "path"},
+        "csv",
+    ],
+)
+def test_what_does_not_loop_rests_at_its_end(fields, csv):
+    reference = Reference.model_validate(csv if fields == "csv" else fields)
+    motion, seconds = reference._motion(DT)
+    table = reference.tracks(DT).table
+    # The last control step may begin half a step before or after the end.
+    ends = motion(np.array([0.0, seconds - DT / 2, seconds, seconds + DT / 2]))[:, :3]
+    gap = np.linalg.norm(table[-1, :3] - (ends[2] - ends[0]))
+    assert gap <= np.linalg.norm(ends[3] - ends[1]) + 1e-9
+    assert not table[-1, 3:9].any() and not table[-1, 11].any()
+    if seconds == 3.0 or fields == "csv":
+        assert gap < 1e-9
+
+
+def test_random_pieces_that_rest_do_not_turn_along_their_path():
+    reference = Reference(curve="random_smooth", resting=0.5, heading="path")
+    tracks = reference.tracks(DT)
+    pieces = tracks.table.reshape(-1, tracks.length, tracks.table.shape[1])
+    resting = pieces[~pieces[..., 3:6].any(axis=(1, 2))]
+    assert len(resting) == len(pieces) / 2
+    assert (resting[..., 9] == 1.0).all() and not resting[..., 10:12].any()
+
+
+@pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"curve": "polynomial"}, "needs waypoints"),
@@ -159,6 +193,15 @@ def test_a_file_and_a_function_give_the_same_table(csv):
 def test_what_is_no_reference_is_refused(fields, message):
     with pytest.raises(ConfigError, match=message):
         QuadcopterVecEnv(1, reference=fields)
+
+
+def test_the_rate_of_no_heading_is_refused_in_flight_as_well():
+    env = QuadcopterVecEnv(2, seed=0)
+    env.reset()
+    before = env.true_state().array.copy()
+    with pytest.raises(ConfigError, match="heading_rate: needs a heading"):
+        env.set_reference((0, 0, 15), heading_rate=[0.0, 2.0])
+    np.testing.assert_array_equal(env.true_state().array, before)
 
 
 # Environments
@@ -357,6 +400,15 @@ def test_enjoy_follows_a_reference(tmp_path, capsys):
     scenario = ["--scenario", "thesis:side_hit", "--no-render"]
     assert main(["enjoy", "pid", *scenario, "--reference", "circle"]) == 2
     assert "remove" in capsys.readouterr().err
+
+
+def test_a_zip_keeps_a_curve_and_no_file_or_function(csv):
+    model = SimpleNamespace()
+    for reference, kept in ((csv, None), (spiral, None), ("helix", Reference(curve="helix"))):
+        settings = FlightSettings(reference=reference, preview=[0, 5])
+        settings.write_into(model)
+        own = settings_of_record(model.flight_settings, "model")
+        assert own.reference == kept and own.preview == settings.preview
 
 
 def test_a_snapshot_keeps_how_targets_move():

@@ -84,6 +84,23 @@ def test_wrench_is_shown(env: QuadcopterEnv) -> None:
     assert red(with_force) > red(without) + 10
 
 
+def test_gusts_are_shown_as_a_part_of_the_wrench(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = QuadcopterEnv(
+        render_mode="rgb_array",
+        render_width=160,
+        render_height=120,
+        randomize={"gusts": {"std": 3.0}},
+    )
+    env.reset(seed=0)
+    shown = []
+    monkeypatch.setattr(env._renderer, "render", lambda state, wrench: shown.append(wrench))
+    env.render()
+    acting: Any = env.true_state().wrench
+    assert acting.any()
+    np.testing.assert_array_equal(shown[0], acting[:, 0])
+    env.close()
+
+
 def test_rotors_turn(env: QuadcopterEnv) -> None:
     env.reset(seed=0)
     assert not np.array_equal(env.render(), env.render())  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ from sb3_quad import envs
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import (
     DEFAULT_STD,
@@ -367,6 +368,7 @@ def test_a_named_mixture_gives_way_to_what_the_user_gives():
     assert FlightSettings(task="thesis_recovery", max_episode_steps=70).max_episode_steps == 70
     changed = FlightSettings(vehicle="crazyflie").with_changes(task="thesis_recovery")
     assert changed.max_episode_steps == 500
+    assert changed.with_changes(task="target_tracking").max_episode_steps == MAX_EPISODE_STEPS
     kept = FlightSettings(max_episode_steps=70).with_changes(task="thesis_recovery")
     assert kept.max_episode_steps == 70
     words = in_words("thesis_recovery")

@@ -3,6 +3,7 @@ one clear error.
 """
 
 import inspect
+from pathlib import Path
 from typing import Any, Literal, Optional
 
 import pytest
@@ -20,6 +21,7 @@ from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.simulation.tasks import TASKS
+from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.training.algorithms import (
     ALGORITHMS,
     constructor_parameters,
@@ -37,6 +39,7 @@ from sb3_quad.training.config import (
 )
 from sb3_quad.training.pipeline import load_pipeline
 from sb3_quad.training.trainer import build_model
+from sb3_quad.vehicles.vehicle import VEHICLES
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}
@@ -228,6 +231,31 @@ def test_overrides_go_over_the_file_and_into_env_kwargs(tmp_path):
     assert config.env_kwargs == {"noise": 0, "vehicle": "itm"}
     with pytest.raises(ConfigError, match="command line: n_envs"):
         load_config("ppo", ENV, path, {"n_envs": 0})
+
+
+def test_files_of_environments_have_absolute_paths(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("own.yaml").write_text(VEHICLES.text("crazyflie")[0])
+    Path("ranges.yaml").write_text(DISTRIBUTIONS.text("raptor")[0])
+    files = {
+        "vehicle": ["itm", "own.yaml"],
+        "rotor_layout": "own.yaml",
+        "vehicles": {"distribution": "ranges.yaml", "mass": 1.0},
+        "reference": "curve.csv",
+    }
+    curve = {"reference": {"curve": "file", "file": "curve", "heading": "path"}}
+    config = build(env_kwargs=files, eval_env_kwargs=curve)
+    assert config.env_kwargs == {
+        "vehicle": ["itm", str(tmp_path / "own.yaml")],
+        "rotor_layout": str(tmp_path / "own.yaml"),
+        "vehicles": {"distribution": str(tmp_path / "ranges.yaml"), "mass": 1.0},
+        "reference": str(tmp_path / "curve.csv"),
+    }
+    assert config.eval_env_kwargs["reference"]["file"] == str(tmp_path / "curve")
+    monkeypatch.chdir("/")
+    assert build_config("dagger", ENV, config.settings) == config
+    names = {"rotor_layout": "itm", "vehicles": "raptor", "reference": "circle"}
+    assert build(env_kwargs=names).env_kwargs == names
 
 
 def test_settings_can_be_written_and_read_again():

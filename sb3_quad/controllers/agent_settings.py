@@ -86,7 +86,11 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     changes: StrDict = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}
     if isinstance(task, dict) and "name" in task:
         changes["task"] = validate(Task, task, where)
-    return validate(FlightSettings, record | changes, where)
+    settings = validate(FlightSettings, record | changes, where)
+    # Zips of older versions name the file of a reference, which export would read.
+    if settings.reference is not None and settings.reference.curve == "file":
+        settings = settings.model_copy(update={"reference": None})
+    return settings
 
 
 def _settings_of_run(config: Path) -> FlightSettings:

@@ -17,8 +17,8 @@ def statistics_of(model: Any) -> Any:
 
     :param model: an SB3 model, or any other controller, which has none.
     """
-    found = getattr(model, "_vec_normalize_env", None) or getattr(model, STATISTICS, None)
-    return found if getattr(found, "norm_obs", False) else None
+    statistics = getattr(model, "_vec_normalize_env", None) or getattr(model, STATISTICS, None)
+    return statistics if getattr(statistics, "norm_obs", False) else None
 
 
 def share_statistics(statistics: Any, env: Any, training: bool = False) -> None:

@@ -55,9 +55,9 @@ def unpickle(content: str | bytes, where: str) -> Any:
         steps.left = min(_STEPS, 10_000 + 5 * len(content))
         reader = _Reader(steps)
         reader.steps = steps
-        found = reader.load()
-        reader.walk(found)
-        return found
+        value = reader.load()
+        reader.walk(value)
+        return value
     except _Refusal as error:
         fault = str(error)
     except Exception as error:  # what wrong types raise depends on the types

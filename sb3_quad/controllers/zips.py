@@ -43,7 +43,7 @@ _OURS = {
 }
 # Of the pickles of an agent, ``predict`` needs only these.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs", STATISTICS)
-# So are numbers of NumPy, whose types SB3 writes so.
+# SB3 pickles NumPy numbers; these prefixes mark them.
 _NUMBERS = ("<class 'numpy.int", "<class 'numpy.float")
 # The others become None, or these values where SB3 cannot load None.
 _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}

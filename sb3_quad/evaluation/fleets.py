@@ -19,7 +19,7 @@ ENV_ID = "QuadTargetTracking-v0"
 
 
 class Fleet(QuadcopterBatch):
-    """n vehicles in their first episodes; a row that is lost stays so.
+    """n vehicles in their first episodes; a lost row stays lost.
 
     :param seeds: of the episodes, (n,).
     :param settings: how they fly; ``max_episode_steps`` has no meaning here, since flights end by
@@ -56,7 +56,7 @@ class PyBulletFleet(Fleet):
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
         super().__init__(seeds, settings)
         self._seeds = seeds
-        # Flights end by their plan; -1 is Gymnasium's word for an environment that truncates none.
+        # Flights end by their plan; -1 switches Gymnasium's time limit off.
         # The batch moves the targets, so that no environment needs tables of its own.
         keywords = {
             **dict(settings),

@@ -81,7 +81,7 @@ class Flights:
     greatest_error: FloatArray  #: (n,), largest |r - r_T|, m
     path_error: FloatArray  #: (n,), root mean square of its part across the target's velocity, m
     lag: FloatArray  #: (n,), how late the flight is on its path, s, see Following
-    heading_error: FloatArray  #: (n,), root mean square, degrees; NaN where no heading is asked for
+    heading_error: FloatArray  #: (n,), root mean square, degrees; NaN where none is commanded
     cut_by_supervisor: BoolArray  #: (n,), whether the firmware would have cut it, see Supervisor
     #: (n,), longest time that the specific force along body z stayed below 0.5 g, s; NaN where the
     #: vehicle has no supervisor
@@ -132,7 +132,7 @@ class Hook:
     ) -> None:
         """See the state before a control step.
 
-        :param observation: (n, 18).
+        :param observation: (n, observation size).
         :param wrench: (n, WRENCH_SIZE), acts during the step.
         :param flying: (n,), the flights that are still in the air.
         """
@@ -169,9 +169,9 @@ def fly(
 
     :param controller: an expert or its name, such as ``"pid"``, asked by ``actions(state)`` for the
         true state; an SB3 model, its zip or the name of a shipped one, asked by
-        ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to
-        actions (n, 4). An agent does not bring the vehicle and the observations that it was trained
-        with: give them by :func:`~sb3_quad.env_kwargs`, or call
+        ``predict(observation, deterministic=True)``; or a function from observations
+        (n, observation size) to actions (n, 4). An agent does not bring the vehicle and the
+        observations that it was trained with: give them by :func:`~sb3_quad.env_kwargs`, or call
         :func:`~sb3_quad.evaluation.compare.compare`.
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
@@ -303,21 +303,21 @@ def _fly_fleet(
         way = np.linalg.norm(state.position - position, axis=1)
         path_length += np.where(flying, way, 0.0)
         position = state.position.copy()
-        arrivals.see(time, course.to_last(distance))
+        arrivals.update(time, course.to_last(distance))
 
         # From here on, only the flights that continue count.
         flying &= fleet.outcome["truncated"]
-        motion.see(step, state, flying)
-        supervisor.see(state, flying)
+        motion.update(step, state, flying)
+        supervisor.update(state, flying)
         if fleet.moves:
-            following.see(step, state, flying)
+            following.update(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
         if len(plan.waypoints):
             # Whoever has reached a waypoint sees the next one from the next step on.
-            onward = course.see(time, distance, flying)
+            onward = course.update(time, distance, flying)
             if onward.size:
                 fleet.state[TARGET, onward] = course.targets(onward).T
                 observation = fleet.observe()
@@ -368,7 +368,7 @@ def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -
 
 
 class Arrivals:
-    """Watches, step by step, when n flights come within T tolerances of their targets.
+    """Tracks when n flights come within T tolerances of their targets.
 
     ``time_to`` (T, n): s until |r - r_T| is first within each tolerance. ``settling_time`` (T, n):
     s since when it has stayed within it. ``overshoot`` (n,): the largest |r - r_T|, m, since it was
@@ -388,7 +388,7 @@ class Arrivals:
             self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
         self.overshoot = np.where(np.isnan(self._first), np.nan, distance)
 
-    def see(self, time: float, distance: FloatArray) -> None:
+    def update(self, time: float, distance: FloatArray) -> None:
         """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s.
 
         Of a flight that was lost it is the last one.
@@ -417,7 +417,7 @@ class Waypoints:
         self._count = len(plan.waypoints)
         self.times = np.full((n, self._count), np.nan)
 
-    def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
+    def update(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
         near = flying & (distance <= self._plan.radius)
         reached = np.flatnonzero(near & (self._next < self._count))
@@ -442,7 +442,7 @@ class Waypoints:
 
 
 class Motion:
-    """Watches, step by step, when n flights become stable and how far they deviate from their line.
+    """Tracks when n flights become stable and how far they deviate from their line.
 
     ``recovery_time`` (n,): s until the tilt has come below 45° and the body rates about x and y
     below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never was. The thesis
@@ -463,9 +463,9 @@ class Motion:
         self._stable_since = np.zeros(state.n)  # NaN while it is not stable
         self.recovery_time = np.full(state.n, np.nan)
         self.cross_track_error = np.where(length[:, 0] > 0.0, 0.0, np.nan)
-        self.see(0, state, np.ones(state.n, bool))
+        self.update(0, state, np.ones(state.n, bool))
 
-    def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
+    def update(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
         """See the state after control step ``step``; only the flights (n,) that continue count."""
         time = step * self._control_step
         # The cosine of the tilt is the z-z element of the rotation matrix.

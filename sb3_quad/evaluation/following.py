@@ -10,14 +10,14 @@ FOLLOWED = ("rms_error", "greatest_error", "path_error", "heading_error", "lag")
 
 
 class Following:
-    """Watches, step by step, how far n flights are from references that move or turn.
+    """Tracks how far n flights are from references that move or turn.
 
     With the error e = r - r_T and the reference's velocity v, over all that is flown after the
     first 2 s: ``rms_error`` is the root mean square of the length of e, ``greatest_error`` the
     greatest length, and ``path_error`` the root mean square of the part of e across v, or of all of
     it where v is zero; m. ``lag`` is -mean(e·v) / mean(v²), s: the delay after which the reference
     fits the flight best, as long as it is short. ``heading_error`` is the root mean square of the
-    angle between the body's x axis, seen from above, and the heading that is asked for, degrees.
+    angle between the body's x axis, seen from above, and the commanded heading, degrees.
 
     ``moves`` (n,) says whose reference has moved or had a heading.
 
@@ -30,27 +30,28 @@ class Following:
         self._greatest = np.full(n, np.nan)
         self._sums = np.zeros((7, n))
 
-    def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
+    def update(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
         """See the state after control step ``step``; only the flights (n,) that continue count."""
         velocity = state.target_velocity
         speed = np.linalg.norm(velocity, axis=1)
         cosine, sine = state.target_heading.T
-        # One where a heading is asked for, zero where none is.
-        asked = np.hypot(cosine, sine)
-        self.moves |= speed + asked > 0.0
+        # One where a heading is commanded, else zero.
+        commanded = np.hypot(cosine, sine)
+        self.moves |= speed + commanded > 0.0
         if step < self._first:
             return
         error = state.position - state.target
         distance = state.distance
         along = (error * velocity).sum(axis=1)
         on_path = np.divide(along, speed, out=np.zeros_like(along), where=speed > 0.0)
-        # The azimuth of the body's x axis, from the heading that is asked for.
+        # The azimuth of the body's x axis, from the commanded heading.
         x, y = state.rotation[:, :2, 0].T
         turn = np.arctan2(cosine * y - sine * x, cosine * x + sine * y)
         np.fmax(self._greatest, distance, out=self._greatest, where=flying)
         squared = distance**2
         across = squared - on_path**2
-        counted = np.ones_like(along), squared, across, along, speed**2, asked, asked * turn**2
+        turns = commanded * turn**2
+        counted = np.ones_like(along), squared, across, along, speed**2, commanded, turns
         self._sums += np.where(flying, counted, 0.0)
 
     def errors(self, survival: BoolArray) -> dict[str, FloatArray]:
@@ -58,13 +59,13 @@ class Following:
 
         :param survival: (n,).
         """
-        steps, squares, across, along, speeds, asked, turns = self._sums
+        steps, squares, across, along, speeds, commanded, turns = self._sums
         with np.errstate(divide="ignore", invalid="ignore"):
             errors = (
                 np.sqrt(squares / steps),
                 self._greatest,
                 np.sqrt(np.maximum(across, 0.0) / steps),
-                np.degrees(np.sqrt(turns / asked)),
+                np.degrees(np.sqrt(turns / commanded)),
                 -along / speeds,
             )
         return dict(zip(FOLLOWED, np.where(survival & self.moves, errors, np.nan), strict=True))

@@ -87,7 +87,7 @@ class Metrics(Frozen):
     lag: Estimate | None
     """mean delay along the path, s"""
     heading_error: Estimate | None
-    """mean root mean square, degrees; None: no heading is asked for"""
+    """mean root mean square, degrees; None: no heading is commanded"""
     cut_by_supervisor: Estimate | None = None
     """share that the firmware would have cut, see Supervisor; None: it has no supervisor"""
     low_force_time: float | None = None

@@ -44,16 +44,16 @@ OFFSETS = np.arange(-0.1, 0.1005, 0.001)
 THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
 FULL_PWM = 65_535.0
 # By the motion capture, in the order of the state's first rows
-SEEN = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
-FELT = ["imu_gyro_x", "imu_gyro_y", "imu_gyro_z"]
+CAPTURE_COLUMNS = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
+GYRO_COLUMNS = ["imu_gyro_x", "imu_gyro_y", "imu_gyro_z"]
 THRUSTS = ["thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4"]
 PWM = ["motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4", "pwr_pm_vbat"]
 NEEDED = (
-    f"a log is a CSV file with the columns t, {', '.join(SEEN + FELT)}, and thrusts in N "
-    f"({', '.join(THRUSTS)}) or {', '.join(PWM)}"
+    f"a log is a CSV file with the columns t, {', '.join(CAPTURE_COLUMNS + GYRO_COLUMNS)}, "
+    f"and thrusts in N ({', '.join(THRUSTS)}) or {', '.join(PWM)}"
 )
 QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
-HEADS = ("root mean square of the error", "simulated", "nothing changes", "velocity, rates stay")
+HEADINGS = ("root mean square of the error", "simulated", "nothing changes", "velocity, rates stay")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def read_log(path: Path, step: float) -> Log:
     with raised_as(ConfigError, f"{path}: not a table of numbers"):
         table = pd.read_csv(path).astype(float)
     commands = THRUSTS if THRUSTS[0] in table else PWM
-    missing = {"t", *SEEN, *FELT, *commands} - {*table}
+    missing = {"t", *CAPTURE_COLUMNS, *GYRO_COLUMNS, *commands} - {*table}
     if missing:
         raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
     if len(table) < 2:
@@ -92,10 +92,10 @@ def read_log(path: Path, step: float) -> Log:
     time = table["t"]
     grid = np.arange(time.iloc[0], time.iloc[-1], step)
 
-    def at(names: list[str], behind: float = 0.0) -> FloatArray:
+    def resampled(names: list[str], behind: float = 0.0) -> FloatArray:
         return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
 
-    motion = at(SEEN + FELT)
+    motion = resampled(CAPTURE_COLUMNS + GYRO_COLUMNS)
     attitude = motion[:, QUATERNION]
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     flying = motion[:, 2] > LEAST_HEIGHT
@@ -104,10 +104,12 @@ def read_log(path: Path, step: float) -> Log:
     rotation = rotation_matrices(attitude)
     turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, step, axis=0))
     rates = turning[flying][:, [2, 0, 1], [1, 2, 0]]
-    offset = float(max(OFFSETS, key=lambda behind: np.vdot(rates, at(FELT, behind)[flying])))
-    motion[:, BODY_RATES] = at(FELT, offset)
+    offset = float(
+        max(OFFSETS, key=lambda behind: np.vdot(rates, resampled(GYRO_COLUMNS, behind)[flying]))
+    )
+    motion[:, BODY_RATES] = resampled(GYRO_COLUMNS, offset)
 
-    thrusts = at(commands, offset)
+    thrusts = resampled(commands, offset)
     if commands is PWM:
         thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
     # Some logs are extrapolated after the radio was lost.
@@ -116,7 +118,7 @@ def read_log(path: Path, step: float) -> Log:
         force = np.gradient(motion[:, VELOCITY], step, axis=0)
         force[:, 2] += GRAVITY
         x, y, z = np.einsum("nji,nj->ni", rotation, force)[flying].mean(axis=0)
-        motion[:, QUATERNION] = turned_on(attitude, np.array([[-y / z, x / z, 0.0]]))
+        motion[:, QUATERNION] = rotated_by(attitude, np.array([[-y / z, x / z, 0.0]]))
         mean = thrusts[flying].mean(axis=0)
         thrusts *= mean.mean() / mean
     return Log(path, motion, thrusts, flying, offset)
@@ -132,7 +134,7 @@ def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
     return np.where((pwm > 0.0) & (pwm <= FULL_PWM), thrusts, np.nan)
 
 
-def turned_on(quaternion: FloatArray, rotation: FloatArray) -> FloatArray:
+def rotated_by(quaternion: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return attitudes, (n, 4), after rotations in body axes, (n, 3), rad."""
     half = 0.5 * np.linalg.norm(rotation, axis=1)
     axis = 0.5 * np.sinc(half / np.pi) * rotation.T
@@ -153,8 +155,8 @@ def open_loop(
     :param logs: with rows at the vehicle's control step.
     :param stride: rows from a window to the next.
     :param before_step: called with the batch before each control step; it may set a wrench.
-    :return: horizon by horizon: its s, the predictions in the order of ``HEADS``, and the record,
-        each (windows, 13) as in ``Log.motion``.
+    :return: horizon by horizon: its s, the predictions in the order of ``HEADINGS``, and the
+        record, each (windows, 13) as in ``Log.motion``.
     :raises ConfigError: no log flies for long enough, or the rotors do not lie as M1 to M4 do.
     """
     crazyflie = first_vehicle("crazyflie")
@@ -192,10 +194,12 @@ def open_loop(
         rows += 1
         if now + 1 in ends:
             time = (now + 1) * step
-            stays = start.copy()
-            stays[:, POSITION] += start[:, VELOCITY] * time
-            stays[:, QUATERNION] = turned_on(start[:, QUATERNION], start[:, BODY_RATES] * time)
-            yield time, [motion.T.copy(), start, stays], record[rows]
+            extrapolated = start.copy()
+            extrapolated[:, POSITION] += start[:, VELOCITY] * time
+            extrapolated[:, QUATERNION] = rotated_by(
+                start[:, QUATERNION], start[:, BODY_RATES] * time
+            )
+            yield time, [motion.T.copy(), start, extrapolated], record[rows]
 
 
 def errors(prediction: FloatArray, end: FloatArray) -> FloatArray:
@@ -211,11 +215,11 @@ def error_table(logs: Sequence[Log], vehicle: Vehicle) -> Table:
     """Return the errors of a vehicle in open loop, over all windows of all logs."""
     rows = []
     for time, predictions, end in open_loop(logs, vehicle):
-        found = np.transpose([errors(prediction, end) for prediction in predictions])
-        for quantity, values in zip(QUANTITIES, found, strict=True):
+        rms_errors = np.transpose([errors(prediction, end) for prediction in predictions])
+        for quantity, values in zip(QUANTITIES, rms_errors, strict=True):
             rows.append([f"{quantity}, after {time:g} s", *(f"{value:.3g}" for value in values)])
     title = f"{vehicle.name}: {len(end)} windows of {len(logs)} logs, open loop"
     thrusts = np.concatenate([log.thrusts[log.flying] for log in logs])
     clipped = (np.abs(vehicle.thrust_to_action(thrusts)) > 1.0).mean()
     caption = f"{clipped:.1%} of the commands are beyond the rotors' limits, and clipped"
-    return text_table(title, HEADS, rows)._replace(caption=caption)
+    return text_table(title, HEADINGS, rows)._replace(caption=caption)

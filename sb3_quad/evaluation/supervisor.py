@@ -23,7 +23,7 @@ SUPERVISED = ("cut_by_supervisor", "low_force_time")
 
 
 class Supervisor:
-    """Watches, step by step, the specific force of n flights: what an accelerometer shows.
+    """Tracks the specific force of n flights: what an accelerometer shows.
 
     The motors are cut where its part along body z has stayed below 0.5 g for more than 1.0 s, or is
     below -0.2 g after more than 0.1 s of that. Free fall, where no part reaches 0.1 g, does not
@@ -45,7 +45,7 @@ class Supervisor:
         self.cut = np.zeros(len(vehicles), bool)
         self.longest = np.where(self._watched, 0.0, np.nan)
 
-    def see(self, state: QuadcopterState, flying: BoolArray) -> None:
+    def update(self, state: QuadcopterState, flying: BoolArray) -> None:
         """See the state after a control step; only the flights (n,) that continue count."""
         if not self._watched.any():
             return

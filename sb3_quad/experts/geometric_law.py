@@ -14,12 +14,11 @@ from sb3_quad.experts.vectors import (
     difference,
     divided,
     dot,
-    plus_rotated,
-    rotated,
-    rotations_at,
+    total,
     vector_at,
 )
 from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.physics import rotation, to_body, to_world
 from sb3_quad.simulation.state import AHEAD, P, W, X
 
 
@@ -41,15 +40,14 @@ def fly_geometric(state, constants, wrench, actions):
         mass = constants.vehicles[P.mass, k]
         g = constants.vehicles[P.gravity, k]
         inertia = vector_at(constants.vehicles, P.ixx, k)
-        rotation, rotation_inverse = rotations_at(state, X.quaternion, i)
+        body_to_world = rotation(state[X.quaternion :], i)
         omega = vector_at(state, X.body_rates, i)
 
         # What the external wrench does: an acceleration in the world frame, a torque in the body's.
-        body_force = vector_at(wrench, W.force_body, j)
-        force = plus_rotated(vector_at(wrench, W.force_world, j), rotation, body_force)
-        world_torque = vector_at(wrench, W.torque_world, j)
-        body_torque = vector_at(wrench, W.torque_body, j)
-        torque = plus_rotated(body_torque, rotation_inverse, world_torque)
+        x, y, z = vector_at(wrench, W.force_body, j)
+        force = total(vector_at(wrench, W.force_world, j), to_world(body_to_world, x, y, z))
+        x, y, z = vector_at(wrench, W.torque_world, j)
+        torque = total(vector_at(wrench, W.torque_body, j), to_body(body_to_world, x, y, z))
 
         # The force that the rotors should give per mass, and its direction b as the body will see
         # it when the command acts.
@@ -65,12 +63,12 @@ def fly_geometric(state, constants, wrench, actions):
             g,
         )
         size = math.sqrt(dot(f, f))
-        b = divided(rotated(rotation_inverse, f), size)
+        b = divided(to_body(body_to_world, f[0], f[1], f[2]), size)
         b = seen_later(b, omega, constants.lag[k])
 
         # Moments for the turn, against the yaw rate, and against the external torque.
         mx, my = turn_moments(b, omega, gains, inertia)
-        mz = yaw_moment(state, i, rotation, omega[2], gains, inertia[2])
+        mz = yaw_moment(state, i, body_to_world, omega[2], gains, inertia[2])
         moments = difference((mx, my, mz), torque)
         allocate(
             mass * size * b[2],
@@ -97,15 +95,15 @@ def reference_acceleration(state, i, lag, attitude):
 
 
 @compiled
-def yaw_moment(state, i, rotation, r, gains, izz):
-    """Return the yaw moment against the yaw rate, or towards the heading if one is asked for, N m.
+def yaw_moment(state, i, body_to_world, r, gains, izz):
+    """Return the yaw moment against the yaw rate, or towards the commanded heading, N m.
 
     The heading is where the body's x axis points, seen from above.
     """
     cosine, sine, rate = vector_at(state, X.target_heading, i)
     if cosine == sine == 0.0:
         return -gains[G.yaw_rate] * izz * r
-    (x, _, _), (y, _, _), (_, _, upright) = rotation
+    (x, _, _), (y, _, _), (_, _, upright) = body_to_world
     error = math.atan2(sine * x - cosine * y, cosine * x + sine * y)
     # Critically damped, and as quick as roll and pitch.
     gain = gains[G.body_rates]

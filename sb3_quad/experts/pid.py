@@ -6,8 +6,9 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
-from sb3_quad.experts.vectors import difference, rotated, rotations_at, vector_at
+from sb3_quad.experts.vectors import difference, vector_at
 from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.physics import rotation, to_body
 from sb3_quad.simulation.state import QuadcopterState, X
 from sb3_quad.vehicles.vehicle import VehicleSource
 
@@ -18,8 +19,8 @@ ANGLE_FACTOR = 0.25
 class PIDExpert(Expert):
     """Position PID around an attitude PD controller, on the true state (thesis 2.1.2 and 3.2.1).
 
-    Of a reference that moves it follows velocity, acceleration and heading, which the thesis's has
-    not.
+    It also tracks the velocity, acceleration and heading of a moving reference; the thesis's PID
+    does not.
     It is made for small angles: from a random attitude it recovers less than a third of the time.
     The attitude gains are I ωn² and 2 ξ ωn I (Eq. 3.15), so they fit any vehicle. With ITM's
     inertia they are those of Table A.1.
@@ -91,13 +92,11 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
         if c == s == 0.0:
             c = 1.0
         # The velocity in the body frame, and the Euler angles Z-Y-X.
-        rotation, rotation_inverse = rotations_at(state, X.quaternion, i)
-        vx, vy, vz = rotated(
-            rotation_inverse,
-            difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i)),
-        )
+        body_to_world = rotation(state[X.quaternion :], i)
+        v = difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i))
+        vx, vy, vz = to_body(body_to_world, v[0], v[1], v[2])
         p, q, r = vector_at(state, X.body_rates, i)
-        (r11, _, _), (r21, _, _), (r31, r32, r33) = rotation
+        (r11, _, _), (r21, _, _), (r31, r32, r33) = body_to_world
         roll = math.atan2(r32, r33)
         pitch = math.asin(min(1.0, max(-1.0, -r31)))
         yaw = math.atan2(r21, r11)
@@ -114,7 +113,7 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
         pitch_des = ANGLE_FACTOR * (ax * cosine + ay * sine) / g
 
         # Attitude: the thrust and the moments (Eqs. 2.7 to 2.10). The desired yaw is 0, or the
-        # heading that is asked for.
+        # commanded heading.
         u1 = mass * (g + az + ki_dt * position_error[2])
         u2 = proportional[0] * (roll_des - roll) - derivative[0] * p
         u3 = proportional[1] * (pitch_des - pitch) - derivative[1] * q

@@ -76,7 +76,7 @@ class Expert(ABC):
 def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -> QuadcopterState:
     """Return the state that observations of shape (n, 18) describe (Eq. 3.16 undone).
 
-    The target is the origin. Noise makes ᴮRᴵ no rotation matrix, so the nearest rotation is taken.
+    The target is the origin. With noise, ᴮRᴵ is not a rotation matrix; the nearest one is taken.
     Rotor speeds cannot be observed and are zero.
     """
     features = observation * std + mean

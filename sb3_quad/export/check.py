@@ -43,7 +43,7 @@ MOVING = {
 ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
 
 
-class Reference:
+class TrainedPolicy:
     """A trained policy in its own environment: an exported file must agree with it.
 
     :ivar vehicle: in the layout that the policy knows.
@@ -103,7 +103,7 @@ class Reference:
 
 
 def compare(
-    reference: Reference,
+    trained: TrainedPolicy,
     call: Call,
     by: str,
     n: int = N_OBSERVATIONS,
@@ -128,15 +128,15 @@ def compare(
     # Far and fast starts, or long flights for a policy with a state.
     changes: StrDict = {"task": "recovery_and_tracking", "task_kwargs": WIDE}
     steps = SHORT
-    if reference.observation.is_extended:
+    if trained.observation.is_extended:
         changes = {"task": {"recovery_and_tracking": 1.0, NEAR: 1.0}}
         steps = LONG
     settings = FlightSettings().with_changes(
         **changes,
-        **dict(reference.observation),
-        observation_mean=reference.mean,
-        observation_std=reference.std,
-        vehicle=reference.vehicle,
+        **dict(trained.observation),
+        observation_mean=trained.mean,
+        observation_std=trained.std,
+        vehicle=trained.vehicle,
         max_episode_steps=ENDLESS,
         noise=0.0,
         reference=MOVING,
@@ -146,14 +146,14 @@ def compare(
     present = settings.with_changes(history=None, last_action=False, position_integral=None)
     shown = QuadcopterBatch(batch.n, present)
     ahead = np.zeros(3 * len(batch.previews))
-    mean = np.append(reference.mean, ahead)
-    std = np.append(reference.std, ahead + ACCELERATION_STD)
+    mean = np.append(trained.mean, ahead)
+    std = np.append(trained.std, ahead + ACCELERATION_STD)
     observation = batch.reset()
     flying = np.ones(batch.n, bool)
     compared = flying.copy()
     # The file flies the vehicle in its own axes and order of rotors.
-    turned = turn_features(reference.turn)
-    integral = reference.observation.position_integral
+    turned = turn_features(trained.turn)
+    integral = trained.observation.position_integral
     file_state = None
     error = 0.0
     count = 0
@@ -178,17 +178,17 @@ def compare(
             features = shown.observe() * std + mean
         features[:, :OBSERVATION_SIZE] = features[:, :OBSERVATION_SIZE] @ turned
         results, file_state = call(features.astype(np.float32), file_state, *references)
-        if reference.clip:
-            observation = observation.clip(-reference.clip, reference.clip)
-        actions, _ = reference.model.predict(observation, deterministic=True)
-        difference = np.abs(results[:, reference.turn.order] - reference.results(actions))
+        if trained.clip:
+            observation = observation.clip(-trained.clip, trained.clip)
+        actions, _ = trained.model.predict(observation, deterministic=True)
+        difference = np.abs(results[:, trained.turn.order] - trained.results(actions))
         error = float(np.max(difference[compared], initial=error))  # NaN stays
         count += int(compared.sum())
         # A flight that is lost ends; what follows of it is not compared.
         actions[~flying] = 0.0
         observation, _, lost = batch.step(actions)
         flying &= ~lost
-    allowed = TOLERANCE * float(np.ptp(reference.results([-1.0, 1.0])))
+    allowed = TOLERANCE * float(np.ptp(trained.results([-1.0, 1.0])))
     # Negated, so that NaN fails as well.
     if not error <= allowed:
         raise ExportError(

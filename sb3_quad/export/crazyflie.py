@@ -7,7 +7,7 @@ import math
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict
-from sb3_quad.export.check import Reference
+from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.cost import cost_of
 from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
@@ -28,14 +28,14 @@ PLATFORMS = {
 }
 
 
-def plan_app(network: Network, reference: Reference) -> StrDict:
+def plan_app(network: Network, trained: TrainedPolicy) -> StrDict:
     """Return what the templates need besides names.
 
-    :param reference: its vehicle's rotors are M1 to M4 of the firmware.
+    :param trained: its vehicle's rotors are M1 to M4 of the firmware.
     :raises ConfigError: thrusts that no platform gives; a policy that is too slow, or whose control
         step is not a number of calls.
     """
-    vehicle = reference.vehicle
+    vehicle = trained.vehicle
     high = vehicle.thrust_range[1]
     able = [item for item in PLATFORMS.items() if high <= item[1][1] * (1.0 + 1e-4)]
     if not able:
@@ -67,7 +67,7 @@ def plan_app(network: Network, reference: Reference) -> StrDict:
         "slices": slices,
         "share": math.ceil(cost.multiplications / slices) + longest_row,
         "highest": high,
-        "angle": reference.turn.angle,
+        "angle": trained.turn.angle,
         "inputs": network.mean.numel(),
         "features": OBSERVATION_SIZE,
         "F": F,

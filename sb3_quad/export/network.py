@@ -20,7 +20,7 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flights import ACTIONS
-from sb3_quad.export.check import Reference
+from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
 from sb3_quad.simulation.tracks import ACCELERATION_STD
 
@@ -48,7 +48,7 @@ class Network(nn.Module):
     ``observation``, m/s²: (batch, OBSERVATION_SIZE + 3 * previews).
 
     :param layers: linear layers, each with the activation that follows it, if any; they are copied.
-    :param reference: its scaling, vehicle, output and ``observation``; features and rotors are
+    :param trained: its scaling, vehicle, output and ``observation``; features and rotors are
         those of the vehicle's own layout.
     """
 
@@ -57,13 +57,13 @@ class Network(nn.Module):
     middle: th.Tensor
     half_range: th.Tensor
 
-    def __init__(self, layers: nn.Sequential, reference: Reference) -> None:
+    def __init__(self, layers: nn.Sequential, trained: TrainedPolicy) -> None:
         super().__init__()
-        vehicle = reference.vehicle
-        observation = reference.observation
+        vehicle = trained.vehicle
+        observation = trained.observation
         self.observation = observation
-        self.clip = reference.clip
-        self.output = reference.output
+        self.clip = trained.clip
+        self.output = trained.output
         self.result, self.unit = OUTPUTS[self.output]
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
         limits = np.array(vehicle.thrust_range)
@@ -76,14 +76,14 @@ class Network(nn.Module):
         # The previewed accelerations follow the features.
         ahead = np.zeros(3 * len(observation.preview or ()))
         buffers = {
-            "mean": np.append(reference.own_mean, ahead),
-            "inverse_std": 1.0 / np.append(reference.std, ahead + ACCELERATION_STD),
+            "mean": np.append(trained.own_mean, ahead),
+            "inverse_std": 1.0 / np.append(trained.std, ahead + ACCELERATION_STD),
             "middle": limits.mean(),
             "half_range": np.ptp(limits) / 2,
         }
         for name, value in buffers.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float32))
-        self.layers = own_layers(layers, reference).to(th.float32)
+        self.layers = own_layers(layers, trained).to(th.float32)
 
         # The state begins with the last action; the latest frame follows the integral.
         integral = observation.position_integral
@@ -152,7 +152,7 @@ class Network(nn.Module):
         ]
 
 
-def build_network(reference: Reference, where: str = "model", features: str = "body") -> Network:
+def build_network(trained: TrainedPolicy, where: str = "model", features: str = "body") -> Network:
     """Build the network of an SB3 model with ``MlpPolicy``, on-policy, SAC's or TD3's, with its
     scaling and its rotors.
 
@@ -162,11 +162,11 @@ def build_network(reference: Reference, where: str = "model", features: str = "b
         that :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
     """
-    refuse_unknown("output", [reference.output], OUTPUTS)
+    refuse_unknown("output", [trained.output], OUTPUTS)
     # The policy must be one whose layers we know, on the spaces that its settings describe.
-    model = reference.model
+    model = trained.model
     layers = deterministic_layers(model.policy, where)
-    expected = (reference.observation.size,)
+    expected = (trained.observation.size,)
     if model.observation_space.shape != expected:
         raise ConfigError(
             f"{where}: its observations are {model.observation_space}, "
@@ -176,7 +176,7 @@ def build_network(reference: Reference, where: str = "model", features: str = "b
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
         )
-    if reference.observation.features != features:
+    if trained.observation.features != features:
         raise ConfigError(
             f"{where}: does not see `features: {features}`; --format px4 needs and takes features:"
             f" px4, all others body; train with --env-kwargs features:{features}"
@@ -188,21 +188,21 @@ def build_network(reference: Reference, where: str = "model", features: str = "b
                 f"{where}: its network has a layer {layer}; "
                 "only linear layers, Tanh and ReLU export"
             )
-    return Network(layers, reference)
+    return Network(layers, trained)
 
 
-def own_layers(layers: nn.Sequential, reference: Reference) -> nn.Sequential:
+def own_layers(layers: nn.Sequential, trained: TrainedPolicy) -> nn.Sequential:
     """Copy a policy's layers for features in the vehicle's own body frame and its own order of the
     rotors.
 
     The first layer turns the features, and the last action; the last layer renumbers the rotors.
     """
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
-    turn = reference.turn
+    turn = trained.turn
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     # One frame: the scaled features, then the last action if the policy sees it.
-    observation = reference.observation
-    std = reference.std
+    observation = trained.observation
+    std = trained.std
     frame = np.eye(observation.frame_size)
     frame[:OBSERVATION_SIZE, :OBSERVATION_SIZE] = turn_features(turn) * std / std[:, None]
     if observation.last_action:

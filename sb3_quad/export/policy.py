@@ -18,7 +18,7 @@ from sb3_quad.controllers.tensors import ENDING, write_tensors
 from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
-from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
+from sb3_quad.export.check import N_OBSERVATIONS, TrainedPolicy, compare
 from sb3_quad.export.cost import cost_of
 from sb3_quad.export.crazyflie import plan_app, write_app
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
@@ -115,30 +115,30 @@ def export_policy(
     if is_app:
         # Axes and rotors as the firmware has them.
         flown = flown.in_layout_of(load_vehicle("crazyflie"))
-    reference = Reference(model, settings, flown, output)
+    trained = TrainedPolicy(model, settings, flown, output)
     # Each format has a writer, and a reader for the check.
     header = (partial(write_header, name=prefix, half=half), partial(load.load_header, name=prefix))
     formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
-        "px4": (partial(write_px4, reference=reference), partial(load_px4, vehicle=flown)),
+        "px4": (partial(write_px4, trained=trained), partial(load_px4, vehicle=flown)),
     }
-    network = build_network(reference, f"model {path}", "px4" if file_format == "px4" else "body")
+    network = build_network(trained, f"model {path}", "px4" if file_format == "px4" else "body")
     write, read = formats.get(file_format, header)
     facts: StrDict = {}
     # What conversions from half precision take was not measured.
     if write is header[0] and not half:
         facts["cost"] = cost_of(network)
     if is_app:
-        facts["plan"] = plan_app(network, reference)
-    metadata = _describe(Path(path), saved_algorithm(path), network, reference, flown, facts)
+        facts["plan"] = plan_app(network, trained)
+    metadata = _describe(Path(path), saved_algorithm(path), network, trained, flown, facts)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
         # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata), network.state_size)
-        error, n_compared = compare(reference, call, by, n_observations, relates=write is header[0])
+        error, n_compared = compare(trained, call, by, n_observations, relates=write is header[0])
         metadata["check"] = (
             f"largest error {error:.2g} {network.unit} "
             f"in {n_compared} observations of flights ({by})"
@@ -161,9 +161,9 @@ def _agent_itself(path: StrPath, output: str, vehicle: VehicleSource | None) -> 
         )
     model = load_model(path)
     settings, source = agent_settings(path)
-    reference = Reference(model, settings, first_vehicle(settings.vehicle))
-    network = build_network(reference, f"model {path}", settings.features)
-    if reference.clip or model.use_sde:
+    trained = TrainedPolicy(model, settings, first_vehicle(settings.vehicle))
+    network = build_network(trained, f"model {path}", settings.features)
+    if trained.clip or model.use_sde:
         raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
     data = saved_data(path)
     if source is not None:
@@ -176,7 +176,7 @@ def _describe(
     path: Path,
     algorithm: str,
     network: Network,
-    reference: Reference,
+    trained: TrainedPolicy,
     vehicle: Vehicle,
     facts: StrDict,
 ) -> StrDict:
@@ -186,10 +186,10 @@ def _describe(
         "metadata.j2",
         version=__version__,
         network=network,
-        reference=reference,
+        trained=trained,
         vehicle=vehicle,
         # The limits of the results are those of the extreme actions.
-        limits=reference.results([-1.0, 1.0]),
+        limits=trained.results([-1.0, 1.0]),
         features=FEATURES,
         places=GROUPS,
         motors=motor_order(vehicle) if network.observation.features == "px4" else [],

@@ -13,7 +13,7 @@ from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import Float32Array, StrDict
-from sb3_quad.export.check import Reference
+from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.load import Call
 from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import GROUPS, F
@@ -35,22 +35,22 @@ SHOWN = np.r_[
 SIGNS = np.repeat([-1.0, 1.0], [3, 12]).astype(np.float32)
 
 
-def write_px4(network: Network, metadata: StrDict, reference: Reference) -> bytes:
+def write_px4(network: Network, metadata: StrDict, trained: TrainedPolicy) -> bytes:
     """Return the file: inputs float32 (1, 15), outputs (1, 4), the actions of PX4's motors.
 
-    :param network: of ``reference``.
+    :param network: of ``trained``.
     :raises ConfigError: tflite is not installed; a network that the module cannot compute.
     """
     tflite = require("tflite", "px4", "--format px4")
     builder = require("flatbuffers", "px4", "--format px4").Builder()
-    _check(network, reference)
+    _check(network, trained)
     # Weights and biases in turn. The first layer scales its inputs, the last one numbers the motors
     # as PX4 does.
     values = [parameter.numpy() for parameter in network.layers.parameters()]
     scaled = values[0][:, SHOWN] * network.inverse_std.numpy()[SHOWN]
     values[1] = values[1] - scaled @ network.mean.numpy()[SHOWN]
     values[0] = scaled * SIGNS
-    motors = motor_order(reference.vehicle)
+    motors = motor_order(trained.vehicle)
     values[-2:] = values[-2][motors], values[-1][motors]
 
     def table(kind: str, **fields: Any) -> Any:
@@ -125,7 +125,7 @@ def write_module(content: bytes, vehicle: Vehicle) -> dict[str, bytes]:
     return files
 
 
-def _check(network: Network, reference: Reference) -> None:
+def _check(network: Network, trained: TrainedPolicy) -> None:
     kinds = {shape["activation"] for shape in network.shapes}
     seen = network.observation
     refusals = {
@@ -136,10 +136,10 @@ def _check(network: Network, reference: Reference) -> None:
             "tanh" in kinds
         ),
         "takes -1 for no thrust: give the vehicle rotor_thrust_limits from 0, and train for it": (
-            reference.vehicle.thrust_range[0] > 0.0
+            trained.vehicle.thrust_range[0] > 0.0
         ),
         "takes actions as they are: train without normalize and a turned rotor_layout": (
-            reference.clip or reference.turn.angle
+            trained.clip or trained.turn.angle
         ),
     }
     for refusal, holds in refusals.items():

@@ -68,6 +68,7 @@ _KEPT = (
     "frames",
     "integral",
     "course",
+    "scaling_of_rows",
 )
 
 
@@ -110,7 +111,7 @@ class QuadcopterBatch:
         self.physics_step = vehicles[0].physics_step
         self.substeps = vehicles[0].substeps
         self.randomize_numbers = self.randomize.numbers(control_step)
-        # An array without columns stands for gusts, frames or an integral that nobody asked for.
+        # An array without columns stands for gusts, frames or an integral that are switched off.
         self.gust = np.zeros((GUST_SIZE, n * bool(self.randomize.gusts)))
         self.wind = np.zeros((3, n))
         self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
@@ -367,22 +368,14 @@ class QuadcopterBatch:
     def restore(self, snapshot: Arrays) -> None:
         """Undo everything that has happened since :meth:`snapshot`.
 
-        :raises ConfigError: the snapshot is of other environments.
+        :param snapshot: of environments with arrays of these types and shapes.
+        :raises ConfigError: its episodes are of tasks that these environments do not have.
         """
-        own = self.snapshot()
-        for name in {*own, *snapshot}:
-            held = _kind(snapshot.get(name))
-            fits = held == _kind(own.get(name))
-            if fits and name == "task_index":
-                # These number the tasks, of which there may be fewer now.
-                fits = bool(np.isin(snapshot[name], np.arange(self.task_weights.size)).all())
-            if not fits:
-                raise ConfigError(
-                    f"the saved state of the environments does not fit these ({name}: {held});"
-                    " use the run's own settings"
-                )
-        for name, array in snapshot.items():
-            getattr(self, name)[...] = array
+        if not np.isin(snapshot["task_index"], np.arange(self.task_weights.size)).all():
+            raise ConfigError("task_index numbers tasks that the environments do not have")
+        for name in _KEPT:
+            getattr(self, name)[...] = snapshot[name]
+        self._bind()
         self._notice_motion()
 
     def fix(self, quantity: str, values: FloatArray) -> None:
@@ -397,7 +390,7 @@ class QuadcopterBatch:
             self.course[: C.begin] = values
 
     def set_reference(self, reference: FloatArray, rows: IntArray) -> None:
-        """Let rows follow what they are told, (REFERENCE_SIZE, rows), from now on."""
+        """Set the reference of these rows, (REFERENCE_SIZE, rows)."""
         self.state[REFERENCE, rows] = reference
         if self.course.size:
             self.course[C.begin, rows] = -1.0
@@ -416,8 +409,8 @@ class QuadcopterBatch:
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
         relative, additive = levels(noise)
         chosen = self.rows(indices)
-        self._scaling_of_rows[-2, chosen] = per_row("noise", relative, chosen.size)
-        self._scaling_of_rows[-1, chosen] = additive
+        self.scaling_of_rows[-2, chosen] = per_row("noise", relative, chosen.size)
+        self.scaling_of_rows[-1, chosen] = additive
         self._bind()
 
     def _set_scaling(self, settings: FlightSettings) -> None:
@@ -435,10 +428,10 @@ class QuadcopterBatch:
             raise ConfigError("observation_std: every value must be of 1e-6 to 1e6")
         if not (np.abs(means) <= 1e6).all():
             raise ConfigError("observation_mean: every value must be of -1e6 to 1e6")
-        self._scaling_of_rows = np.vstack([means, stds, np.zeros((2, self.n))])
+        self.scaling_of_rows = np.vstack([means, stds, np.zeros((2, self.n))])
 
     def _bind(self) -> None:
-        self.scaling = self._scaling_of_rows
+        self.scaling = self.scaling_of_rows
         # One column serves all rows where they do not differ.
         if (self.scaling == self.scaling[:, :1]).all():
             self.scaling = self.scaling[:, :1].copy()
@@ -446,10 +439,3 @@ class QuadcopterBatch:
         self.std = self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
         self.noise_level, self.additive_level = self.scaling[-2:]
         self._arguments = {name: getattr(self, name) for name in BATCH_ARGUMENTS}
-
-
-def _kind(array: AnyArray | None) -> str:
-    """Return the type and shape of an array in a snapshot."""
-    if array is None:
-        return "missing"
-    return f"{array.dtype} of shape {array.shape}"

@@ -64,7 +64,7 @@ class ObservationSettings(Frozen):
 
     @field_validator("history")
     @classmethod
-    def _rises(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
+    def _check_history(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
         if value is None:
             return None
         # Sorted with the present frame, they are as they were only if they rise from it.
@@ -76,7 +76,7 @@ class ObservationSettings(Frozen):
 
     @field_validator("preview")
     @classmethod
-    def _looks_ahead(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
+    def _check_preview(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
         if value is not None and not all(0 <= ahead <= MAX_AGE for ahead in value):
             raise ValueError(f"{list(value)}: must be of 0 to {MAX_AGE} control steps")
         return value

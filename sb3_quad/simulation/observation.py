@@ -114,7 +114,7 @@ def _features_at_rest(b, for_px4):
 @inlined
 def heading_of(b, lane):
     """Return cosine and sine of the heading whose frame a lane observes; the world's if none is
-    asked for.
+    commanded.
     """
     cosine, sine = b.target_heading[0, lane], b.target_heading[1, lane]
     return (cosine if cosine * cosine + sine * sine > 0.0 else 1.0), sine

@@ -38,7 +38,7 @@ Unit = Literal["SI", "weight"]
 VECTOR = {"length": RANGE, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
 V = first_rows(VECTOR)
 GUST = {"std": RANGE, "keeps": 1, "by_weight": 1}
-N = first_rows(GUST)
+GUST_NUMBERS = first_rows(GUST)
 Bounded = TypeVar("Bounded", bound=float)
 
 
@@ -54,7 +54,7 @@ class Range(Frozen, Generic[Bounded]):
 
     @model_validator(mode="before")
     @classmethod
-    def _for_short(cls, data: Any) -> Any:
+    def _from_shorthand(cls, data: Any) -> Any:
         if isinstance(data, (int, float)) and not isinstance(data, bool):
             return {"low": data, "high": data}
         if isinstance(data, (list, tuple)):
@@ -65,7 +65,7 @@ class Range(Frozen, Generic[Bounded]):
         return data
 
     @model_validator(mode="after")
-    def _rises(self) -> "Range[Bounded]":
+    def _check_order(self) -> "Range[Bounded]":
         given = f"[{self.low:g}, {self.high:g}]"
         if self.low > self.high:
             raise ValueError(f"{given}: the first number exceeds the second")
@@ -119,17 +119,17 @@ class RandomVector(Frozen):
 
     @model_validator(mode="before")
     @classmethod
-    def _for_short(cls, data: Any) -> Any:
+    def _from_shorthand(cls, data: Any) -> Any:
         return {"magnitude": data} if isinstance(data, (list, tuple, int, float)) else data
 
     @model_validator(mode="after")
-    def _can_be(self) -> "RandomVector":
+    def _check_magnitude(self) -> "RandomVector":
         _check_weights(self.magnitude, self.unit)
         return self
 
     @field_validator("direction")
     @classmethod
-    def _points_somewhere(cls, value: Vector | None) -> Vector | None:
+    def _check_direction(cls, value: Vector | None) -> Vector | None:
         if value is not None and not any(value):
             raise ValueError("direction must not be zero")
         return value
@@ -164,7 +164,7 @@ class Gusts(Frozen):
     """time after which a gust has faded to 1/e, s"""
 
     @model_validator(mode="after")
-    def _can_be(self) -> "Gusts":
+    def _check_std(self) -> "Gusts":
         _check_weights(self.std, self.unit)
         return self
 
@@ -230,7 +230,7 @@ class Randomization(Frozen):
     """a random velocity added to the wind, such as {std: [0, 1]}, m/s"""
 
     @model_validator(mode="after")
-    def _possible(self) -> "Randomization":
+    def _check_wind(self) -> "Randomization":
         for wind in (self.wind, self.wind_gusts):
             if wind is not None and (wind.unit != "SI" or getattr(wind, "frame", None)):
                 raise ValueError(

@@ -35,7 +35,9 @@ _POSITION, _VELOCITY, _ACCELERATION, _HEADING, _HEADING_RATE, _AHEAD = _PLACES
 # Random motion: so many pieces of so many seconds, each a sum of sines that fit into it.
 PIECES = 256
 PIECE_SECONDS = 10.0
-CURVES = (*SINES, "polynomial", "file", "function", "random_smooth")
+# Curves that are given by a field, and its name
+NEEDED = {"polynomial": "waypoints", "file": "file", "function": "function"}
+CURVES = (*SINES, *NEEDED, "random_smooth")
 
 
 class Tracks(NamedTuple):
@@ -88,7 +90,7 @@ class Reference(Frozen):
     """random_smooth: share of pieces that rest"""
     heading: Literal["path", "random"] | float | None = None
     """at the start, rad; path: along the velocity; random: of each piece of random_smooth its own,
-    with a rate up to heading_rate; None: nothing is asked of it"""
+    with a rate up to heading_rate; None: none is commanded"""
     heading_rate: float = Field(default=0.0, ge=-20, le=20)
     """rad/s, for a heading that is a number; so that curves loop, rounded to whole turns in 600 s,
     or in 10 s of random_smooth"""
@@ -112,15 +114,10 @@ class Reference(Frozen):
         return {"curve": "function", "function": data} if callable(data) else data
 
     @model_validator(mode="after")
-    def _complete(self) -> "Reference":
-        for curve, needed in (
-            ("polynomial", self.waypoints),
-            ("file", self.file),
-            ("function", self.function),
-        ):
-            if self.curve == curve and not needed:
-                argument = "waypoints" if curve == "polynomial" else curve
-                raise ValueError(f"curve {curve}: needs {argument}")
+    def _check_complete(self) -> "Reference":
+        needed = NEEDED.get(self.curve)
+        if needed and not getattr(self, needed):
+            raise ValueError(f"curve {self.curve}: needs {needed}")
         if self.heading == "random" and self.curve != "random_smooth":
             raise ValueError("heading 'random': only with curve random_smooth")
         if self.heading_rate and self.heading in (None, "path"):
@@ -140,11 +137,10 @@ class Reference(Frozen):
         if loops and self.heading_rate:
             # The heading must loop, too: whole turns in many periods are nearly at its rate.
             steps *= math.ceil(MAX_SECONDS / dt / steps)
+        # One row more where it does not loop: the end, at which it rests.
         with raised_as(ConfigError, f"reference {self.curve}"):
-            table = self._table(motion, steps, dt, loops)
+            table = self._table(motion, steps + (not loops), dt, loops)
         if not loops:
-            # It rests where it ends.
-            table = np.vstack([table, table[-1]])
             table[-1, _VELOCITY.start : _ACCELERATION.stop] = 0.0
             table[-1, _HEADING_RATE] = 0.0
         return _tracks(table, len(table), loops, dt)
@@ -242,6 +238,9 @@ class Reference(Frozen):
             if number < self.resting * PIECES:
                 scale = 0.0
             table[:, : _ACCELERATION.stop] *= scale
+            if scale == 0.0 and self.heading == "path":
+                # It has no path: the heading rests, too, as that of hover.
+                _set_heading(table, np.zeros(length), dt)
             # Whole turns in a piece, so that it loops.
             turns = round(random.uniform(-1.0, 1.0) * self.heading_rate / base)
             start = random.uniform(-math.pi, math.pi)

@@ -16,7 +16,7 @@ from sb3_quad.simulation.random import (
     WIND,
     uniforms,
 )
-from sb3_quad.simulation.randomization import FIXED, N, R, V, between
+from sb3_quad.simulation.randomization import FIXED, GUST_NUMBERS, R, V, between
 from sb3_quad.simulation.state import P, W, X, first_rows, row_slices
 from sb3_quad.simulation.tasks import T
 from sb3_quad.simulation.tracks import deepest, start_course
@@ -28,7 +28,7 @@ after a control step; the standard deviation of the increment.
 """
 GUST_SIZE = sum(GUSTS.values())
 GUST_VALUE = row_slices(GUSTS)["value"]
-G = first_rows(GUSTS)
+GUST_ROWS = first_rows(GUSTS)
 TURN = 2.0 * math.pi
 _SEVEN_BITS = np.uint64(127)
 # Mean and deviation of the sum of three whole numbers, uniform from 0 to 127
@@ -40,7 +40,7 @@ _SUM_STD = math.sqrt(3 * (128**2 - 1) / 12)
 def start_episode(
     i, state, queue, streams, task_index, vehicles, tasks, weights, course, tracks, track_numbers
 ):
-    """Begin the episode that row i's stream has come to, in place: sample task, state and target.
+    """Begin the next episode of row i's stream, in place: sample task, state and target.
 
     Targets are never below ground.
 
@@ -228,15 +228,15 @@ def _begin_gusts(table, k, share, unit, u, gust):
     :param k: where their numbers begin; ``share`` and ``unit`` as of :func:`_sample_vector`.
     :param u: eight uniforms.
     """
-    std = share * between(table, k + N.std, u[0], 0.0)
-    if table[k + N.by_weight] != 0.0:
+    std = share * between(table, k + GUST_NUMBERS.std, u[0], 0.0)
+    if table[k + GUST_NUMBERS.by_weight] != 0.0:
         std *= unit
-    keeps = table[k + N.keeps]
-    gust[G.keeps] = keeps
-    gust[G.adds] = std * math.sqrt(1.0 - keeps * keeps)
+    keeps = table[k + GUST_NUMBERS.keeps]
+    gust[GUST_ROWS.keeps] = keeps
+    gust[GUST_ROWS.adds] = std * math.sqrt(1.0 - keeps * keeps)
     # The first gust has the deviation of all later ones.
     for axis in range(3):
-        gust[G.value + axis] = _normals(std, std, u, 2 + 2 * axis)[0]
+        gust[GUST_ROWS.value + axis] = _normals(std, std, u, 2 + 2 * axis)[0]
 
 
 @compiled
@@ -246,7 +246,7 @@ def add_gusts(to, gust, first, count):
         return
     for axis in range(3):
         for lane in range(count):
-            to[axis, lane] += gust[G.value + axis, first + lane]
+            to[axis, lane] += gust[GUST_ROWS.value + axis, first + lane]
 
 
 @compiled
@@ -267,5 +267,5 @@ def advance_gusts(b, gust, first, count):
             for shift in (0, 7, 14):
                 total += part >> np.uint64(shift) & _SEVEN_BITS
             normal = (np.float64(np.int64(total)) - _SUM_MEAN) / _SUM_STD
-            kept = gust[G.keeps, i] * gust[G.value + axis, i]
-            gust[G.value + axis, i] = kept + gust[G.adds, i] * normal
+            kept = gust[GUST_ROWS.keeps, i] * gust[GUST_ROWS.value + axis, i]
+            gust[GUST_ROWS.value + axis, i] = kept + gust[GUST_ROWS.adds, i] * normal

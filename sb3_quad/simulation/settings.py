@@ -3,7 +3,6 @@
 Training writes them into every zip.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -82,18 +81,14 @@ class FlightSettings(ObservationSettings):
     max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = MAX_EPISODE_STEPS
     """control steps after which an episode is truncated, for all rows or for each"""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _steps_of_mixture(cls, data: Any) -> Any:
-        """A named mixture brings its episode length, unless one is given."""
-        mixture = find_mixture(data.get("task")) if isinstance(data, Mapping) else None
-        if mixture is None:
-            return data
-        return {"max_episode_steps": mixture.max_episode_steps, **data}
-
     @model_validator(mode="after")
-    def _known_task(self) -> "FlightSettings":
+    def _check_task(self) -> "FlightSettings":
+        """A named mixture brings its episode length, unless one is given."""
         resolve_tasks(self.task, self.task_kwargs)
+        mixture = find_mixture(self.task)
+        if mixture is not None and "max_episode_steps" not in self.model_fields_set:
+            # Pydantic would count it as given, and with_changes would keep it for other tasks.
+            object.__setattr__(self, "max_episode_steps", mixture.max_episode_steps)
         return self
 
     @property
@@ -147,7 +142,7 @@ class FlightSettings(ObservationSettings):
 
     def write_into(self, model: Any) -> None:
         """Write these settings into an SB3 model: ``model.flight_settings``, plain JSON with the
-        parameters of the vehicle, of several the first.
+        parameters of the vehicle, of several the first. A reference stays if it is a curve by name.
 
         From then on its zips hold them, and ``load`` of Stable-Baselines3 keeps them, even without
         this package.
@@ -157,8 +152,9 @@ class FlightSettings(ObservationSettings):
         changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
         if self.rotor_layout is not None:
             changes["rotor_layout"] = load_vehicle(self.rotor_layout)
-        if self.reference is not None and self.reference.function is not None:
-            # A function cannot be written, and an agent flies any reference.
+        if self.reference is not None and self.reference.curve in ("file", "function"):
+            # A function cannot be written, and the file may not be where the zip is read. The agent
+            # does not need either: it follows any reference.
             changes["reference"] = None
         setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
 

@@ -25,7 +25,7 @@ COURSE = {"anchor": 3, "begin": 1}
 COURSE_SIZE = sum(COURSE.values())
 C = first_rows(COURSE)
 # The first column of the acceleration in a table
-A = first_rows(REFERENCE_PARTS).target_acceleration
+ACCELERATION = first_rows(REFERENCE_PARTS).target_acceleration
 # σ of a previewed acceleration, m/s²
 ACCELERATION_STD = 5.0
 
@@ -103,7 +103,9 @@ def observe_preview(b, count, previews, course, table, numbers, out):
             if table.shape[0] > 0 and course[C.begin, i] >= 0.0:
                 step = np.int64(b.stream[STEP, lane]) + ahead
                 future = table[_row_at(course[C.begin, i], step, numbers)]
-                x, y, z = future[A], future[A + 1], future[A + 2]
+                x = future[ACCELERATION]
+                y = future[ACCELERATION + 1]
+                z = future[ACCELERATION + 2]
             out[i, at] = scale * float32(cosine * x + sine * y)
             out[i, at + 1] = scale * float32(cosine * y - sine * x)
             out[i, at + 2] = scale * float32(z)

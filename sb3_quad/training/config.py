@@ -251,6 +251,8 @@ class TrainingConfig(Frozen):
 
 # Keys of a settings file that hold keywords of environments.
 ENV_KEYS = {"env_kwargs", "eval_env_kwargs"}
+# Keywords of environments that may be the path of a file, or hold one.
+FILE_KEYS = {"vehicle", "rotor_layout", "vehicles", "reference"}
 # Keys of a settings file that are not the algorithm's.
 JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams", "settings"}
 
@@ -377,7 +379,7 @@ def build_config(
     algorithm = get_algorithm(algo)
     parameters = constructor_parameters(algorithm)
     check_environment(env_id)
-    settings = with_vehicle_paths(settings)
+    settings = with_absolute_paths(settings)
     # The default is written out, so that config.yml names the expert. Flights of a file need none.
     needs_expert = takes_expert(algorithm) and not settings.get("demonstrations")
     if needs_expert and settings.get("expert") is None:
@@ -402,25 +404,35 @@ def build_config(
     return validate(TrainingConfig, fields, source)
 
 
-def with_vehicle_paths(settings: StrDict) -> StrDict:
-    """Return the settings with absolute paths of vehicle files.
+def with_absolute_paths(settings: StrDict) -> StrDict:
+    """Return the settings with absolute paths of the files that keywords of environments name.
 
     A run may be flown and resumed later, from another folder.
     """
     settings = dict(settings)
     for key in ENV_KEYS & settings.keys():
-        keywords = settings[key]
-        if isinstance(keywords, dict) and "vehicle" in keywords:
-            settings[key] = {**keywords, "vehicle": _absolute(keywords["vehicle"])}
+        if isinstance(settings[key], dict):
+            settings[key] = {
+                name: _absolute(value) if name in FILE_KEYS else value
+                for name, value in settings[key].items()
+            }
     return settings
 
 
-def _absolute(vehicle: Any) -> Any:
-    if isinstance(vehicle, (list, tuple)):
-        return [_absolute(entry) for entry in vehicle]
-    if isinstance(vehicle, (str, Path)) and VEHICLES.is_path(vehicle):
-        return str(Path(vehicle).absolute())
-    return vehicle
+def _absolute(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return [_absolute(entry) for entry in value]
+    if isinstance(value, dict):
+        value = dict(value)
+        if "distribution" in value:
+            value["distribution"] = _absolute(value["distribution"])
+        # It is never a name, even without a suffix.
+        if isinstance(value.get("file"), str):
+            value["file"] = str(Path(value["file"]).absolute())
+        return value
+    if isinstance(value, (str, Path)) and VEHICLES.is_path(value):
+        return str(Path(value).absolute())
+    return value
 
 
 def check_environment(env_id: str) -> None:

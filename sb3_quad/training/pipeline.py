@@ -28,7 +28,7 @@ from sb3_quad.training.config import (
     describe,
     load_config,
     merged,
-    with_vehicle_paths,
+    with_absolute_paths,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train, trained_seconds
@@ -146,7 +146,7 @@ def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
     stages = []
     for stage in pipeline.stages:
         # The pipeline may be resumed from another folder.
-        settings = with_vehicle_paths(merged(stage.settings, changes, stage.name))
+        settings = with_absolute_paths(merged(stage.settings, changes, stage.name))
         stages.append(stage.model_copy(update={"settings": settings}))
     return pipeline.model_copy(update={"stages": stages})
 

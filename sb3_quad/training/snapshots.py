@@ -66,7 +66,7 @@ class SnapshotFile(BaseCallback):
 
     def _on_training_start(self) -> None:
         path = self._run.resume_state
-        # The log of a resumed run is to say what it would have said without the interruption.
+        # Restore pending log values, so that a resumed run logs what an uninterrupted one would.
         if not path.is_file():
             return
         log = read_arrays(path, "log")["log"]

@@ -80,7 +80,7 @@ def train(
     :raises SB3QuadError: bad settings; or a training that cannot continue, after the last good
         model was saved.
     """
-    # All that can be refused is refused before there is a run folder, which would stay empty.
+    # Check everything first, so that no empty run folder is left.
     if job.tensorboard_log is not None:
         make_folder(job.tensorboard_log, "TensorBoard folder", "-tb")
     with StopSignals() as signals, _environments(job) as (env, eval_envs):

@@ -201,7 +201,7 @@ class Vehicle(Frozen):
         return self
 
     @model_validator(mode="after")
-    def _can_be_flown(self) -> "Vehicle":
+    def _check_flyable(self) -> "Vehicle":
         low, high = self.thrust_limits
         if not low < 1.0 < high:
             raise CannotHover(

@@ -343,6 +343,17 @@ def test_a_zip_opens_no_file_of_this_machine(key, source, capsys):
     )
 
 
+@pytest.mark.parametrize("source", ["fifo.csv", {"curve": "file", "file": "/dev/zero"}])
+def test_a_zip_flies_without_the_file_of_its_reference(source):
+    """Older versions wrote its path."""
+    os.mkfifo("fifo.csv")
+    settings = agent_settings(AGENT)[0].model_dump(mode="json")
+    foreign = zip_with({"flight_settings": settings | {"reference": source}})
+    assert agent_settings(foreign)[0] == agent_settings(AGENT)[0]
+    named = zip_with({"flight_settings": settings | {"reference": "circle"}})
+    assert agent_settings(named)[0].reference.curve == "circle"
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -34,8 +34,8 @@ class OneOf(Frozen):
     def _exactly_one(self) -> "OneOf":
         given = [name for name in self.ways if getattr(self, name) is not None]
         if len(given) != 1:
-            found = " and ".join(given) or "none"
-            raise ValueError(f"give exactly one of {', '.join(self.ways)}, not {found}")
+            names_given = " and ".join(given) or "none"
+            raise ValueError(f"give exactly one of {', '.join(self.ways)}, not {names_given}")
         return self
 
 

@@ -118,7 +118,7 @@ class Scenario(Frozen):
         return value
 
     @model_validator(mode="after")
-    def _possible(self) -> "Scenario":
+    def _check_flight(self) -> "Scenario":
         vehicle = self.flown_vehicle()
         # Of a distribution, the vehicle that can do least decides.
         if self.vehicles is not None:

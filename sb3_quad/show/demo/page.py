@@ -23,7 +23,7 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.results import COLOURS, colours_of
-from sb3_quad.export.check import Reference
+from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
 from sb3_quad.simulation.state import AHEAD, STATE, STATE_SIZE, X
@@ -162,16 +162,16 @@ def describe(spec: ControllerSpec) -> StrDict:
         raise ConfigError(f"controller {spec.spec}: the page does not compute {further}")
     settings = agent_settings(spec.spec)[0]
     layout = settings.layout
-    reference = Reference(load_model(spec.spec), settings, layout)
-    network = build_network(reference, f"model {spec.spec}")
+    trained = TrainedPolicy(load_model(spec.spec), settings, layout)
+    network = build_network(trained, f"model {spec.spec}")
     return {
         "kind": "network",
         "vehicle": "" if settings.vehicles is not None else first_vehicle(settings.vehicle).name,
         "layout": layout.model_dump(mode="json", include={"rotor_positions", "rotor_directions"}),
-        "observation": reference.observation.model_dump(mode="json"),
-        "mean": reference.mean.tolist(),
-        "std": reference.std.tolist(),
-        "clip": reference.clip,
+        "observation": trained.observation.model_dump(mode="json"),
+        "mean": trained.mean.tolist(),
+        "std": trained.std.tolist(),
+        "clip": trained.clip,
         "shapes": network.shapes,
         **pack(network),
     }
