@@ -123,7 +123,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = LinearSchedule(5e-4, 1e-5, 1.0),  # noqa: B008
+        learning_rate: float | Schedule = LinearSchedule(4e-3, 8e-5, 1.0),  # noqa: B008
         n_steps: int = 300,
         max_grad_norm: float = 1.0,
         stats_window_size: int = 100,

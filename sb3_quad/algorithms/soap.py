@@ -6,7 +6,7 @@ from typing import Any
 import torch as th
 
 # How slowly the second moments of a matrix's gradients change, and updates between two bases
-MOMENT_DECAY = 0.98
+MOMENT_DECAY = 0.95
 REFRESH = 5
 
 
