@@ -103,7 +103,9 @@ def _draw_path(
     begins = acts & ~np.roll(acts, 1)
     force = track.wrench[begins, :3]
     direction = force / np.linalg.norm(force, axis=1, keepdims=True)
-    axes.quiver(*path[begins].T, *direction[:, plane].T, color=FORCE, scale=12, width=0.006)
+    if begins.any():
+        arrows = {"color": FORCE, "scale": 12, "width": 0.006, "label": "disturbance force"}
+        axes.quiver(*path[begins].T, *direction[:, plane].T, **arrows)
 
 
 @styled
