@@ -104,8 +104,10 @@ def _draw_path(
     force = track.wrench[begins, :3]
     direction = force / np.linalg.norm(force, axis=1, keepdims=True)
     if begins.any():
-        arrows = {"color": FORCE, "scale": 12, "width": 0.006, "label": "disturbance force"}
-        axes.quiver(*path[begins].T, *direction[:, plane].T, **arrows)
+        arrows = axes.quiver(
+            *path[begins].T, *direction[:, plane].T, color=FORCE, scale=12, width=0.006
+        )
+        arrows.set_label("disturbance force")
 
 
 @styled
