@@ -86,6 +86,16 @@ def test_warnings_are_about_units():
     bulky = ITM.model_copy(update={"collision_radius": 13.5})
     for vehicle, about in ((in_grams, "inertia"), (weak, "thrust"), (bulky, "collision_radius")):
         assert [warning.split(":")[0] for warning in warnings(vehicle)] == [about]
+    heavy = ITM.model_copy(update={"mass": 1000 * ITM.mass})
+    assert "the mass in kg" in warnings(heavy)[0]
+    for key, value in (
+        ("motor_gain", 0.033),
+        ("motor_gain", 300.0),
+        ("moment_thrust_ratio", 1.27),
+        ("moment_thrust_ratio", 12.7),
+    ):
+        slip = ITM.model_copy(update={key: value})
+        assert [warning.split(":")[0] for warning in warnings(slip)] == [key]
     np.testing.assert_allclose(in_grams.gyration_ratios, np.sqrt(1000) * ITM.gyration_ratios)
 
 

@@ -9,10 +9,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_quad import PPOBC, SACBC, DAgger
-from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.geometric import privileged_geometric
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -122,6 +123,37 @@ def test_labels_are_clipped_to_the_action_space():
     )
     np.testing.assert_array_equal(labels, [[2.0], [-2.0]])
     assert labels.dtype == np.float32
+
+
+def test_labels_in_another_unit_are_warned_of_once(recwarn):
+    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    observation = env.reset()
+    labeller = Controller.for_env(lambda observation: np.array([[9.0], [-2.5]]), env)
+    with pytest.warns(UserWarning, match="such as 9, which are clipped; are they newtons"):
+        labeller.labels(observation)
+    labeller.labels(observation)
+    assert not recwarn.list
+
+
+def test_an_expert_of_another_vehicle_is_warned_of(recwarn):
+    env = QuadcopterVecEnv(2, vehicle="crazyflie", seed=0)
+    with pytest.warns(UserWarning, match="made for the vehicle itm and flies crazyflie"):
+        Controller.for_env(PIDExpert(), env)
+    with pytest.warns(UserWarning, match="made for the vehicle itm and flies crazyflie"):
+        fly(PIDExpert(), n_flights=2, vehicle="crazyflie", max_steps=2)
+    # These know the vehicle, or fly another one on purpose.
+    nominal = QuadcopterVecEnv(2, randomize={"mass": [0.8, 1.2]}, seed=0)
+    Controller.for_env("pid", env)
+    Controller.for_env(privileged_geometric(), env)
+    Controller.for_env(PIDExpert(), nominal)
+    assert not recwarn.list
+
+
+def test_a_model_of_other_limits_names_the_way_out():
+    rescaled = gym.wrappers.RescaleAction(Blind(), np.float32(0.0), np.float32(1.0))
+    model = PPO("MlpPolicy", rescaled, device="cpu")
+    with pytest.raises(ControllerError, match="train it within these, or give an environment with"):
+        fly(model, n_flights=1, max_steps=1)
 
 
 @pytest.mark.parametrize(

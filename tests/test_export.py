@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from test_extending import DIFFS, ROOT, apply
 
+from sb3_quad import DAgger
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
 from sb3_quad.controllers.agent_settings import env_kwargs
@@ -77,7 +78,9 @@ def zips(tmp_path_factory):
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("models")
     for kind in MODELS:
-        untrained(kind, QuadcopterVecEnv(2, seed=0)).save(folder / f"{kind}.zip")
+        model = untrained(kind, QuadcopterVecEnv(2, seed=0))
+        FlightSettings().write_into(model)
+        model.save(folder / f"{kind}.zip")
     return folder
 
 
@@ -336,11 +339,11 @@ def test_a_header_that_relates_otherwise_is_refused(zips, monkeypatch, wrong):
         export_policy(zips / "tanh.zip", "c", n_observations=200)
 
 
-def test_the_run_folder_gives_vehicle_and_scaling(zips, tmp_path):
+def test_the_run_folder_gives_vehicle_and_scaling(tmp_path):
     run_folder = tmp_path / "run"
     (run_folder / "Env-v0").mkdir(parents=True)
     path = run_folder / "agent.zip"
-    path.write_bytes((zips / "tanh.zip").read_bytes())
+    untrained("tanh", QuadcopterVecEnv(2, seed=0)).save(path)
     (tmp_path / "light.yaml").write_text(json.dumps(light()))
     given = {
         "vehicle": str(tmp_path / "light.yaml"),
@@ -490,6 +493,19 @@ def test_settings_that_do_not_fit_the_policy_are_one_line(zips, tmp_path, capsys
     assert "by its settings of shape (36,)" in error and error.count("\n") == 1
 
 
+def test_an_agent_that_does_not_say_its_vehicle_needs_one(tmp_path):
+    """Behind such a wrapper an algorithm writes no settings."""
+    path = tmp_path / "agent.zip"
+    env = gymnasium.make("QuadTargetTracking-v0", vehicle="crazyflie")
+    wrapped = gymnasium.wrappers.NormalizeObservation(env)
+    model = DAgger("MlpPolicy", wrapped, expert="pid", n_steps=8, gradient_steps=1, device="cpu")
+    model.learn(8).save(path)
+    with pytest.raises(ConfigError, match="does not say how its agent flies; if no wrapper"):
+        export_policy(path, "torchscript", n_observations=100)
+    exported = export_policy(path, "torchscript", vehicle="crazyflie", n_observations=100)
+    assert exported.metadata["vehicle"].startswith("crazyflie")
+
+
 @given(st.text(max_size=200))
 def test_any_file_name_makes_a_c_name_and_a_comment(text):
     assert re.fullmatch("[A-Za-z][A-Za-z0-9_]*", c_header.c_name(text))
@@ -547,6 +563,8 @@ def test_a_policy_that_cannot_fly_so_is_refused(make, message):
         (["agent.zip", "--format", "c"], "--overwrite"),
         (["agent.zip", "--format", "c", "--overwrite", "-o", "agent.zip"], "the model itself"),
         (["agent.zip", "--format", "c", "-o", "b.h", "--name", "1st"], "C identifier"),
+        (["agent.zip", "--format", "c", "-o", "b.onnx"], "c writes a .h file, no .onnx file"),
+        (["agent.zip", "--format", "px4", "-o", "b.tflite"], "px4 writes a folder, no .tflite"),
         (["agent.zip", "--format", "onnx"], r"pip install '\.\[export\]'"),
     ],
 )

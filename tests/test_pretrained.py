@@ -17,7 +17,7 @@ import yaml
 from stable_baselines3 import PPO
 
 import sb3_quad
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.cli import main
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import FOLDER, agent_path, pretrained_names
@@ -299,6 +299,21 @@ def test_each_says_how_it_flies(name):
     )
     imitates_pid = name in ("thesis-imitation", "thesis-printed-imitation")
     assert settings.task == ("target_tracking" if imitates_pid else "state_recovery")
+
+
+def test_a_misspelt_name_is_guessed():
+    with pytest.raises(ConfigError, match="itm-robus: no such file; did you mean 'itm-robust'"):
+        sb3_quad.env_kwargs("itm-robus")
+
+
+def test_fly_warns_of_a_vehicle_that_an_agent_was_not_trained_on(recwarn):
+    model = sb3_quad.load_pretrained("crazyflie-recovery")
+    fly(model, n_flights=1, max_steps=1, **sb3_quad.env_kwargs(model))
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="trained on the vehicle crazyflie and flies itm; give"):
+        fly(model, n_flights=1, max_steps=1)
+    with pytest.raises(ControllerError, match=r"the environment's \(18,\); give \*\*env_kwargs"):
+        fly("itm-robust", n_flights=1, max_steps=1)
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ class Craft(Frozen):
     rotors: tuple[Rotor, ...] = ()
     by_name: dict[str, Rotor] = Field(default_factory=dict)
     saved: Rotor | None = None
+    shape: Literal["cross", "plus"] = Field(default="plus", description="how it\nlooks")
     fault: Literal["none", "hover", "expert"] = "none"
     second: Literal["none", "hover", "other"] = "none"
 
@@ -58,7 +59,7 @@ def test_data_become_a_frozen_model():
         (
             {"mass": 1, "cuont": 4},
             "x: unknown key 'cuont': did you mean 'count'? "
-            "(valid: by_name, count, fault, length, mass, rotors, saved, second)",
+            "(valid: by_name, count, fault, length, mass, rotors, saved, second, shape)",
         ),
         (
             {"mass": 1, "rotors": [{"thrust": 1}, {"thrust": "x"}]},
@@ -77,6 +78,10 @@ def test_data_become_a_frozen_model():
         (
             {"count": "x", "mass": 0},
             "x: mass: Input should be greater than 0 (m, kg); count: 'x' must",
+        ),
+        (
+            {"mass": 1, "shape": "crss"},
+            "x: shape: Input should be 'cross' or 'plus'; did you mean 'cross'? (how it looks)",
         ),
         ([1], "x: Input should be a valid dictionary"),
     ],

@@ -488,6 +488,7 @@ def test_vehicles_by_row():
         ({"n_envs": 2, "observation_mean": np.zeros(17)}, r"observation_mean of shape \(17,\)"),
         ({"n_envs": 2, "max_episode_steps": [5, 0]}, "max_episode_steps"),
         ({"n_envs": 2, "max_episode_steps": []}, "max_episode_steps"),
+        ({"n_envs": 2, "max_episode_steps": True}, "true and false are not numbers"),
         ({"n_envs": 2, "max_episode_steps": [5] * 3}, "max_episode_steps: 3 values for 2"),
         ({"n_envs": 2, "vehicle": ["itm"] * 3}, "vehicle: 3 values for 2"),
     ],

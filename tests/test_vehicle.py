@@ -379,6 +379,8 @@ def test_a_little_too_large_a_moment_is_a_warning_and_more_is_refused(
 def test_unknown_name_gives_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"'imt': did you mean 'itm'.*path of a .yaml"):
         load_vehicle("imt")
+    with pytest.raises(ConfigError, match="vehicle None: must be a name or the path of"):
+        load_vehicle(None)  # type: ignore[arg-type]
 
 
 def rotors(vehicle: Vehicle, turn: float = 0.0) -> set[tuple[complex, int]]:

@@ -339,10 +339,14 @@ def model_of(initial_policy: BaseAlgorithm | StrPath | None) -> BaseAlgorithm | 
     """Return the model that ``initial_policy`` is or names.
 
     :param initial_policy: a model, the path of a zip, a run folder, or the name of a shipped agent.
-    :raises ConfigError: a missing or damaged file.
+    :raises ConfigError: a missing or damaged file, or something else.
     """
     if isinstance(initial_policy, (str, Path)):
         return load_model(agent_path(str(initial_policy)))
+    if initial_policy is not None and not isinstance(initial_policy, BaseAlgorithm):
+        raise ConfigError(
+            f"initial_policy {initial_policy!r}: must be a model, the path of a zip, or a name"
+        )
     return initial_policy
 
 

@@ -1,6 +1,7 @@
 """Validated data: one base class for records and settings, and one-line errors."""
 
 import json
+import re
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrMapping
 
@@ -86,7 +87,12 @@ def _message(item: StrMapping) -> str:
         return f"{value!r} must be a plain number, without a unit"
     if item["type"] == "missing":
         return "is missing"
-    return str(item["msg"]).removeprefix("Value error, ")
+    message = str(item["msg"]).removeprefix("Value error, ")
+    if item["type"] == "literal_error":
+        # pydantic lists the valid values in quotes.
+        guess = did_you_mean(value, re.findall("'([^']+)'", item["ctx"]["expected"]))
+        message = f"{message}; {guess}".rstrip("; ")
+    return message
 
 
 def _locate(
@@ -103,7 +109,9 @@ def _locate(
             names.append(str(part))
         elif field is not None:
             names.append(part)
-            meaning = f" ({field.description})" if field.description else ""
+            # A docstring may have several lines.
+            words = " ".join((field.description or "").split())
+            meaning = f" ({words})" if words else ""
             model = _model_in(field.annotation) or model
         # Anything else is the name of a union's alternative, which the user does not know.
     return model, ".".join(names), meaning

@@ -1,5 +1,6 @@
 """YAML files, by the name of one that comes with the package, or by path."""
 
+import os
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -112,6 +113,10 @@ class YamlFolder(NamedTuple):
 
         :raises ConfigError: An unknown name, or a file that is missing or cannot be read.
         """
+        if not isinstance(source, (str, os.PathLike)):
+            raise ConfigError(
+                f"{self.kind} {source!r}: must be a name or the path of a {self.suffix} file"
+            )
         if self.is_path(source):
             return read_text(source), str(source)
         name = str(source)

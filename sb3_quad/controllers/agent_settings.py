@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.base_class import BaseAlgorithm
+
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.types import StrDict, StrPath
@@ -53,10 +55,13 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
     # An agent that was trained on many vehicles knows none of them in particular.
     if own.vehicles is not None or trained.flies_as(flown):
         return ""
-    warning = f"{label}: was trained on the vehicle {trained.name} and flies {flown.name}"
-    if trained.name == flown.name:
-        warning += " of other parameters"
-    return warning
+    flies = name_beside(trained, flown)
+    return f"{label}: was trained on the vehicle {trained.name} and flies {flies}"
+
+
+def name_beside(known: Vehicle, flown: Vehicle) -> str:
+    """Return the name of a vehicle that a controller flies and does not know."""
+    return flown.name + " of other parameters" * (known.name == flown.name)
 
 
 def settings_of_record(record: Any, where: str) -> FlightSettings:
@@ -66,7 +71,10 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     :raises ConfigError: it does not fit.
     """
     if not isinstance(record, dict):
-        raise ConfigError(f"{where}: must be a mapping of names to values")
+        raise ConfigError(
+            f"{where}: must be a mapping of names to values, as"
+            " FlightSettings(...).write_into(model) writes it"
+        )
     # A path in a stranger's zip could name a device file, which is read forever. Both a vehicle and
     # a distribution may be given by a name, which could be a path.
     distribution = record.get("vehicles")
@@ -116,7 +124,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
     return validate(FlightSettings, given, where)
 
 
-def env_kwargs(agent: StrPath) -> StrDict:
+def env_kwargs(agent: StrPath | BaseAlgorithm) -> StrDict:
     """Return the keywords of environments that fly as an agent was trained to.
 
     They are its vehicle, noise and observation.
@@ -124,8 +132,11 @@ def env_kwargs(agent: StrPath) -> StrDict:
     >>> import gymnasium, sb3_quad
     >>> env = gymnasium.make("QuadTargetTracking-v0", **sb3_quad.env_kwargs("itm-robust"))
 
-    :param agent: a zip, a run folder, or the name of a policy that comes with the package.
-    :raises ConfigError: a zip or settings that cannot be read.
+    :param agent: a zip, a run folder, the name of a policy that comes with the package, or a model.
+    :raises ConfigError: a zip or settings that cannot be read; a model that holds none.
     """
-    settings, _ = agent_settings(agent_path(str(agent)))
+    if isinstance(agent, BaseAlgorithm):
+        settings = settings_of_record(getattr(agent, KEY, None), f"{type(agent).__name__}.{KEY}")
+    else:
+        settings, _ = agent_settings(agent_path(str(agent)))
     return settings.in_any_task()

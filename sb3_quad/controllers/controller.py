@@ -1,5 +1,6 @@
 """One way to ask a controller for actions, whatever it is: an expert, an SB3 model, a function."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,11 +11,16 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array
+from sb3_quad.controllers.agent_settings import name_beside
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.simulation.settings import KEY
 from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle
+
+# Labels this far from the middle of the action space, in half ranges, are in some other unit.
+FAR = 1.5
 
 
 class Controller:
@@ -48,6 +54,8 @@ class Controller:
 
     # A VecNormalize whose raw observations the source sees instead of those that it is asked about.
     _raw: Any = None
+    # Whether it has warned of labels outside of the action space.
+    _warned = False
 
     def __init__(
         self,
@@ -87,9 +95,13 @@ class Controller:
         ):
             theirs = getattr(source, space, None)
             if isinstance(theirs, spaces.Space) and theirs.shape != ours.shape:
+                # An agent that says how it flies says what it observes.
+                way_out = ""
+                if space == "observation_space" and hasattr(source, KEY):
+                    way_out = "; give **env_kwargs(the agent)"
                 raise self._error(
                     f"{self._who}: its {space.replace('_', ' ')} has shape {theirs.shape}, "
-                    f"the environment's {ours.shape}"
+                    f"the environment's {ours.shape}{way_out}"
                 )
 
         # Actions are checked and clipped as flat rows.
@@ -104,9 +116,15 @@ class Controller:
         if isinstance(own, spaces.Box) and not np.allclose(limits_of(own), self._limits):
             self._own_limits = limits_of(own)
             if not np.allclose(_limits_below(env, action_space), self._own_limits):
+                way_out = "no wrapper such as RescaleAction leads straight from these to those"
+                if hasattr(source, "action_space"):
+                    way_out = (
+                        "train it within these, or give an environment with the wrapper that it"
+                        " was trained in"
+                    )
                 raise self._error(
                     f"{self._who}: its actions are of {own}, the environment's of {action_space};"
-                    " no wrapper such as RescaleAction leads straight from these to those"
+                    f" {way_out}"
                 )
 
     @staticmethod
@@ -136,6 +154,8 @@ class Controller:
             return present
         vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
         source = resolve_expert(expert, vehicle)
+        if isinstance(vehicle, Vehicle):
+            warn_of_vehicle(source, vehicle)
         controller = Controller(
             source,
             env.action_space,
@@ -206,6 +226,15 @@ class Controller:
         if self._own_limits is not None:
             least, most = self._own_limits
             actions = low + (actions - least) * ((high - low) / (most - least))
+        beyond = np.maximum(low - actions, actions - high)
+        if not self._warned and (beyond > (FAR - 1.0) * (0.5 * high - 0.5 * low)).any():
+            self._warned = True
+            warnings.warn(
+                f"{self._who}: gives actions far outside of the action space, such as"
+                f" {actions.flat[beyond.argmax()]:.4g}, which are clipped; are they newtons or PWM"
+                f" rather than actions from {low.min():g} to {high.max():g}?",
+                stacklevel=2,
+            )
         return actions.clip(low, high)
 
     def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
@@ -228,6 +257,20 @@ class Controller:
             observation, deterministic=self._deterministic, **keywords
         )
         return actions
+
+
+def warn_of_vehicle(source: Any, flown: Vehicle) -> None:
+    """Warn of an expert that is made for another vehicle than the one that it flies."""
+    known = getattr(source, "vehicle", None)
+    if not isinstance(known, Vehicle) or getattr(source, "is_privileged", False):
+        return
+    if not known.flies_as(flown):
+        name = type(source).__name__
+        warnings.warn(
+            f"{name}: is made for the vehicle {known.name} and flies {name_beside(known, flown)};"
+            f" make it for this one: {name}(vehicle)",
+            stacklevel=3,
+        )
 
 
 def limits_of(space: spaces.Box) -> Float32Array:

@@ -13,12 +13,13 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.errors import ConfigError, did_you_mean, raised_as
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import trusted
 from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
+from sb3_quad.controllers.pretrained import pretrained_names
 from sb3_quad.controllers.statistics import STATISTICS
 from sb3_quad.controllers.tensors import ENDING, read_tensors
 from sb3_quad.controllers.unpickle import WAY_OUT, held, unpickle
@@ -76,7 +77,8 @@ def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
         if Path(path).is_dir():
             raise ConfigError(f"{where}: no run with an agent in this folder")
         if not Path(path).is_file():
-            raise ConfigError(f"{where}: no such file")
+            guess = did_you_mean(path, pretrained_names())
+            raise ConfigError(f"{where}: no such file; {guess}".rstrip("; "))
     # What a damaged archive raises depends on where the damage is.
     with raised_as(ConfigError, f"{where}: {DAMAGED}"), _open(path, where) as archive:
         return dict(json.loads(archive.read("data")))

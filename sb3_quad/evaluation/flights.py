@@ -5,6 +5,7 @@ the end of the first control step after which |r - r_T| is within it. The path i
 episode, 15 s, not only of the way until arrival.
 """
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,7 +18,8 @@ from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, unknow
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict, StrPath
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.agent_settings import settings_of_record, unlike_trained
+from sb3_quad.controllers.controller import Controller, warn_of_vehicle
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
@@ -25,9 +27,9 @@ from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.evaluation.supervisor import Supervisor
 from sb3_quad.simulation import MAX_EPISODE_STEPS
-from sb3_quad.simulation.settings import FlightSettings, known_layout
+from sb3_quad.simulation.settings import KEY, FlightSettings, known_layout
 from sb3_quad.simulation.state import TARGET, QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance where it is not one
@@ -200,10 +202,26 @@ def fly(
     settings = FlightSettings().with_changes(
         task=task, vehicle=vehicle, noise=noise, max_episode_steps=max_steps, **environment
     )
+    _warn_if_unlike(controller, settings)
     seeds = row_seeds(seed, n_flights)
     return fly_settings(
         controller, settings, seeds, backend, tolerances, hooks, reward=reward, record=record
     )
+
+
+def _warn_if_unlike(controller: Any, settings: FlightSettings) -> None:
+    """Warn of an agent or an expert of another vehicle than it flies."""
+    # A distribution has no particular vehicle.
+    if settings.vehicles is not None:
+        return
+    warn_of_vehicle(controller, first_vehicle(settings.vehicle, settings.rotor_layout))
+    record = getattr(controller, KEY, None)
+    if isinstance(record, dict):
+        name = type(controller).__name__
+        own = settings_of_record(record, f"{name}.{KEY}")
+        notice = unlike_trained(name, own, first_vehicle(settings.vehicle))
+        if notice:
+            warnings.warn(f"{notice}; give **env_kwargs(the agent)", stacklevel=3)
 
 
 def fly_settings(

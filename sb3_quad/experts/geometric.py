@@ -61,6 +61,7 @@ class GeometricExpert(Expert):
             self.vehicle.control_step,
             self.gains.values()[:, None],
         )
+        self.is_privileged = privileged
         self._true = TrueConstants(self.vehicle, self.gains) if privileged else None
 
     def actions(self, state: QuadcopterState) -> Actions:

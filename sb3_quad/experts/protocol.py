@@ -41,6 +41,9 @@ class Expert(ABC):
     observation_mean: FloatArray = DEFAULT_MEAN
     observation_std: FloatArray = DEFAULT_STD
 
+    # Whether it flies by each vehicle's true parameters rather than by those of ``vehicle``.
+    is_privileged = False
+
     def __init__(self, vehicle: VehicleSource = "itm") -> None:
         self.vehicle = load_vehicle(vehicle)
 

@@ -67,8 +67,8 @@ def export_policy(
     relative to a reference that moves, see ``metadata["reference"]``. It gives the four rotors'
     thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the
     policy sees are in a state, ``metadata["state"]``. A vehicle that is not given, and the scaling,
-    are those that :func:`agent_settings` finds in the zip or next to it, or else ``itm`` and Table
-    A.2.
+    are those that :func:`agent_settings` finds in the zip or next to it. If it finds none, the
+    vehicle must be given, and the scaling is that of Table A.2.
 
     :param file_format: ``onnx``, ``torchscript``, ``c``, ``crazyflie``, which is an app around the
         C header, ``px4`` or ``safetensors``; ``output``: ``thrusts`` or ``speeds``.
@@ -79,10 +79,10 @@ def export_policy(
     :param half: round the weights to half precision, for ``c``. The check compares the file with
         the policy of these weights.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are
-        not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle,
-        and none is given; a vehicle whose rotors cannot be brought to where the policy knows them;
-        an app for another vehicle than a Crazyflie, of speeds, or of a policy that is too slow;
-        a package or a C compiler that is not installed.
+        not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle
+        or does not say which, and none is given; a vehicle whose rotors cannot be brought to where
+        the policy knows them; an app for another vehicle than a Crazyflie, of speeds, or of a
+        policy that is too slow; a package or a C compiler that is not installed.
     :raises ExportError: the file computes something else than the policy, or does not compile.
     """
     prefix = c_name(Path(path).stem) if name is None else name
@@ -105,6 +105,11 @@ def export_policy(
         for values in model.policy.parameters():
             values.data = values.data.half().float()
     settings, source = agent_settings(path)
+    if source is None and vehicle is None:
+        raise ConfigError(
+            f"model {path}: does not say how its agent flies; if no wrapper of observations or"
+            " actions lay over its environment, name its vehicle with --vehicle"
+        )
     given = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
     if given.vehicles is not None:
         raise ConfigError(

@@ -20,6 +20,8 @@ LABELS = {
     "reward": ("mean reward", 1.0),
     "bc_loss": ("cloning loss", 1.0),
 }
+# On longer curves markers would hide the line.
+MOST_MARKERS = 60
 # The columns of panels: an array of a curve, its unit and the axis's label.
 COLUMNS = (
     ("timesteps", 1e6, "timesteps in millions"),
@@ -36,7 +38,7 @@ def plot_curves(
 ) -> Figure:
     """Draw two panels for each of ``show``, over timesteps and over wall-clock time.
 
-    A marker stands at each evaluation.
+    A marker stands at each evaluation, unless there are too many to tell apart.
 
     :param groups: from the name of an agent to the curves of its seeds; their mean is drawn, with
         their range around it.
@@ -61,11 +63,12 @@ def plot_curves(
                 seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
                 if len(points):
                     points.index /= unit
-                    band(panel, colours[name], name + seeds, points, **POINTS)
-            for style, (name, heights) in zip(cycle(("--", ":", "-.")), lines.items()):
+                    style = POINTS if len(points) <= MOST_MARKERS else {}
+                    band(panel, colours[name], name + seeds, points, **style)
+            for dashes, (name, heights) in zip(cycle(("--", ":", "-.")), lines.items()):
                 if measure in heights:
                     panel.axhline(
-                        heights[measure] * factor, color="0.3", ls=style, linewidth=1.2, label=name
+                        heights[measure] * factor, color="0.3", ls=dashes, linewidth=1.2, label=name
                     )
     # A title of the figure would lie on the legend.
     panels[0, 0].set_title(title, loc="left")

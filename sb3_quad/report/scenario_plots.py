@@ -103,7 +103,11 @@ def _draw_path(
     begins = acts & ~np.roll(acts, 1)
     force = track.wrench[begins, :3]
     direction = force / np.linalg.norm(force, axis=1, keepdims=True)
-    axes.quiver(*path[begins].T, *direction[:, plane].T, color=FORCE, scale=12, width=0.006)
+    if begins.any():
+        arrows = axes.quiver(
+            *path[begins].T, *direction[:, plane].T, color=FORCE, scale=12, width=0.006
+        )
+        arrows.set_label("disturbance force")
 
 
 @styled

@@ -17,18 +17,18 @@ from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.references import Reference
 from sb3_quad.simulation.tasks import find_mixture, resolve_tasks
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, a_number, first_vehicle, load_vehicle
 
 # The most control steps that an episode can have
 ENDLESS = 2**62 - 1
-Steps = Annotated[int, Field(gt=0, le=ENDLESS)]
+Steps = Annotated[int, BeforeValidator(a_number), Field(gt=0, le=ENDLESS)]
 AsList = BeforeValidator(
     lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 )
 Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
 # The attribute of a model, and so the key of the JSON in its zip
 KEY = "flight_settings"
-Level = Annotated[float, Field(ge=0, le=100)]
+Level = Annotated[float, BeforeValidator(a_number), Field(ge=0, le=100)]
 
 
 _OBSERVATION = set(ObservationSettings.model_fields)

@@ -77,6 +77,11 @@ def make_environments(
                 **{"task": config.task, **config.env_kwargs},
             )
         else:
+            if config.algo == "apg":
+                raise ConfigError(
+                    f"--vec-env {config.vec_env}: apg differentiates the batched environment; "
+                    "remove --vec-env, or see docs/apg.md for an environment of your own"
+                )
             # A worker process could not say that PyBullet is missing.
             if config.task:
                 from sb3_quad.base import bullet  # noqa: F401

@@ -71,7 +71,7 @@ PARAMETER_NAMES = (
 NAME = r"^[^/\\<>\p{C}]{1,100}$"
 
 
-def _a_number(value: Any) -> Any:
+def a_number(value: Any) -> Any:
     """Refuse true and false, which pydantic takes for 1 and 0."""
     if isinstance(value, bool):
         raise ValueError("true and false are not numbers")
@@ -80,7 +80,7 @@ def _a_number(value: Any) -> Any:
 
 # No quadcopter has larger numbers, and the square of one would overflow.
 LARGEST = 1e6
-Number = Annotated[float, BeforeValidator(_a_number), Field(le=LARGEST)]
+Number = Annotated[float, BeforeValidator(a_number), Field(le=LARGEST)]
 PositiveFloat = Annotated[Number, Field(gt=0.0)]
 NonNegativeFloat = Annotated[Number, Field(ge=0.0)]
 Limits = tuple[NonNegativeFloat, PositiveFloat]

@@ -34,6 +34,12 @@ if TYPE_CHECKING:
 SLIM_THRUST = 1.2
 # Rotor speed, rpm. Above it a unit must be wrong.
 FASTEST_HOVER = 95_000.0
+# Time constants of motors, s. Beyond these a unit must be wrong, or the gain is the time itself.
+QUICKEST_MOTOR = 0.004
+SLOWEST_MOTOR = 0.3
+# kM / kF by the rotors' distance from the centre. It is about a tenth of a propeller's diameter.
+LEAST_RATIO = 0.02
+GREATEST_RATIO = 2.0
 # rpm per rad/s.
 RPM = 60.0 / (2.0 * math.pi)
 
@@ -120,7 +126,20 @@ def warnings(vehicle: "Vehicle") -> list[str]:
         lines.append(
             f"inertia: radii of gyration of {ratios.min():.3g} to {ratios.max():.3g} "
             "of the rotors' distance are unusual (0.2 to 0.6 is common); "
-            "is it in kg m², and are the rotor positions in m?"
+            "is it in kg m², the mass in kg, and are the rotor positions in m?"
+        )
+    quickest = 1.0 / max(vehicle.motor_gain_up, vehicle.motor_gain_down)
+    slowest = 1.0 / min(vehicle.motor_gain_up, vehicle.motor_gain_down)
+    if quickest < QUICKEST_MOTOR or slowest > SLOWEST_MOTOR:
+        lines.append(
+            f"motor_gain: time constants of {1000 * quickest:.3g} to {1000 * slowest:.3g} ms "
+            "are unusual (20 to 150 ms is common); is it in 1/s, one by the time constant?"
+        )
+    by_arm = vehicle.moment_thrust_ratio / vehicle.arm_length
+    if not LEAST_RATIO < by_arm < GREATEST_RATIO:
+        lines.append(
+            f"moment_thrust_ratio: {by_arm:.3g} times the rotors' distance from the centre is "
+            "unusual (0.05 to 0.5 is common); is it in m?"
         )
     most = vehicle.thrust_limits[1]
     if most < SLIM_THRUST:

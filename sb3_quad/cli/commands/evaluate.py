@@ -4,6 +4,8 @@ All controllers fly the same episodes.
 
 controllers:
   pid, geometric          an expert
+  itm-robust              an agent that comes with the package
+                          (docs/agents.md)
   path/to/agent.zip       an agent of any Stable-Baselines3 algorithm, or its
                           run folder
   package.module:factory  a function that takes the vehicle and returns a
@@ -55,7 +57,7 @@ DEFAULT_FOLDER = "evaluations"
 
 
 FLAGS: Flags = {
-    "controllers CONTROLLER": (SEVERAL, "controllers to fly, see below"),
+    "controllers CONTROLLER": (SEVERAL, "controllers to fly, as listed above"),
     "--suite": (
         str,
         "thesis",

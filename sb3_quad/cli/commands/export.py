@@ -56,6 +56,8 @@ FACTS = (
     "cost",
     "check",
 )
+# Suffixes that mean something, and no format's own.
+OTHER_FILES = (".tflite", ".zip")
 
 
 FLAGS: Flags = {
@@ -99,6 +101,11 @@ def run(options: Namespace) -> int:
         file /= model.stem + FORMATS[options.format]
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
+    # Suffixes that no format has, such as .hpp, are the user's choice.
+    ending = FORMATS[options.format]
+    if file.suffix != ending and file.suffix in (*FORMATS.values(), *OTHER_FILES):
+        kind = "a folder" if is_app else f"a {ending} file"
+        raise ConfigError(f"{file}: --format {options.format} writes {kind}, no {file.suffix} file")
     refuse_existing(file / FOLDERS.get(options.format, ""), options.overwrite)
     name = options.name
     if name is None:
@@ -113,8 +120,7 @@ def run(options: Namespace) -> int:
     files = exported.files or {"": exported.content}
     for path, content in files.items():
         write_bytes(file / path, content)
-    unknown_settings = "in neither the zip nor its folder; assumed: itm, the scaling of Table A.2"
-    print(f"settings: {exported.settings or unknown_settings}")
+    print(f"settings: {exported.settings or 'in neither the zip nor its folder'}")
     for fact in FACTS:
         if fact in exported.metadata:
             print(f"{fact}: {exported.metadata[fact]}")

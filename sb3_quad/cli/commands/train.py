@@ -77,7 +77,9 @@ KEPT_BY_RESUME = (
 
 # What is trained; tune has these as well.
 SETTINGS_FLAGS: Flags = {
-    "--algo": f"algorithm: dagger, ppo_bc, sac_bc, apg, ppo, sac or td3 ({DEFAULT_ALGO})",
+    "--algo": (
+        f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, sac_bc, apg, ppo, sac or td3"
+    ),
     "--env": (
         f"environment id ({DEFAULT_ENV}); "
         "any id that Gymnasium knows, with --vec-env dummy or subproc"
