@@ -25,7 +25,7 @@ from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.report.scenario_plots import paths_plot
 from sb3_quad.simulation.motions import read_points
-from sb3_quad.simulation.references import Reference
+from sb3_quad.simulation.references import NEEDED, Reference
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
 
@@ -186,6 +186,14 @@ def test_random_pieces_that_rest_do_not_turn_along_their_path():
         ({"curve": "polynomial"}, "needs waypoints"),
         ({"heading": "random"}, "only with curve random_smooth"),
         ({"heading_rate": 1.0}, "needs a heading"),
+        ({"curve": "circle", "waypoints": WAYPOINTS}, "waypoints: curve circle does not use it"),
+        ({"curve": "circle", "file": "c.csv"}, "file: curve circle"),
+        ({"waypoints": WAYPOINTS, "function": spiral}, "function: curve polynomial"),
+        ({"curve": "circle", "resting": 0.5}, "only random_smooth"),
+        ({"curve": "hover", "speed": 9}, "speed: curve hover"),
+        ({"acceleration": 3}, "acceleration: curve figure_eight"),
+        ({"duration": 3}, "only helix, function"),
+        ({"function": spiral, "heading": "path"}, "gives headings of its own"),
         ("no_such.csv", "no_such.csv"),
         (lambda times: times, "must be finite numbers"),
     ],
@@ -193,6 +201,15 @@ def test_random_pieces_that_rest_do_not_turn_along_their_path():
 def test_what_is_no_reference_is_refused(fields, message):
     with pytest.raises(ConfigError, match=message):
         QuadcopterVecEnv(1, reference=fields)
+
+
+def test_what_only_one_curve_needs_names_it(csv):
+    for fields in ({"waypoints": WAYPOINTS}, {"file": csv}, {"function": spiral, "duration": 4.0}):
+        reference = Reference.model_validate(fields)
+        assert NEEDED[reference.curve] in fields
+        # A record holds every field, most of them by default.
+        if reference.curve != "function":
+            assert Reference.model_validate(reference.model_dump(mode="json")).tracks(DT)
 
 
 def test_the_rate_of_no_heading_is_refused_in_flight_as_well():
