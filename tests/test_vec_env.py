@@ -360,6 +360,14 @@ def test_setters_reach_the_rows_they_name():
     np.testing.assert_array_equal(env.get_attr("target", [0, 1]), [(1, 2, 3), (0, 0, 9)])
     env.set_attr("target", np.arange(12.0).reshape(4, 3))
     np.testing.assert_array_equal(env.target, np.arange(12.0).reshape(4, 3))
+    for indices in ([], np.zeros(4, np.bool_)):
+        env.set_target((0, 0, 15), indices=indices)
+        env.set_reference((0, 0, 15), heading=1.0, indices=indices)
+        env.set_wrench((1, 0, 0), indices=indices)
+        env.set_wind((1, 0, 0), indices=indices)
+        env.set_noise(0.5, indices=indices)
+    np.testing.assert_array_equal(env.target, np.arange(12.0).reshape(4, 3))
+    assert not env.wrench.any() and not env.wind.any() and (env.noise == 0.05).all()
     env.set_noise(0.0)
     assert env.get_attr("noise") == [0.0] * 4
     env.set_attr("noise", 0.1, indices=2)
@@ -529,8 +537,9 @@ def test_bad_settings_are_refused(method, arguments, says):
 
 def test_unknown_rows_methods_and_attributes_are_refused():
     env = QuadcopterVecEnv(2)
-    with pytest.raises(ConfigError, match="0 to 1"):
-        env.set_target((0, 0, 1), indices=[2])
+    for indices in ([2], 1.5):
+        with pytest.raises(ConfigError, match="0 to 1"):
+            env.set_target((0, 0, 1), indices=indices)
     with pytest.raises(AttributeError):
         env.env_method("fly_home")
     with pytest.raises(AttributeError):

@@ -317,8 +317,8 @@ class QuadcopterBatch:
         everything = np.arange(self.n, dtype=np.int64)
         if rows is None:
             return everything
-        selected = rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)
         try:
+            selected = rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)
             return np.atleast_1d(everything[selected])
         except (IndexError, TypeError):
             raise ConfigError(
