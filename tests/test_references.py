@@ -447,6 +447,33 @@ def test_a_heading_that_jumps_by_a_whole_turn_turns_no_further():
     np.testing.assert_allclose(rates, 0.5, atol=1e-9)
 
 
+def test_a_file_may_have_spaces_behind_its_commas(tmp_path):
+    file = tmp_path / "spaces.csv"
+    file.write_text("t, x, y, z \n0, 0, 0, 0\n1, 1, 2, 3\n")
+    np.testing.assert_array_equal(read_points(file)[1], [[0, 0, 0], [1, 2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("t,x,y,Z\n0,0,0,0\n1,0,0,0\n", "names t,x,y,Z; the columns must be t,x,y,z"),
+        ("t,x,y,z\n0,0,0,0,1\n1,0,0,0,1\n", "more numbers than its first line"),
+        ("t,x,y,z\n0,0,0,0\n", "two or more rows"),
+        ("t,x,y,z\n0,0,0,0\n1,0,0\n", "row 2: z is missing"),
+        ("t,x,y,z\n0,nan,0,0\n1,0,0,0\n", "row 1: x is missing, or is not a finite number"),
+        ("t,x,y,z\n0,0,0,0\n1,0,0,0\n1,0,0,0\n", "row 3: t is 1 after 1"),
+        ("t,x,y,z\n0,0,0,0\n2,0,0,0\n1,0,0,0\n", "row 3: t is 1 after 2"),
+        ("t,x,y,z\n0,0,0,0\n601,0,0,0\n", "takes 601 s"),
+        ("t,x,y,z\n0,0,0,zero\n1,0,0,0\n", "zero"),
+    ],
+)
+def test_errors_of_a_file_say_where(tmp_path, text, says):
+    file = tmp_path / "path.csv"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=says):
+        read_points(file)
+
+
 def test_the_heading_of_a_file_goes_the_shorter_way(tmp_path):
     file = tmp_path / "turn.csv"
     file.write_text("t,x,y,z,heading\n0,0,0,0,3.1\n1,0,0,0,-3.1\n")
