@@ -10,6 +10,7 @@ import warnings
 import numba
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -533,6 +534,27 @@ def test_bad_actions_are_refused_and_change_nothing():
 def test_bad_settings_are_refused(method, arguments, says):
     with pytest.raises(ConfigError, match=says):
         getattr(QuadcopterVecEnv(2), method)(*arguments)
+
+
+def test_targets_wait_for_the_first_reset():
+    env = QuadcopterVecEnv(2)
+    for setter in (env.set_target, env.set_reference):
+        with pytest.raises(ResetNeeded, match="call reset"):
+            setter((1, 2, 15))
+    env.batch.reset(0)
+    env.set_target((1, 2, 15), indices=0)
+    with pytest.raises(ResetNeeded):
+        env.set_target((1, 2, 15), indices=1)
+
+
+def test_wind_without_drag_warns():
+    with pytest.warns(UserWarning, match="wind acts through drag, and itm has none"):
+        QuadcopterVecEnv(1).set_wind((1, 0, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        QuadcopterVecEnv(1).set_wind()
+        QuadcopterVecEnv(1, vehicle="cf2x_L250").set_wind((1, 0, 0))
+        QuadcopterVecEnv(1, randomize={"drag": [0, 0.5]}).set_wind((1, 0, 0))
 
 
 def test_unknown_rows_methods_and_attributes_are_refused():

@@ -343,6 +343,13 @@ class QuadcopterBatch:
         """Whether some vehicle has drag."""
         return bool(self.vehicles[P.drag_x : P.drag_z + 1].any())
 
+    @property
+    def may_have_drag(self) -> bool:
+        """Whether some vehicle has drag, or may have some in a later episode."""
+        if self.distribution is not None and self.distribution.drag is not None:
+            return True
+        return self.has_drag or self.randomize.drag is not None
+
     def total_wrench(self) -> FloatArray:
         """Return the external wrench of this control step, (WRENCH_SIZE, n): the one that was set
         or sampled, and gusts; without drag.
