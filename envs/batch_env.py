@@ -1,12 +1,14 @@
 """The part that all environments share: spaces, keywords, and reading and setting in flight."""
 
 import inspect
+import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -20,7 +22,7 @@ from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.references import Reference
 from sb3_quad.simulation.settings import FlightSettings, Noise
-from sb3_quad.simulation.state import TARGET, QuadcopterState, make_wrench
+from sb3_quad.simulation.state import QUATERNION, TARGET, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource
@@ -114,10 +116,11 @@ class BatchEnv:
         return self.batch.true_state()
 
     def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
-        """Move targets. They stay there until the next reset of their rows.
+        """Move targets, after reset. They stay there until the next reset of their rows.
 
         :param position: r_T, (3,) for all these rows or (rows, 3), world frame, m.
         :raises ConfigError: a wrong shape, or a number that is not finite.
+        :raises gymnasium.error.ResetNeeded: a row has not been reset yet.
         """
         self.set_reference(position, indices=indices)
 
@@ -143,6 +146,7 @@ class BatchEnv:
         :param heading_rate: likewise, rad/s.
         :raises ConfigError: a wrong shape, a number that is not finite, or a heading_rate without a
             heading.
+        :raises gymnasium.error.ResetNeeded: a row has not been reset yet.
         """
         rows = self.batch.rows(indices)
         n = rows.size
@@ -156,6 +160,9 @@ class BatchEnv:
         if heading is not None:
             angle = per_row("heading", heading, n)[0]
             turning = np.stack([np.cos(angle), np.sin(angle), rate])
+        # Before its first reset the attitude of a row is zero. That reset would set another target.
+        if not self.batch.state[QUATERNION, rows].any(axis=0).all():
+            raise ResetNeeded("call reset() before set_target() or set_reference()")
         # Nobody knows its future, so the acceleration ahead is the present one.
         parts = [positions, velocities, accelerations, turning, accelerations]
         self.batch.set_reference(np.concatenate(parts), rows)
@@ -185,13 +192,21 @@ class BatchEnv:
         self.batch.wrench[:, rows] = make_wrench(forces, torques, force_frame, torque_frame)
 
     def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
-        """Set the velocity of the air until you set another. It acts on vehicles with ``drag``.
+        """Set the velocity of the air until you set another.
+
+        It acts through drag alone, and a warning says so if no vehicle here has ``drag``.
 
         :param velocity: (3,) for all these rows or (rows, 3), world frame, m/s.
         :raises ConfigError: a wrong shape, or a number that is not finite.
         """
         rows = self.batch.rows(indices)
         self.batch.wind[:, rows] = per_row("wind", velocity, rows.size, 3)
+        if self.batch.wind.any() and not self.batch.may_have_drag:
+            warnings.warn(
+                f"set_wind: wind acts through drag, and {self.vehicle.name} has none;"
+                " give a vehicle with drag",
+                stacklevel=2,
+            )
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the observation noise until you set another.

@@ -8,6 +8,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import AnyArray, IntArray, StrDict
 from sb3_quad.simulation.settings import ENDLESS
 
@@ -20,6 +21,9 @@ class BatchVecEnv(VecEnv):
     are too long, and gives the infos that SB3 reads: ``terminal_observation``,
     ``TimeLimit.truncated`` and ``episode`` (``r``, ``l``). Observations are copied, so that your
     arrays may change in place.
+
+    What the two methods return is checked: a wrong shape or a number that is not finite is a
+    :class:`~sb3_quad.base.errors.ConfigError` that names the method.
 
     The constructor is that of SB3's ``VecEnv``: the number of rows, the observation space and the
     action space of one row. The observations are a Box.
@@ -61,7 +65,14 @@ class BatchVecEnv(VecEnv):
         """Begin a new episode in every row; return the observations (n, ...)."""
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
-        return np.array(self.begin(np.arange(self.num_envs)), self.observation_space.dtype)
+        return self._begin(np.arange(self.num_envs))
+
+    def _begin(self, rows: IntArray) -> AnyArray:
+        """Begin new episodes and return their observations, checked (k, ...)."""
+        shape = (len(rows), *(self.observation_space.shape or ()))
+        return _checked(
+            "begin: observations", self.begin(rows), shape, self.observation_space.dtype
+        )
 
     def step_async(self, actions: AnyArray) -> None:
         """Keep the actions, (n, ...), for ``step_wait``."""
@@ -69,11 +80,15 @@ class BatchVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows; return observations (n, ...), rewards (n,), done (n,), infos."""
-        seen, gained, failed = self.advance(self._actions)
-        observations = np.array(seen, self.observation_space.dtype)
-        rewards = np.array(gained, np.float32)
-        terminated = np.array(failed, np.bool_)
-        # In place, where NumPy refuses arrays (n, 1).
+        results = self.advance(self._actions)
+        if not isinstance(results, (tuple, list)) or len(results) != 3:
+            raise ConfigError("advance: must return observations, rewards and terminated")
+        seen, gained, failed = results
+        n = self.num_envs
+        shape = (n, *(self.observation_space.shape or ()))
+        observations = _checked("advance: observations", seen, shape, self.observation_space.dtype)
+        rewards = _checked("advance: rewards", gained, (n,), np.float32)
+        terminated = _checked("advance: terminated", failed, (n,), np.bool_)
         self._returns += rewards
         self._lengths += 1
         dones = self._lengths >= self.max_episode_steps
@@ -89,7 +104,7 @@ class BatchVecEnv(VecEnv):
         if ended.size:
             self._returns[ended] = 0.0
             self._lengths[ended] = 0
-            observations[ended] = self.begin(ended)
+            observations[ended] = self._begin(ended)
         return observations, rewards, dones, infos
 
     def close(self) -> None:
@@ -108,3 +123,22 @@ class BatchVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
         """Return True for SB3's ``Monitor`` only, since the rows give its ``info["episode"]``."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+
+def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyArray:
+    """Return a copy of what a method has given, as an array.
+
+    :param what: the method and what it gives, for the message.
+    :raises ConfigError: another shape, or numbers that are not finite.
+    """
+    with raised_as(ConfigError, f"{what} are no numbers"):
+        array = np.array(values, dtype)
+    # None, of a method without a return, would be a NaN of shape ().
+    if values is None:
+        raise ConfigError(f"{what}: None; return an array of shape {shape}")
+    if array.shape != shape:
+        raise ConfigError(f"{what} of shape {array.shape}: must be of shape {shape}")
+    if not np.isfinite(array).all():
+        row = int(np.argwhere(~np.isfinite(array))[0, 0])
+        raise ConfigError(f"{what}: row {row} has a number that is not finite")
+    return array

@@ -9,6 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad import DAgger
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs import BatchVecEnv
 
 SPACES = (spaces.Box(-np.inf, np.inf, (2,), np.float32), spaces.Box(-1.0, 1.0, (1,), np.float32))
@@ -111,15 +112,55 @@ def test_its_random_numbers_follow_the_seed():
     assert not np.array_equal(first, second)
 
 
-@pytest.mark.parametrize("place", [1, 2])
-def test_arrays_with_an_axis_too_many_are_refused(place):
+@pytest.mark.parametrize(
+    ("place", "change", "says"),
+    [
+        (0, lambda seen: seen[:1], r"advance: observations of shape \(1, 2\): .* \(3, 2\)"),
+        (0, lambda seen: seen + np.nan, "advance: observations: row 0 .*not finite"),
+        (1, lambda gained: gained[:, None], r"advance: rewards of shape \(3, 1\)"),
+        (1, lambda gained: gained / 0.0, "advance: rewards: row 0"),
+        (2, lambda failed: failed[:, None], "advance: terminated of shape"),
+        (2, lambda failed: None, "advance: terminated: None"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_what_advance_returns_is_checked(place, change, says):
     class Wrong(Rows):
         def advance(self, actions):
             given = [*super().advance(actions)]
-            given[place] = given[place][:, None]
+            given[place] = change(given[place])
             return given
 
     env = Wrong(3)
     env.reset()
-    with pytest.raises(ValueError, match="broadcast"):
+    with pytest.raises(ConfigError, match=says):
+        env.step(np.zeros((3, 1), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (None, r"begin: observations: None; return an array of shape \(3, 2\)"),
+        (np.zeros(2), r"begin: observations of shape \(2,\)"),
+        (np.full((3, 2), np.nan), "begin: observations: row 0"),
+        ("near", "begin: observations are no numbers"),
+    ],
+)
+def test_what_begin_returns_is_checked(given, says):
+    class Wrong(Rows):
+        def begin(self, rows):
+            return given
+
+    with pytest.raises(ConfigError, match=says):
+        Wrong(3).reset()
+
+
+def test_a_step_without_results_names_advance():
+    class Wrong(Rows):
+        def advance(self, actions):
+            super().advance(actions)
+
+    env = Wrong(3)
+    env.reset()
+    with pytest.raises(ConfigError, match="advance: must return"):
         env.step(np.zeros((3, 1), np.float32))

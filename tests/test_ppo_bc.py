@@ -425,6 +425,28 @@ def test_an_initial_policy_is_a_model_a_zip_or_a_name(kind, tmp_path):
             PPOBC("MlpPolicy", env, initial_policy=source, policy_kwargs={"net_arch": [8]})
 
 
+def test_an_initial_policy_that_observed_something_else_is_warned_of(capsys):
+    def make(algorithm, initial=None, **observed):
+        env = QuadcopterVecEnv(2, **observed)
+        return algorithm(
+            "MlpPolicy", env, expert="pid", initial_policy=initial, policy_kwargs={"net_arch": [8]}
+        )
+
+    observed = {"history": [0, 1], "preview": [0, 5], "position_integral": {"gain": 0.5}}
+    teacher = make(DAgger, **observed)
+    make(PPOBC, teacher, **observed)
+    # Training may do without the integral, and whoever adds one or a preview does so on purpose.
+    make(PPOBC, teacher, **observed | {"position_integral": None})
+    make(PPOBC, make(DAgger), preview=[0, 5], position_integral={})
+    assert "warning" not in capsys.readouterr().err
+    other = {"history": [0, 4], "preview": [0, 9], "position_integral": {"gain": 1.0}}
+    make(PPOBC, teacher, **other, observation_std=[2.0] * 18)
+    warning = capsys.readouterr().err
+    assert warning.count("\n") == 1
+    assert "history [0, 1], here [0, 4]; preview [0, 5], here [0, 9]" in warning
+    assert "'gain': 0.5" in warning and "observation_std)" in warning
+
+
 def flights_of(model):
     return getattr(model, KEY, None)
 

@@ -25,7 +25,7 @@ from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.report.scenario_plots import paths_plot
 from sb3_quad.simulation.motions import read_points
-from sb3_quad.simulation.references import Reference
+from sb3_quad.simulation.references import NEEDED, Reference
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
 
@@ -186,6 +186,14 @@ def test_random_pieces_that_rest_do_not_turn_along_their_path():
         ({"curve": "polynomial"}, "needs waypoints"),
         ({"heading": "random"}, "only with curve random_smooth"),
         ({"heading_rate": 1.0}, "needs a heading"),
+        ({"curve": "circle", "waypoints": WAYPOINTS}, "waypoints: curve circle does not use it"),
+        ({"curve": "circle", "file": "c.csv"}, "file: curve circle"),
+        ({"waypoints": WAYPOINTS, "function": spiral}, "function: curve polynomial"),
+        ({"curve": "circle", "resting": 0.5}, "only random_smooth"),
+        ({"curve": "hover", "speed": 9}, "speed: curve hover"),
+        ({"acceleration": 3}, "acceleration: curve figure_eight"),
+        ({"duration": 3}, "only helix, function"),
+        ({"function": spiral, "heading": "path"}, "gives headings of its own"),
         ("no_such.csv", "no_such.csv"),
         (lambda times: times, "must be finite numbers"),
     ],
@@ -193,6 +201,15 @@ def test_random_pieces_that_rest_do_not_turn_along_their_path():
 def test_what_is_no_reference_is_refused(fields, message):
     with pytest.raises(ConfigError, match=message):
         QuadcopterVecEnv(1, reference=fields)
+
+
+def test_what_only_one_curve_needs_names_it(csv):
+    for fields in ({"waypoints": WAYPOINTS}, {"file": csv}, {"function": spiral, "duration": 4.0}):
+        reference = Reference.model_validate(fields)
+        assert NEEDED[reference.curve] in fields
+        # A record holds every field, most of them by default.
+        if reference.curve != "function":
+            assert Reference.model_validate(reference.model_dump(mode="json")).tracks(DT)
 
 
 def test_the_rate_of_no_heading_is_refused_in_flight_as_well():
@@ -428,6 +445,33 @@ def test_a_heading_that_jumps_by_a_whole_turn_turns_no_further():
 
     rates = Reference(curve="function", function=turning, duration=2.0).tracks(DT).table[:-1, 11]
     np.testing.assert_allclose(rates, 0.5, atol=1e-9)
+
+
+def test_a_file_may_have_spaces_behind_its_commas(tmp_path):
+    file = tmp_path / "spaces.csv"
+    file.write_text("t, x, y, z \n0, 0, 0, 0\n1, 1, 2, 3\n")
+    np.testing.assert_array_equal(read_points(file)[1], [[0, 0, 0], [1, 2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("t,x,y,Z\n0,0,0,0\n1,0,0,0\n", "names t,x,y,Z; the columns must be t,x,y,z"),
+        ("t,x,y,z\n0,0,0,0,1\n1,0,0,0,1\n", "more numbers than its first line"),
+        ("t,x,y,z\n0,0,0,0\n", "two or more rows"),
+        ("t,x,y,z\n0,0,0,0\n1,0,0\n", "row 2: z is missing"),
+        ("t,x,y,z\n0,nan,0,0\n1,0,0,0\n", "row 1: x is missing, or is not a finite number"),
+        ("t,x,y,z\n0,0,0,0\n1,0,0,0\n1,0,0,0\n", "row 3: t is 1 after 1"),
+        ("t,x,y,z\n0,0,0,0\n2,0,0,0\n1,0,0,0\n", "row 3: t is 1 after 2"),
+        ("t,x,y,z\n0,0,0,0\n601,0,0,0\n", "takes 601 s"),
+        ("t,x,y,z\n0,0,0,zero\n1,0,0,0\n", "zero"),
+    ],
+)
+def test_errors_of_a_file_say_where(tmp_path, text, says):
+    file = tmp_path / "path.csv"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=says):
+        read_points(file)
 
 
 def test_the_heading_of_a_file_goes_the_shorter_way(tmp_path):

@@ -10,6 +10,7 @@ import warnings
 import numba
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -360,6 +361,14 @@ def test_setters_reach_the_rows_they_name():
     np.testing.assert_array_equal(env.get_attr("target", [0, 1]), [(1, 2, 3), (0, 0, 9)])
     env.set_attr("target", np.arange(12.0).reshape(4, 3))
     np.testing.assert_array_equal(env.target, np.arange(12.0).reshape(4, 3))
+    for indices in ([], np.zeros(4, np.bool_)):
+        env.set_target((0, 0, 15), indices=indices)
+        env.set_reference((0, 0, 15), heading=1.0, indices=indices)
+        env.set_wrench((1, 0, 0), indices=indices)
+        env.set_wind((1, 0, 0), indices=indices)
+        env.set_noise(0.5, indices=indices)
+    np.testing.assert_array_equal(env.target, np.arange(12.0).reshape(4, 3))
+    assert not env.wrench.any() and not env.wind.any() and (env.noise == 0.05).all()
     env.set_noise(0.0)
     assert env.get_attr("noise") == [0.0] * 4
     env.set_attr("noise", 0.1, indices=2)
@@ -528,10 +537,32 @@ def test_bad_settings_are_refused(method, arguments, says):
         getattr(QuadcopterVecEnv(2), method)(*arguments)
 
 
+def test_targets_wait_for_the_first_reset():
+    env = QuadcopterVecEnv(2)
+    for setter in (env.set_target, env.set_reference):
+        with pytest.raises(ResetNeeded, match="call reset"):
+            setter((1, 2, 15))
+    env.batch.reset(0)
+    env.set_target((1, 2, 15), indices=0)
+    with pytest.raises(ResetNeeded):
+        env.set_target((1, 2, 15), indices=1)
+
+
+def test_wind_without_drag_warns():
+    with pytest.warns(UserWarning, match="wind acts through drag, and itm has none"):
+        QuadcopterVecEnv(1).set_wind((1, 0, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        QuadcopterVecEnv(1).set_wind()
+        QuadcopterVecEnv(1, vehicle="cf2x_L250").set_wind((1, 0, 0))
+        QuadcopterVecEnv(1, randomize={"drag": [0, 0.5]}).set_wind((1, 0, 0))
+
+
 def test_unknown_rows_methods_and_attributes_are_refused():
     env = QuadcopterVecEnv(2)
-    with pytest.raises(ConfigError, match="0 to 1"):
-        env.set_target((0, 0, 1), indices=[2])
+    for indices in ([2], 1.5):
+        with pytest.raises(ConfigError, match="0 to 1"):
+            env.set_target((0, 0, 1), indices=indices)
     with pytest.raises(AttributeError):
         env.env_method("fly_home")
     with pytest.raises(AttributeError):

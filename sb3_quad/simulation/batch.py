@@ -317,8 +317,8 @@ class QuadcopterBatch:
         everything = np.arange(self.n, dtype=np.int64)
         if rows is None:
             return everything
-        selected = rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)
         try:
+            selected = rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)
             return np.atleast_1d(everything[selected])
         except (IndexError, TypeError):
             raise ConfigError(
@@ -342,6 +342,13 @@ class QuadcopterBatch:
     def has_drag(self) -> bool:
         """Whether some vehicle has drag."""
         return bool(self.vehicles[P.drag_x : P.drag_z + 1].any())
+
+    @property
+    def may_have_drag(self) -> bool:
+        """Whether some vehicle has drag, or may have some in a later episode."""
+        if self.distribution is not None and self.distribution.drag is not None:
+            return True
+        return self.has_drag or self.randomize.drag is not None
 
     def total_wrench(self) -> FloatArray:
         """Return the external wrench of this control step, (WRENCH_SIZE, n): the one that was set

@@ -4,6 +4,7 @@ that are allowed.
 :raises ConfigError: by every function.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,9 @@ def per_row(name: str, value: Any, rows: int, *size: int) -> FloatArray:
         raise ConfigError(
             f"{name} of shape {array.shape}: must be {size}, or {shape} for {rows} rows"
         )
-    return np.ascontiguousarray(np.broadcast_to(array, shape).T).reshape(-1, rows)
+    # Not -1: without rows there would be no telling how many columns there are.
+    columns = math.prod(size)
+    return np.ascontiguousarray(np.broadcast_to(array, shape).T).reshape(columns, rows)
 
 
 def whole_number(name: str, value: Any, least: int, most: int, unit: str = "") -> int:

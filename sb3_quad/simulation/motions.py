@@ -42,18 +42,39 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
 
     Its first line names the columns: t, x, y, z and maybe heading; s, m, rad.
 
-    :raises ConfigError: a file that cannot be read, or whose times do not rise.
+    :raises ConfigError: a file that cannot be read, or whose times do not rise; names the row,
+        counted from 1 behind the names.
     """
     with raised_as(ConfigError, str(path)):
-        frame = pd.read_csv(path, dtype=np.float64)
-    if [*frame.columns] not in (_COLUMNS[:4], _COLUMNS) or len(frame) < 2:
-        raise ConfigError(f"{path}: needs two or more rows with the columns t,x,y,z[,heading]")
-    numbers = frame.to_numpy()
-    times = numbers[:, 0] - numbers[0, 0]
-    if not np.isfinite(numbers).all() or not 0.0 < np.diff(times).min() <= times[-1] <= MAX_SECONDS:
+        frame = pd.read_csv(path, dtype=np.float64, skipinitialspace=True)
+    # Pandas takes what is too much in the rows for an index, and all columns would be shifted.
+    if not isinstance(frame.index, pd.RangeIndex):
+        raise ConfigError(f"{path}: its rows have more numbers than its first line has names")
+    names = [name.strip() for name in frame.columns]
+    if names not in (_COLUMNS[:4], _COLUMNS):
         raise ConfigError(
-            f"{path}: every number must be finite, and t rise from row to row, by {MAX_SECONDS:g} s"
-            " at most"
+            f"{path}: its first line names {','.join(names)}; the columns must be t,x,y,z[,heading]"
+        )
+    if len(frame) < 2:
+        raise ConfigError(f"{path}: needs two or more rows behind the names of its columns")
+    numbers = frame.to_numpy()
+    unfit = np.argwhere(~np.isfinite(numbers))
+    if len(unfit):
+        row, column = unfit[0]
+        raise ConfigError(
+            f"{path}: row {row + 1}: {names[column]} is missing, or is not a finite number"
+        )
+    times = numbers[:, 0] - numbers[0, 0]
+    falling = np.flatnonzero(np.diff(times) <= 0.0)
+    if falling.size:
+        row = falling[0] + 1
+        raise ConfigError(
+            f"{path}: row {row + 1}: t is {numbers[row, 0]:g} after {numbers[row - 1, 0]:g};"
+            " it must rise from row to row"
+        )
+    if times[-1] > MAX_SECONDS:
+        raise ConfigError(
+            f"{path}: takes {times[-1]:g} s; t must rise by {MAX_SECONDS:g} s at most"
         )
     # Headings may be given from -π to π: between two of them is the shorter way.
     numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)

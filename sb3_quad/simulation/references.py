@@ -38,6 +38,17 @@ PIECE_SECONDS = 10.0
 # Curves that are given by a field, and its name
 NEEDED = {"polynomial": "waypoints", "file": "file", "function": "function"}
 CURVES = (*SINES, *NEEDED, "random_smooth")
+# Fields that only some curves use, and these curves
+USED_BY = {
+    "speed": ("circle", "figure_eight", "helix", "lissajous", "polynomial", "random_smooth"),
+    "size": ("circle", "figure_eight", "helix", "lissajous"),
+    "acceleration": ("random_smooth",),
+    "resting": ("random_smooth",),
+    "waypoints": ("polynomial",),
+    "file": ("file",),
+    "function": ("function",),
+    "duration": ("helix", "function"),
+}
 
 
 class Tracks(NamedTuple):
@@ -79,7 +90,7 @@ class Reference(Frozen):
     """
 
     curve: Literal[CURVES] = "figure_eight"  # type: ignore[valid-type]
-    """which curve"""
+    """which curve; waypoints, a file or a function without one name theirs"""
     speed: PositiveFloat = Field(default=2.0, le=100)
     """greatest speed, m/s; of random_smooth the limit, below which each piece has its own"""
     size: tuple[Metres, Metres, Metres] | None = None
@@ -98,26 +109,43 @@ class Reference(Frozen):
     """polynomial: two or more points, relative to the start, which is added if they do not begin
     there"""
     file: str | Path | None = None
-    """file: path of the CSV file"""
+    """file: path of the CSV file; times and positions count from its first row"""
     function: Any = Field(default=None, exclude=True)
     """function: times (t,) to positions (t, 3), or (t, 4) with headings; it is not saved"""
     duration: PositiveFloat = Field(default=20.0, le=MAX_SECONDS)
-    """helix and function: s"""
+    """helix and function: s, after which they rest"""
 
     @model_validator(mode="before")
     @classmethod
     def _from_name(cls, data: Any) -> Any:
-        """A string names a curve, or is the path of a CSV file; a function is one."""
+        """A string names a curve, or is the path of a CSV file; a function is one.
+
+        Fields without a curve say which it is by what only one curve needs.
+        """
         if isinstance(data, (str, Path)):
             is_file = str(data).endswith(".csv")
             return {"curve": "file", "file": data} if is_file else {"curve": data}
-        return {"curve": "function", "function": data} if callable(data) else data
+        if callable(data):
+            return {"curve": "function", "function": data}
+        if isinstance(data, dict) and "curve" not in data:
+            for curve, field in NEEDED.items():
+                if data.get(field) is not None:
+                    return {**data, "curve": curve}
+        return data
 
     @model_validator(mode="after")
     def _check_complete(self) -> "Reference":
         needed = NEEDED.get(self.curve)
         if needed and not getattr(self, needed):
             raise ValueError(f"curve {self.curve}: needs {needed}")
+        # Zips hold every field, so that only a value that is not the default was given on purpose.
+        for name, curves in USED_BY.items():
+            default = type(self).model_fields[name].default
+            if self.curve not in curves and getattr(self, name) != default:
+                raise ValueError(
+                    f"{name}: curve {self.curve} does not use it, only {', '.join(curves)};"
+                    " remove it, or name such a curve"
+                )
         if self.heading == "random" and self.curve != "random_smooth":
             raise ValueError("heading 'random': only with curve random_smooth")
         if self.heading_rate and self.heading in (None, "path"):
@@ -187,6 +215,8 @@ class Reference(Frozen):
         table[:, _VELOCITY] = np.gradient(table[:, _POSITION], dt, axis=0)
         table[:, _ACCELERATION] = np.gradient(table[:, _VELOCITY], dt, axis=0)
         heading: Any = None
+        if columns == 4 and self.heading is not None:
+            raise ValueError("gives headings of its own; remove heading")
         if columns == 4:
             heading = np.unwrap(values[:, 3])
         elif self.heading == "path":
