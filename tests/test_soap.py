@@ -86,3 +86,9 @@ def test_an_optimizer_class_of_the_user_holds(kind):
     kwargs = {"optimizer_class": kind}
     model = APG("MlpPolicy", QuadcopterVecEnv(2, seed=0), n_steps=10, policy_kwargs=kwargs)
     assert type(model.policy.optimizer) is kind
+
+
+def test_what_it_does_not_do_is_refused():
+    kwargs = {"optimizer_kwargs": {"weight_decay": 0.1}}
+    with pytest.raises(TypeError, match="weight_decay"):
+        APG("MlpPolicy", QuadcopterVecEnv(2, seed=0), n_steps=10, policy_kwargs=kwargs)

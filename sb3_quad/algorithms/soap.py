@@ -1,6 +1,6 @@
 """SOAP: Adam in the basis in which the gradients of a layer are uncorrelated."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch as th
@@ -21,9 +21,20 @@ class SOAP(th.optim.Adam):
 
     Its state holds all that Adam's does, so that ``PPO.load`` takes it for Adam's.
 
-    Arguments are those of :class:`torch.optim.Adam`; those that choose how Adam computes, such as
-    ``fused``, have no effect.
+    :param params: parameters to learn, or groups of them, as for ``torch.optim.Adam``.
+    :param lr: the rate.
+    :param betas: how the momentum decays, and the second moments of biases.
+    :param eps: is added to each deviation by which an update is divided.
     """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-5,
+    ) -> None:
+        super().__init__(params, lr, betas, eps)
 
     @th.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
