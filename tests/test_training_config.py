@@ -356,7 +356,7 @@ def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of
         if isinstance(flown, str):
             assert flown == task and "tasks" not in line
         else:
-            assert max(flown, key=flown.get) == task and f"tasks {flown[task]:.0%} {task}, " in line
+            assert f"tasks {flown[task]:.0%} {task}, " in line
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
