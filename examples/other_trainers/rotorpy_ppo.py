@@ -44,7 +44,7 @@ RECOVERIES = 480
 
 
 class Until(BaseCallback):
-    """Ends a training when this process has used so many CPU seconds."""
+    """Ends a training when this process has used ``end`` CPU seconds."""
 
     def __init__(self, end: float) -> None:
         super().__init__()

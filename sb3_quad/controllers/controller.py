@@ -19,8 +19,8 @@ from sb3_quad.simulation.settings import KEY
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
-# Labels this far from the middle of the action space, in half ranges, are in some other unit.
-FAR = 1.5
+# Labels this far beyond the limits of the action space, in half ranges, are in some other unit.
+FAR = 0.5
 
 
 class Controller:
@@ -226,8 +226,9 @@ class Controller:
         if self._own_limits is not None:
             least, most = self._own_limits
             actions = low + (actions - least) * ((high - low) / (most - least))
-        beyond = np.maximum(low - actions, actions - high)
-        if not self._warned and (beyond > (FAR - 1.0) * (0.5 * high - 0.5 * low)).any():
+        clipped = actions.clip(low, high)
+        beyond = np.abs(actions - clipped)
+        if not self._warned and (beyond > FAR * (0.5 * high - 0.5 * low)).any():
             self._warned = True
             warnings.warn(
                 f"{self._who}: gives actions far outside of the action space, such as"
@@ -235,7 +236,7 @@ class Controller:
                 f" rather than actions from {low.min():g} to {high.max():g}?",
                 stacklevel=2,
             )
-        return actions.clip(low, high)
+        return clipped
 
     def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
         """Return the controller's own answer, unchecked."""
