@@ -110,8 +110,9 @@ class BatchEnv:
     def true_state(self) -> QuadcopterState:
         """Return the true state of all rows, free of noise.
 
-        It is a live view: the next step changes it. Its wrench is a copy if there are gusts or
-        drag, which it includes.
+        It is a live view: the next step changes it. Only what a reference has besides its position
+        stays as it was at this call. Its wrench is a copy if there are gusts or drag, which it
+        includes.
         """
         return self.batch.true_state()
 

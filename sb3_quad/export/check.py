@@ -18,7 +18,7 @@ from sb3_quad.simulation.observation import (
     turn_features,
 )
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.simulation.state import X
+from sb3_quad.simulation.state import REFERENCE, X
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.simulation.tracks import ACCELERATION_STD
 from sb3_quad.vehicles.layout import find_turn
@@ -175,7 +175,9 @@ def compare(
             heading = np.arctan2(moving[7], moving[6])
             numbers = np.stack([*moving[:3], heading, moving[8]], axis=1)
             references = [numbers.astype(np.float32, order="C")]
-            shown.state[X.target_velocity :] = 0.0
+            resting = shown.state[REFERENCE].copy()
+            resting[3:] = 0.0
+            shown.set_reference(resting, shown.rows(None))
             features = shown.observe() * std + mean
         features[:, :OBSERVATION_SIZE] = features[:, :OBSERVATION_SIZE] @ turned
         results, file_state = call(features.astype(np.float32), file_state, *references)

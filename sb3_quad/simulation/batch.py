@@ -23,7 +23,14 @@ from sb3_quad.simulation.kernel import (
     rotor_wrenches,
     step,
 )
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.simulation.observation import (
+    DEFAULT_MEAN,
+    DEFAULT_STD,
+    MOVES,
+    OBSERVATION_SIZE,
+    RESTS,
+    TURNS,
+)
 from sb3_quad.simulation.random import new_streams
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.references import NO_TRACKS
@@ -43,7 +50,7 @@ from sb3_quad.simulation.state import (
 )
 from sb3_quad.simulation.tasks import resolve_tasks
 from sb3_quad.simulation.threads import share_out
-from sb3_quad.simulation.tracks import COURSE_SIZE, C
+from sb3_quad.simulation.tracks import COURSE_SIZE, C, complete
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -140,8 +147,10 @@ class QuadcopterBatch:
             NO_TRACKS if settings.reference is None else settings.reference.tracks(control_step)
         )
         self.previews = np.array(self.observation.preview or (), dtype=np.int64)
-        # A preview reads what the rows of the target say of its motion.
-        self.moves = settings.reference is not None or self.previews.size > 0
+        # A preview reads all that the rows of the target say of its motion.
+        self.moves = TURNS if tracks.has_heading or self.previews.size > 0 else RESTS
+        if settings.reference is not None:
+            self.moves = max(self.moves, MOVES)
         self.tracks = tracks.table
         self.track_numbers = tracks.numbers()
         self.course = np.zeros((COURSE_SIZE, n * (len(tracks.table) > 0)))
@@ -154,7 +163,9 @@ class QuadcopterBatch:
         # The episodes under way may be shorter, see stagger.
         self.limits = self.max_steps.copy()
 
-        self.state = np.zeros((STATE_SIZE, n))
+        self._state = np.zeros((STATE_SIZE, n))
+        # Whether a step has moved references since their velocities were last written
+        self._is_behind = False
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         self.returns = np.zeros(n)
@@ -271,6 +282,7 @@ class QuadcopterBatch:
         dones[begins] = True
         results = observations, rewards, dones
         arguments = self._arguments | changes
+        self._is_behind = len(self.tracks) > 0
         if not share_out(step, self.helpers, mode, array, *results, *arguments.values()):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(
@@ -368,6 +380,18 @@ class QuadcopterBatch:
             return self.wind
         return self.wind + self.wind_gust[GUST_VALUE]
 
+    @property
+    def state(self) -> FloatArray:
+        """The state of all rows, (STATE_SIZE, n); see :data:`.state.STATE`.
+
+        A step changes it in place, but for what references have besides their position: that is
+        of when the state was asked for.
+        """
+        if self._is_behind:
+            complete(self._state, self.streams, self.course, self.tracks, self.track_numbers)
+            self._is_behind = False
+        return self._state
+
     def snapshot(self) -> Arrays:
         """Return copies of everything that future flight depends on, by name."""
         return {name: getattr(self, name).copy() for name in _KEPT}
@@ -404,9 +428,12 @@ class QuadcopterBatch:
         self._notice_motion()
 
     def _notice_motion(self) -> None:
-        """Let steps read how targets move, once one does."""
-        if not self.moves and self.state[X.target_velocity :].any():
-            self.moves = True
+        """Let steps read how targets move and turn, once one does."""
+        moves = MOVES if self.state[X.target_velocity :].any() else RESTS
+        if self.state[X.target_heading : X.target_ahead].any():
+            moves = TURNS
+        if moves > self.moves:
+            self.moves = moves
             self._bind()
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:

@@ -25,6 +25,8 @@ from sb3_quad.simulation.observation import (
     GUST_WORDS,
     NORMALS,
     OBSERVATION_SIZE,
+    RESTS,
+    TURNS,
     WORDS,
     observe,
 )
@@ -207,8 +209,8 @@ def step(
     :param limits: int64 (n,), control steps of the episodes under way; ``max_steps`` (n,), of those
         that follow.
     :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
-    :param moves: whether targets move or have a heading; without it their rows of the state behind
-        the position are not read.
+    :param moves: ``RESTS``, ``MOVES`` or ``TURNS``, see :func:`.observation.features`; while they
+        rest, the rows of the state behind the target's position are not read.
     :param for_px4: whether observations are those of ``features: px4``.
     :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, as for ``tracks`` and
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
@@ -253,7 +255,7 @@ def step(
                 b, first, count, False, scaling, vehicles, task_index, task_parameters,
                 physics_step,
             )  # fmt: skip
-            if moves and tracks.shape[0] == 0:
+            if moves != RESTS and tracks.shape[0] == 0:
                 load_rows(state, first, count, b.state)
             else:
                 load_rows(state, first, count, b.resting)
@@ -269,7 +271,11 @@ def step(
                     for lane in range(count):
                         state[k, first + lane] = b.state[k, lane]
             if tracks.shape[0] > 0:
-                follow(b, first, count, state, streams, course, tracks, track_numbers)
+                turns = moves == TURNS
+                follow(b, 1, turns, state, streams, course, tracks, track_numbers)
+                for axis in range(3):
+                    for lane in range(count):
+                        state[X.target + axis, first + lane] = b.target[axis, lane]
             score(b)
             # The noise of the observation is that of the next step.
             for lane in range(count):
@@ -338,6 +344,8 @@ def step(
                 b.state[k, lane] = state[k, b.row[lane]]
             for k in range(4):
                 b.stream[k, lane] = streams[k, b.row[lane]]
+        if tracks.shape[0] > 0:
+            follow(b, 0, moves == TURNS, state, streams, course, tracks, track_numbers)
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
         observe(b, moves, for_px4)

@@ -55,6 +55,9 @@ OBSERVATION_SIZE = len(FEATURE_NAMES)
 DEFAULT_MEAN = np.zeros(OBSERVATION_SIZE)
 DEFAULT_STD = np.repeat([feature.std for feature in FEATURES], list(_SIZES.values()))
 
+# What a reference does: rest, move, or move and turn
+RESTS, MOVES, TURNS = range(3)
+
 # The noise takes a random word for each normal, and normals come in pairs. Two words for a gust
 # follow. Random words come in fours.
 NORMALS = 2 * math.ceil(OBSERVATION_SIZE / 2)
@@ -86,12 +89,15 @@ def features(b, moves, for_px4):
 
     They go to ``b.feature``, float32.
 
-    :param moves: whether references move or have a heading; else the target rests.
+    :param moves: ``RESTS``, ``MOVES`` or ``TURNS``: what references do; with the last they have a
+        heading.
     :param for_px4: whether the velocity has world axes, and nothing but the position is relative.
     """
     _features_at_rest(b, for_px4)
-    if moves and not for_px4:
+    if moves != RESTS and not for_px4:
         _relate(b)
+        if moves == TURNS:
+            _turn(b)
 
 
 @fast
@@ -122,14 +128,9 @@ def heading_of(b, lane):
 
 @fast
 def _relate(b):
-    """Make features relative to a reference that moves, in place: velocities are those relative to
-    it, and world axes are turned to its heading.
-    """
+    """Make the velocity relative to that of a reference, in place."""
     out = b.feature
     for lane in range(LANES):
-        c, s = heading_of(b, lane)
-        cosine, sine = float32(c), float32(s)
-        rate = float32(b.target_heading_rate[0, lane])
         ux = float32(b.target_velocity[0, lane])
         uy = float32(b.target_velocity[1, lane])
         uz = float32(b.target_velocity[2, lane])
@@ -138,6 +139,22 @@ def _relate(b):
             y = out[F.rotation + 3 * row + 1, lane]
             z = out[F.rotation + 3 * row + 2, lane]
             out[F.velocity + row, lane] -= ux * x + uy * y + uz * z
+
+
+@fast
+def _turn(b):
+    """Turn the world axes of features to the heading of a reference, in place; body rates become
+    relative to its rate.
+    """
+    out = b.feature
+    for lane in range(LANES):
+        c, s = heading_of(b, lane)
+        cosine, sine = float32(c), float32(s)
+        rate = float32(b.target_heading_rate[0, lane])
+        for row in range(3):
+            x = out[F.rotation + 3 * row, lane]
+            y = out[F.rotation + 3 * row + 1, lane]
+            z = out[F.rotation + 3 * row + 2, lane]
             out[F.body_rates + row, lane] -= rate * z
             out[F.rotation + 3 * row, lane] = cosine * x + sine * y
             out[F.rotation + 3 * row + 1, lane] = cosine * y - sine * x

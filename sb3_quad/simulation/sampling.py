@@ -76,7 +76,7 @@ def start_episode(
         s[X.target + axis] = s[X.position + axis] + offset[axis]
     s[X.target_velocity :] = 0.0
     if course.shape[1] > 0:
-        start_course(i, state, streams, course, tracks, track_numbers)
+        start_course(i, state, streams, course, track_numbers)
 
     s[X.quaternion : X.velocity] = 0.0
     s[X.quaternion] = 1.0

@@ -26,6 +26,7 @@ from sb3_quad.simulation.kernel import (
 )
 from sb3_quad.simulation.observation import (
     OBSERVATION_SIZE,
+    RESTS,
     F,
     clear_hidden,
     features,
@@ -240,7 +241,7 @@ def undo(
                 if for_px4:
                     clear_hidden(grad_feature)
                 undo_noise(b, grad_feature)
-                if moves and not for_px4:
+                if moves != RESTS and not for_px4:
                     undo_relation(b, grad_feature)
                 undo_features(b, grad_feature, own, for_px4)
 

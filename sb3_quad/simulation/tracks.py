@@ -4,6 +4,9 @@
 ``course`` (COURSE_SIZE, n) says where each row is: the target of its episode, from which the
 reference moves, and the first row of its piece in the table, below zero for a target that rests.
 ``numbers`` int64 (3,) are :meth:`.references.Tracks.numbers`.
+
+A step writes the positions of references to the state. :func:`complete` writes what else they have
+when somebody reads it, since that would take a third of what references cost.
 """
 
 import numpy as np
@@ -24,8 +27,9 @@ from sb3_quad.simulation.state import (
 COURSE = {"anchor": 3, "begin": 1}
 COURSE_SIZE = sum(COURSE.values())
 C = first_rows(COURSE)
-# The first column of the acceleration in a table
+# The first columns of two parts in a table
 ACCELERATION = first_rows(REFERENCE_PARTS).target_acceleration
+AHEAD = first_rows(REFERENCE_PARTS).target_ahead
 # σ of a previewed acceleration, m/s²
 ACCELERATION_STD = 5.0
 
@@ -45,14 +49,11 @@ def _first_row(i, streams, numbers):
 
 
 @compiled
-def start_course(i, state, streams, course, table, numbers):
-    """Let row i's reference begin at its target, in place, by a piece from its own stream."""
-    begin = _first_row(i, streams, numbers)
+def start_course(i, state, streams, course, numbers):
+    """Let row i's reference begin at its target, by a piece from its own stream."""
     for axis in range(3):
         course[C.anchor + axis, i] = state[X.target + axis, i]
-    course[C.begin, i] = begin
-    for k in range(3, REFERENCE_SIZE):
-        state[X.target + k, i] = table[begin, k]
+    course[C.begin, i] = _first_row(i, streams, numbers)
 
 
 @compiled
@@ -63,8 +64,11 @@ def deepest(i, streams, table, numbers):
 
 
 @compiled
-def follow(b, first, count, state, streams, course, table, numbers):
-    """Move the targets of a block to where their references are after this control step."""
+def follow(b, ahead, turns, state, streams, course, table, numbers):
+    """Load the targets of a block's rows as they are ``ahead`` control steps from now.
+
+    :param turns: whether some heading is commanded; without it, none is loaded.
+    """
     for lane in range(LANES):
         i = b.row[lane]
         begin = course[C.begin, i]
@@ -73,15 +77,26 @@ def follow(b, first, count, state, streams, course, table, numbers):
                 b.state[k, lane] = state[k, i]
             continue
         # Without a sign, numba does not look whether an index counts from the end.
-        row = np.uint64(_row_at(begin, np.int64(streams[STEP, i]) + 1, numbers))
-        for k in range(REFERENCE_SIZE):
+        row = np.uint64(_row_at(begin, np.int64(streams[STEP, i]) + ahead, numbers))
+        # Loops of a fixed length: a variable one would take five times as long.
+        for k in range(ACCELERATION):
             b.state[X.target + k, lane] = table[row, np.uint64(k)]
+        if turns:
+            for k in range(ACCELERATION, AHEAD):
+                b.state[X.target + k, lane] = table[row, np.uint64(k)]
         for axis in range(3):
             b.state[X.target + axis, lane] += course[C.anchor + axis, i]
-    # Quantity by quantity: neighbours in memory are written together.
-    for k in range(X.target, STATE_SIZE):
-        for lane in range(count):
-            state[k, first + lane] = b.state[k, lane]
+
+
+@compiled
+def complete(state, streams, course, table, numbers):
+    """Write to the state how the references move now, and their headings, in place."""
+    for i in range(state.shape[1]):
+        begin = course[C.begin, i]
+        if begin >= 0.0:
+            row = _row_at(begin, np.int64(streams[STEP, i]), numbers)
+            for k in range(3, REFERENCE_SIZE):
+                state[X.target + k, i] = table[row, k]
 
 
 @compiled

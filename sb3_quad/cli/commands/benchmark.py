@@ -164,6 +164,7 @@ def _environments(stack: ExitStack, sizes: list[int], n_envs: int) -> list[Subje
     robust = load_config("dagger", TRAINED, "robust/dagger.yml").env_kwargs["randomize"]
     for size in sizes:
         add_vectorised("batch", "batch", size)
+        add_vectorised("batch, figure eight", "batch", size, reference="figure_eight")
         add_vectorised("batch, domain randomization", "batch", size, randomize=robust)
     return subjects
 
