@@ -1,7 +1,9 @@
 """Multilayer perceptrons, forward and backward, compiled.
 
-Blocks of rows go through all layers while they are in the cache. A block holds ``ROWS`` rows of the
-mini-batch side by side, (width, ROWS), so that every loop over rows is a vector loop. Widths are
+Blocks of rows go through all layers while they are in the cache. A block holds ``size`` rows of the
+mini-batch side by side, (width, size), so that every loop over rows is a vector loop. The size is
+``ROWS``, or ``FEW`` for so few rows that half of a block would be empty. Loops are compiled for
+both: with a size that is not known in advance they take up to a fifth longer. Widths are
 padded to multiples of 4 with zeros. A layer's parameters lie in a row: weights (outputs, inputs),
 then biases. A chunk is a number of blocks; whichever thread computes it, its sums are the same.
 """
@@ -17,6 +19,7 @@ from sb3_quad.simulation.compiled import compiled
 
 # Rows of a block: long loops, and yet a layer of 64 and its gradients fit into half a megabyte
 ROWS = 256
+FEW = 128
 LINEAR, TANH, RELU = range(3)
 _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
 # Inputs at once: their rows stay in the first cache
@@ -43,8 +46,8 @@ class Layers(NamedTuple):
 
 
 @compiled(fastmath=_FAST)
-def _multiply(w, x, h):
-    """h = w x; w (rows, columns), x (columns, ROWS), h (rows, ROWS)."""
+def _multiply(w, x, h, size):
+    """h = w x; w (rows, columns), x (columns, size), h (rows, size)."""
     # Unsigned: Python's indices from the end would cost a third.
     rows = uint64(w.shape[0])
     columns = uint64(w.shape[1])
@@ -59,27 +62,27 @@ def _multiply(w, x, h):
                     w[j + _1, k + _3],
                 )
                 if k == _0:
-                    for i in range(ROWS):
+                    for i in range(size):
                         x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
                         h[j, i] = a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
                         h[j + _1, i] = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
                 else:
-                    for i in range(ROWS):
+                    for i in range(size):
                         x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
                         h[j, i] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
                         h[j + _1, i] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
 
 
 @compiled(fastmath=_FAST)
-def _add_products(g, x, dw):
-    """dw += g xᵀ; g (rows, ROWS), x (columns, ROWS), dw (rows, columns)."""
+def _add_products(g, x, dw, size):
+    """dw += g xᵀ; g (rows, size), x (columns, size), dw (rows, columns)."""
     rows = uint64(dw.shape[0])
     columns = uint64(dw.shape[1])
     for tile in range(_0, columns, _TILE):
         for j in range(_0, rows, _2):
             for k in range(tile, min(columns, tile + _TILE), _4):
                 a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = float32(0.0)
-                for i in range(ROWS):
+                for i in range(size):
                     x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
                     g0 = g[j, i]
                     g1 = g[j + _1, i]
@@ -99,15 +102,15 @@ def _add_products(g, x, dw):
 
 
 @compiled(fastmath=_FAST)
-def _activate(h, bias, kind):
-    """h = f(h + bias), (rows, ROWS).
+def _activate(h, bias, kind, size):
+    """h = f(h + bias), (rows, size).
 
     tanh is the quotient of polynomials that Eigen uses, exact to 4e-7.
     """
     for j in range(h.shape[0]):
         b = bias[j]
         if kind == TANH:
-            for i in range(ROWS):
+            for i in range(size):
                 x = h[j, i] + b
                 u = min(max(x, -_END), _END)
                 s = u * u
@@ -123,23 +126,23 @@ def _activate(h, bias, kind):
                 # The last term lets NaN and infinity come out as NaN.
                 h[j, i] = u * p / q + float32(0.0) * x
         elif kind == RELU:
-            for i in range(ROWS):
+            for i in range(size):
                 x = h[j, i] + b
                 h[j, i] = x if not x < float32(0.0) else float32(0.0)
         else:
-            for i in range(ROWS):
+            for i in range(size):
                 h[j, i] += b
 
 
 @compiled(fastmath=_FAST)
-def _undo_activation(g, h, kind, db):
-    """g = g f'(x) with h = f(x), both (rows, ROWS).
+def _undo_activation(g, h, kind, db, size):
+    """g = g f'(x) with h = f(x), both (rows, size).
 
     db (rows,) += the sums of g over the rows of the mini-batch.
     """
     for j in range(g.shape[0]):
         total = float32(0.0)
-        for i in range(ROWS):
+        for i in range(size):
             if kind == TANH:
                 g[j, i] *= float32(1.0) - h[j, i] * h[j, i]
             elif kind == RELU:
@@ -158,14 +161,14 @@ def _touch(rows, index, first, count):
 
 
 @compiled
-def _load(rows, index, first, count, h):
+def _load(rows, index, first, count, h, size):
     """Gather ``count`` rows of (m, size), from ``first`` on in ``index``, into a block.
 
-    The block is (width, ROWS), with zeros around the rows.
+    The block is (width, size), with zeros around the rows.
     """
     h[0, 0] = _touch(rows, index, first, count)
     for k in range(h.shape[0]):
-        for i in range(count if k < rows.shape[1] else 0, ROWS):
+        for i in range(count if k < rows.shape[1] else 0, size):
             h[k, i] = 0.0
     for i in range(count):
         row = rows[index[first + i]]
@@ -174,36 +177,36 @@ def _load(rows, index, first, count, h):
 
 
 @compiled
-def _layer(scratch, at, width):
-    """Return the ``width`` units of a layer at a place in the scratch memory, (width, ROWS)."""
-    return scratch[at : at + width * ROWS].reshape(width, ROWS)
+def _layer(scratch, at, width, size):
+    """Return the ``width`` units of a layer at a place in the scratch memory, (width, size)."""
+    return scratch[at : at + width * size].reshape(width, size)
 
 
 @compiled
-def _forward(scratch, x, index, first, count, layers):
+def _forward(scratch, x, index, first, count, layers, size):
     """Compute all layers of a block, which lie behind one another, the inputs first.
 
     :return: where the outputs begin.
     """
     widths, kinds, parameters, _ = layers
-    _load(x, index, first, count, _layer(scratch, 0, widths[0]))
+    _load(x, index, first, count, _layer(scratch, 0, widths[0], size), size)
     at = 0
     place = 0
     for layer in range(1, len(widths)):
         rows = widths[layer]
         columns = widths[layer - 1]
-        before = _layer(scratch, at, columns)
-        at += columns * ROWS
+        before = _layer(scratch, at, columns, size)
+        at += columns * size
         middle = place + rows * columns
-        h = _layer(scratch, at, rows)
-        _multiply(parameters[place:middle].reshape(rows, columns), before, h)
-        _activate(h, parameters[middle : middle + rows], kinds[layer - 1])
+        h = _layer(scratch, at, rows, size)
+        _multiply(parameters[place:middle].reshape(rows, columns), before, h, size)
+        _activate(h, parameters[middle : middle + rows], kinds[layer - 1], size)
         place = middle + rows
     return at
 
 
 @compiled
-def _backward(activations, scratch, layers, sums, last_layer):
+def _backward(activations, scratch, layers, sums, last_layer, size):
     """Add the gradient of a block with respect to the parameters to ``sums``.
 
     The block's layers lie in ``activations``. The gradient with respect to the outputs lies in
@@ -213,25 +216,31 @@ def _backward(activations, scratch, layers, sums, last_layer):
     :return: where the gradient of that layer begins.
     """
     widths, kinds, _, transposed = layers
-    here = widths.sum() * ROWS
-    there = here + widths.max() * ROWS
-    at = here - widths[-1] * ROWS
+    here = widths.sum() * size
+    there = here + widths.max() * size
+    at = here - widths[-1] * size
     place = len(sums)
     for layer in range(len(widths) - 1, 0, -1):
         rows = widths[layer]
         columns = widths[layer - 1]
-        g = _layer(scratch, here, rows)
-        h = _layer(activations, at, rows)
-        at -= columns * ROWS
+        g = _layer(scratch, here, rows, size)
+        h = _layer(activations, at, rows, size)
+        at -= columns * size
         place -= rows * (columns + 1)
         middle = place + rows * columns
-        _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows])
+        _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows], size)
         _add_products(
-            g, _layer(activations, at, columns), sums[place:middle].reshape(rows, columns)
+            g,
+            _layer(activations, at, columns, size),
+            sums[place:middle].reshape(rows, columns),
+            size,
         )
         if layer > last_layer:
             _multiply(
-                transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns)
+                transposed[place:middle].reshape(columns, rows),
+                g,
+                _layer(scratch, there, columns, size),
+                size,
             )
             here, there = there, here
     return here
@@ -249,14 +258,28 @@ def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, act
     :param activations: (blocks, ``ROWS`` numbers for each unit), is written for :func:`pullback`;
         or (0, any).
     """
+    if len(index) <= FEW:
+        _forward_blocks(
+            first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations, FEW
+        )
+    else:
+        _forward_blocks(
+            first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations, ROWS
+        )
+
+
+@compiled
+def _forward_blocks(
+    first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations, size
+):
     n = len(index)
-    blocks = (n + ROWS - 1) // ROWS
+    blocks = (n + size - 1) // size
     for block in range(first_chunk * blocks // chunks, last_chunk * blocks // chunks):
-        first = block * ROWS
-        count = min(ROWS, n - first)
+        first = block * size
+        count = min(size, n - first)
         own = activations[block] if len(activations) else scratch
-        at = _forward(own, x, index, first, count, layers)
-        h = _layer(own, at, layers.widths[-1])
+        at = _forward(own, x, index, first, count, layers, size)
+        h = _layer(own, at, layers.widths[-1], size)
         for i in range(count):
             for j in range(out.shape[1]):
                 out[first + i, j] = h[j, i]
@@ -277,30 +300,31 @@ def gradient(
     :param sums: float32 (chunks, parameters + a), the gradient of each chunk.
     :param terms: float64 (chunks, TERMS), likewise, the loss's terms.
     """
+    size = ROWS
     n = len(index)
-    size = len(layers.parameters)
+    n_parameters = len(layers.parameters)
     outputs = layers.widths[-1]
-    blocks = (n + ROWS - 1) // ROWS
-    behind = layers.widths.sum() * ROWS
+    blocks = (n + size - 1) // size
+    behind = layers.widths.sum() * size
     for chunk in range(first_chunk, last_chunk):
         sums[chunk, :] = 0.0
         terms[chunk, :] = 0.0
         for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
-            first = block * ROWS
-            count = min(ROWS, n - first)
-            at = _forward(scratch, x, index, first, count, layers)
-            y = _layer(scratch, at, outputs)
-            g = _layer(scratch, behind, outputs)
+            first = block * size
+            count = min(size, n - first)
+            at = _forward(scratch, x, index, first, count, layers, size)
+            y = _layer(scratch, at, outputs, size)
+            g = _layer(scratch, behind, outputs, size)
             g[:, :] = 0.0
             g[0, 0] = 0.0 * _touch(targets, index, first, count)
-            g_log_std = sums[chunk, size:]
+            g_log_std = sums[chunk, n_parameters:]
             if len(log_std) > 0:
                 actor_loss(
                     y, index, first, count, targets, loss, log_std, g, g_log_std, terms[chunk]
                 )
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
-            _backward(scratch, scratch, layers, sums[chunk, :size], 1)
+            _backward(scratch, scratch, layers, sums[chunk, :n_parameters], 1, size)
 
 
 @compiled
@@ -318,16 +342,60 @@ def pullback(
     :param grad_inputs: float32 (m, inputs), is written.
     :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
     """
-    blocks = (len(index) + ROWS - 1) // ROWS
-    behind = layers.widths.sum() * ROWS
+    if len(index) <= FEW:
+        _pullback_blocks(
+            first_chunk,
+            last_chunk,
+            chunks,
+            scratch,
+            layers,
+            activations,
+            index,
+            grad_outputs,
+            grad_inputs,
+            sums,
+            FEW,
+        )
+    else:
+        _pullback_blocks(
+            first_chunk,
+            last_chunk,
+            chunks,
+            scratch,
+            layers,
+            activations,
+            index,
+            grad_outputs,
+            grad_inputs,
+            sums,
+            ROWS,
+        )
+
+
+@compiled
+def _pullback_blocks(
+    first_chunk,
+    last_chunk,
+    chunks,
+    scratch,
+    layers,
+    activations,
+    index,
+    grad_outputs,
+    grad_inputs,
+    sums,
+    size,
+):
+    blocks = (len(index) + size - 1) // size
+    behind = layers.widths.sum() * size
     for chunk in range(first_chunk, last_chunk):
         for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
-            first = block * ROWS
-            count = min(ROWS, len(index) - first)
-            g = _layer(scratch, behind, layers.widths[-1])
-            _load(grad_outputs, index, first, count, g)
-            here = _backward(activations[block], scratch, layers, sums[chunk], 0)
-            g = _layer(scratch, here, layers.widths[0])
+            first = block * size
+            count = min(size, len(index) - first)
+            g = _layer(scratch, behind, layers.widths[-1], size)
+            _load(grad_outputs, index, first, count, g, size)
+            here = _backward(activations[block], scratch, layers, sums[chunk], 0, size)
+            g = _layer(scratch, here, layers.widths[0], size)
             for i in range(count):
                 for k in range(grad_inputs.shape[1]):
                     grad_inputs[index[first + i], k] = g[k, i]
