@@ -271,6 +271,7 @@ def test_apg_adds_the_cost_of_low_forces_where_it_is_asked_to(tmp_path):
     assert APG.load(tmp_path / "agent", env).low_force_coef == 5.0
 
 
-def test_apg_refuses_the_cost_for_other_environments():
-    with pytest.raises(ConfigError, match="Carts: low_force_coef is a cost of quadcopters"):
-        APG("MlpPolicy", Carts(2, 0), n_steps=5, low_force_coef=1.0).learn(10)
+@pytest.mark.parametrize("coef", ["body_rates_coef", "low_force_coef"])
+def test_apg_refuses_the_costs_of_quadcopters_for_other_environments(coef):
+    with pytest.raises(ConfigError, match="Carts: body_rates_coef and low_force_coef are costs"):
+        APG("MlpPolicy", Carts(2, 0), n_steps=5, **{coef: 1.0}).learn(10)

@@ -21,6 +21,7 @@ from typing_extensions import Self
 from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
 from sb3_quad.algorithms.flight_cost import (
     FlownStates,
+    body_rates_cost,
     cost_and_gradients,
     flight_cost,
     low_force_cost,
@@ -107,6 +108,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     :param cost: The cost of each control step, (steps, n), as a function of
         :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved:
         give it to ``load``, too.
+    :param body_rates_coef: Weight of
+        :func:`~sb3_quad.algorithms.flight_cost.body_rates_cost`, which is added to the cost: for
+        agents that swing at the target where motors are slow or delays are long.
     :param low_force_coef: Weight of
         :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which is added to the cost: for
         vehicles whose firmware takes a thrust that stays low for a crash.
@@ -137,6 +141,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         max_row_ratio: float | None = None,
         carry_on: bool = False,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
+        body_rates_coef: float = 0.0,
         low_force_coef: float = 0.0,
         substeps: int | None = 2,
         _init_setup_model: bool = True,
@@ -167,6 +172,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.carry_on = carry_on
         self.cost = cost
         self.own_cost = False
+        self.body_rates_coef = body_rates_coef
         self.low_force_coef = low_force_coef
         self.substeps = substeps
 
@@ -216,9 +222,11 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             )
         self.own_cost = self.cost is not flight_cost
         self._tape = env.record(self.n_steps, self.substeps)
-        if self.low_force_coef and not hasattr(self._tape, "control_step"):
+        is_quadcopter = hasattr(self._tape, "control_step")
+        if (self.body_rates_coef or self.low_force_coef) and not is_quadcopter:
             raise ConfigError(
-                f"{type(env).__name__}: low_force_coef is a cost of quadcopters; remove it"
+                f"{type(env).__name__}: body_rates_coef and low_force_coef are costs of"
+                " quadcopters; remove them"
             )
         self._recorded_policy = RecordedPolicy(self.policy, self.n_steps, self.n_envs)
         return super().learn(
@@ -287,6 +295,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
     def _whole_cost(self, flown: FlownStates) -> th.Tensor:
         cost = self.cost(flown)
+        if self.body_rates_coef:
+            cost = cost + self.body_rates_coef * body_rates_cost(flown)
         if self.low_force_coef:
             tape: Any = self._tape
             cost = cost + self.low_force_coef * low_force_cost(flown, tape.control_step)

@@ -61,6 +61,7 @@ LIMITS = {
     "beta_decay": _WEIGHT,
     "substeps": _COUNT,
     "max_row_ratio": (1, 2**40),
+    "body_rates_coef": _WEIGHT,
     "low_force_coef": _WEIGHT,
 }
 """Valid range of each argument of the algorithms; the greatest holds for settings files alone."""

@@ -120,6 +120,11 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     return cost + 0.5 * (SAFE_HEIGHT - flown.position[..., 2]).clamp(min=0.0)
 
 
+def body_rates_cost(flown: FlownStates) -> th.Tensor:
+    """Return a further cost of body rates at the target, (steps, n): |ω| / (1 + (d / 0.5)²)."""
+    return length(flown.body_rates) / (1.0 + (flown.distance / COARSE) ** 2)
+
+
 def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
     """Return the cost of a specific force along body z that stays low, (steps, n).
 
