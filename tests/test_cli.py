@@ -449,17 +449,17 @@ def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo)
     [("crazyflie-recovery", True), ("itm-recovery", False), ("any-quadcopter", False)],
 )
 def test_an_agent_that_goes_on_with_another_vehicle_is_said(agent, other, capsys):
-    as_agent(agent_path(agent), build_config("dagger", ENV, {"n_timesteps": 1}), {})
+    as_agent(agent_path(agent), "dagger", ENV, {})
     assert (
         "was trained on the vehicle crazyflie and flies itm" in capsys.readouterr().err
     ) == other
 
 
-def test_an_agent_that_goes_on_with_a_vehicle_of_another_layout_knows_its_rotors():
-    path = agent_path("any-quadcopter")
+@pytest.mark.parametrize("agent", ["any-quadcopter", "itm-recovery"])
+def test_an_agent_that_goes_on_with_a_vehicle_of_another_layout_knows_its_rotors(agent):
     changes = {"env_kwargs": {"vehicle": "crazyflie"}}
+    changes = as_agent(agent_path(agent), "apg", ENV, changes)
     config = load_config("apg", ENV, overrides=changes)
-    config = load_config("apg", ENV, overrides=as_agent(path, config, changes))
     assert config.flight_settings.rotor_layout.name == "itm"
     # The expert of the closing table flies it in this layout, too.
     config.make_expert()

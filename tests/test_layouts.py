@@ -4,6 +4,7 @@ agents and exported files.
 
 import itertools
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -278,3 +279,45 @@ def test_a_vehicle_whose_rotors_lie_elsewhere_is_refused_in_one_line(tmp_path, m
         error = capsys.readouterr().err
         assert "maps the rotors of long" in error and error.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["long.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"vehicle": "crazyflie"}, "rotor_layout itm, here crazyflie"),
+        ({"observation_std": [50.0] * 18}, "observation_std"),
+        ({"features": "px4"}, "features body, here px4"),
+        ({"vehicle": "crazyflie", "rotor_layout": "itm"}, None),
+        ({}, None),
+    ],
+)
+@pytest.mark.parametrize("use", ["initial_policy", "expert"])
+def test_agents_that_would_read_other_numbers_are_warned_of(use, how, words, capsys):
+    env = sb3_quad.QuadcopterVecEnv(2, "state_recovery", seed=0, **how)
+    if use == "expert":
+        sb3_quad.DAgger(
+            "MlpPolicy", env, expert=sb3_quad.load_pretrained("itm-recovery"), n_steps=1
+        ).learn(2)
+    else:
+        sb3_quad.APG("MlpPolicy", env, initial_policy="itm-recovery")
+    warning = capsys.readouterr().err
+    if words is None:
+        assert "another observation" not in warning
+    else:
+        assert f"was trained with another observation ({words})" in warning
+
+
+@pytest.mark.parametrize(
+    ("expert", "is_unlike"), [("geometric", True), ("privileged_geometric", False)]
+)
+def test_an_expert_of_the_first_vehicle_is_warned_of_where_rows_have_others(expert, is_unlike):
+    vehicles = ["itm", "crazyflie"]
+    env = sb3_quad.QuadcopterVecEnv(2, "state_recovery", vehicle=vehicles, seed=0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sb3_quad.DAgger("MlpPolicy", env, expert=expert, n_steps=1).learn(2)
+        fly(expert, n_flights=2, max_steps=1, vehicle=vehicles)
+    said = [
+        "is made for the vehicle itm and flies crazyflie" in str(each.message) for each in caught
+    ]
+    assert sum(said) == 2 * is_unlike

@@ -306,6 +306,21 @@ def test_a_misspelt_name_is_guessed():
         sb3_quad.env_kwargs("itm-robus")
 
 
+def test_the_keywords_of_an_agent_that_does_not_say_how_it_flies_are_refused(tmp_path):
+    PPO("MlpPolicy", sb3_quad.QuadcopterVecEnv(1)).save(tmp_path / "silent.zip")
+    with pytest.raises(ConfigError, match=r"silent\.zip: does not say how its agent flies"):
+        sb3_quad.env_kwargs(tmp_path / "silent.zip")
+
+
+def test_an_agent_of_rows_that_differ_flies_anywhere():
+    sigma = [[1.0] * 18, [2.0] * 18]
+    vehicles = ["itm", "crazyflie"]
+    env = sb3_quad.QuadcopterVecEnv(2, vehicle=vehicles, noise=[0.0, 0.1], observation_std=sigma)
+    own = sb3_quad.env_kwargs(sb3_quad.APG("MlpPolicy", env))
+    assert (own["vehicle"].name, own["noise"], own["observation_std"]) == ("itm", 0.05, sigma[0])
+    sb3_quad.QuadcopterVecEnv(3, **own)
+
+
 def test_fly_warns_of_a_vehicle_that_an_agent_was_not_trained_on(recwarn):
     model = sb3_quad.load_pretrained("crazyflie-recovery")
     fly(model, n_flights=1, max_steps=1, **sb3_quad.env_kwargs(model))

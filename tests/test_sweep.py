@@ -105,6 +105,14 @@ def test_the_runs_are_the_product_of_grid_and_seeds(noise, rate, seeds):
     assert all(re.fullmatch(r"[\w.=,+-]+/seed_\d+", run.name) for run in runs)
 
 
+def test_runs_from_an_agent_have_its_observation_and_networks():
+    keys = {"algo": "apg", "trained_agent": "itm-robust", "n_timesteps": 100}
+    (run,) = make_runs(validate(SweepSpec, keys, "sweep"))
+    settings = run.stages[0].settings
+    assert settings["env_kwargs"]["history"] == [0, 1, 2, 4, 8, 16, 32, 96]
+    assert settings["policy_kwargs"]["net_arch"]["pi"] == [192, 128, 128, 64]
+
+
 def test_entries_of_a_list_have_their_names_and_inherit():
     own = [
         {"name": "calm", "env_kwargs": {"noise": 0}},

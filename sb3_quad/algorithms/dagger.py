@@ -208,6 +208,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if _init_setup_model:
             self._set_up(initial)
             if demonstrations is not None:
+                normalize = self._vec_normalize_env
+                if normalize is not None and normalize.norm_obs:
+                    raise ConfigError(
+                        "demonstrations: their observations are raw, those of VecNormalize are not;"
+                        " remove it, or give norm_obs=False"
+                    )
                 self.dataset.load(demonstrations)
 
     def _setup_model(self) -> None:

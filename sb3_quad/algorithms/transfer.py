@@ -12,12 +12,11 @@ from stable_baselines3.common.utils import update_learning_rate
 from sb3_quad.algorithms.buffers import AggregatedDataset
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
-from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
+from sb3_quad.controllers.agent_settings import warn_of_observation
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.statistics import share_statistics, statistics_of
 from sb3_quad.controllers.zips import load_model
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.simulation.settings import KEY
 
 
@@ -45,7 +44,7 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
     else:
         name = str(source)
         teacher = load_model(source)
-    _warn_of_other_observation(name, getattr(teacher, KEY, {}), getattr(model, KEY, {}))
+    warn_of_observation(name, teacher, getattr(model, KEY, None))
     theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()
     if isinstance(model, OffPolicyAlgorithm) and theirs.keys() != ours.keys():
@@ -73,55 +72,6 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
             f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
             " train takes them from it unless --conf-file is given"
         ) from None
-
-
-# What a setting of the observation stands for where it is not given
-NOT_GIVEN: StrDict = {
-    "features": "body",
-    "last_action": False,
-    "history": [0],
-    "preview": [],
-    "position_integral": {},
-    "observation_mean": DEFAULT_MEAN.tolist(),
-    "observation_std": DEFAULT_STD.tolist(),
-}
-# An agent may do without these first and get them later: new weights begin at zero, and the
-# integral changes nothing until there is a steady error.
-MAY_BE_ADDED = ("preview", "position_integral")
-
-
-def _warn_of_other_observation(name: str, theirs: StrMapping, ours: StrMapping) -> None:
-    """Warn if an agent observed something else where it was trained, in a vector that may have the
-    same size.
-
-    :param name: what the warning calls the agent.
-    :param theirs: the flight settings that it holds, in JSON; empty if it holds none.
-    :param ours: those of the new model.
-    """
-    if not theirs or not ours:
-        return
-    differences = []
-    for key, default in NOT_GIVEN.items():
-        before = theirs.get(key) or default
-        now = ours.get(key) or default
-        # Training does without the integral that evaluations fly with.
-        if key == "position_integral" and not now:
-            continue
-        if before == now or (key in MAY_BE_ADDED and not before):
-            continue
-        # A scaling for each row is one of several vehicles, of which any may be the agent's.
-        if key.startswith("observation_") and any(np.ndim(value) > 1 for value in (before, now)):
-            continue
-        # Of 18 numbers or more the name is enough.
-        difference = key
-        if not key.startswith("observation_"):
-            difference += f" {before}, here {now}"
-        differences.append(difference)
-    if differences:
-        print_once(
-            f"warning: {name}: was trained with another observation ({'; '.join(differences)});"
-            " sb3_quad.env_kwargs(agent) gives its own"
-        )
 
 
 def _add_preview(theirs: StrDict, ours: StrDict, settings: StrMapping) -> None:

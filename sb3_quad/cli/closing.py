@@ -72,6 +72,22 @@ def close_run(result: TrainingResult) -> int:
     return 0
 
 
+def print_stages(job: TrainingJob, agents: dict[str, str]) -> None:
+    """Print tables of the stages' agents, each as it was trained, and of the expert of ``job``; or
+    why there are none.
+    """
+    try:
+        tables = compare(
+            {"expert": job.for_evaluation().make_expert(), **agents},
+            n_flights=PIPELINE_EPISODES,
+            seed=seed_for("table", job.seed),
+            thesis_columns=("expert", "IL-agent", "RL-agent"),
+        )
+        console().print(tables)
+    except SB3QuadError as error:
+        print(f"no tables: {error}")
+
+
 def close_pipeline(result: PipelineResult, seconds: float) -> int:
     """Print tables of all stages' agents and where everything is. Returns the exit code.
 
@@ -79,20 +95,14 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     """
     if result.exit_code != 0:
         return result.exit_code
-    controllers = {"expert": result.job.for_evaluation().make_expert()}
-    for name, stage in result.stages.items():
-        controllers[name] = stage.agent
-    try:
-        tables = compare(
-            controllers,
-            n_flights=PIPELINE_EPISODES,
-            seed=seed_for("table", result.job.seed),
-            thesis_columns=("expert", "IL-agent", "RL-agent"),
-            **result.job.flight_settings.in_any_task(),
-        )
-        console().print(tables)
-    except SB3QuadError as error:
-        print(f"no tables: {error}")
+    # Training writes this into all agents that fly without wrappers.
+    agents = {
+        name: stage.agent for name, stage in result.stages.items() if KEY in saved_data(stage.agent)
+    }
+    if agents:
+        print_stages(result.job, agents)
+    else:
+        print("no tables: their flights have wrappers; the evaluations above have them")
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print(f"saved in {result.folder}, {seconds:.0f} s in all")

@@ -3,19 +3,23 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping
+from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import refuse_settings, saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
+from sb3_quad.vehicles.layout import Turn, find_turn
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle
 
 
@@ -62,6 +66,60 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
 def name_beside(known: Vehicle, flown: Vehicle) -> str:
     """Return the name of a vehicle that a controller flies and does not know."""
     return flown.name + " of other parameters" * (known.name == flown.name)
+
+
+def warn_of_observation(name: str, agent: Any, here: Any) -> None:
+    """Warn if an agent observed something else where it was trained, in a vector of the same size,
+    or had its rotors in another order.
+
+    :param name: what the warning calls the agent.
+    :param agent: a model. One that does not say how it flies gives no warning.
+    :param here: the flight settings where it is to fly, as a record or as they are; None: unknown.
+    :raises ConfigError: settings that do not fit, or rotors that are elsewhere.
+    """
+    record = getattr(agent, KEY, None)
+    if not record or not here:
+        return
+    own = settings_of_record(record, f"{name}: {KEY}")
+    if not isinstance(here, FlightSettings):
+        here = settings_of_record(here, KEY)
+    differences = []
+    theirs, ours = _observed(own), _observed(here)
+    for key, before in theirs.items():
+        now = ours[key]
+        # Training does without the integral that evaluations fly with. An agent may do without it
+        # and the preview first, and get them later: new weights begin at zero, and the integral
+        # changes nothing until there is a steady error.
+        is_optional = (key == "position_integral" and not now) or (
+            key in ("preview", "position_integral") and not before
+        )
+        if before == now or is_optional:
+            continue
+        if not key.startswith("observation_"):
+            differences.append(f"{key} {before}, here {now}")
+        # A scaling for each row is one of several vehicles, of which any may be the agent's. Of 18
+        # numbers the name is enough.
+        elif np.ndim(before) == np.ndim(now) == 1:
+            differences.append(key)
+    if find_turn(here.layout, own.layout) != Turn():
+        differences.append(f"rotor_layout {own.layout.name}, here {here.layout.name}")
+    if differences:
+        print_once(
+            f"warning: {name}: was trained with another observation ({'; '.join(differences)});"
+            " sb3_quad.env_kwargs(agent) gives its own"
+        )
+
+
+def _observed(settings: FlightSettings) -> StrDict:
+    """Return what is observed, with the values that a setting stands for where it is not given."""
+    observed = settings.observed
+    observed |= {
+        "history": [*settings.ages],
+        "observation_mean": settings.observation_mean or DEFAULT_MEAN.tolist(),
+        "observation_std": settings.observation_std or DEFAULT_STD.tolist(),
+    }
+    del observed["rotor_layout"]
+    return observed
 
 
 def settings_of_record(record: Any, where: str) -> FlightSettings:
@@ -133,10 +191,15 @@ def env_kwargs(agent: StrPath | BaseAlgorithm) -> StrDict:
     >>> env = gymnasium.make("QuadTargetTracking-v0", **sb3_quad.env_kwargs("itm-robust"))
 
     :param agent: a zip, a run folder, the name of a policy that comes with the package, or a model.
-    :raises ConfigError: a zip or settings that cannot be read; a model that holds none.
+    :raises ConfigError: a zip or settings that cannot be read; an agent that holds none.
     """
     if isinstance(agent, BaseAlgorithm):
         settings = settings_of_record(getattr(agent, KEY, None), f"{type(agent).__name__}.{KEY}")
     else:
-        settings, _ = agent_settings(agent_path(str(agent)))
+        settings, source = agent_settings(agent_path(str(agent)))
+        if source is None:
+            raise ConfigError(
+                f"{agent}: does not say how its agent flies; give the keywords that it was trained"
+                " with"
+            )
     return settings.in_any_task()

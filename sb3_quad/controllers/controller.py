@@ -1,7 +1,7 @@
 """One way to ask a controller for actions, whatever it is: an expert, an SB3 model, a function."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array
-from sb3_quad.controllers.agent_settings import name_beside
+from sb3_quad.controllers.agent_settings import name_beside, warn_of_observation
 from sb3_quad.controllers.expert_like import ExpertLike
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.statistics import statistics_of
@@ -152,10 +152,11 @@ class Controller:
         # A recurrent expert keeps its state as long as it labels the same environment.
         if present and present.made_for[0] is expert and present.made_for[1] is env:
             return present
-        vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
-        source = resolve_expert(expert, vehicle)
-        if isinstance(vehicle, Vehicle):
-            warn_of_vehicle(source, vehicle)
+        vehicles = env.get_attr("vehicle") if env.has_attr("vehicle") else ["itm"]
+        source = resolve_expert(expert, vehicles[0])
+        warn_of_vehicle(source, vehicles)
+        if env.has_attr(KEY):
+            warn_of_observation(f"expert {expert}", source, env.get_attr(KEY, [0])[0])
         controller = Controller(
             source,
             env.action_space,
@@ -260,18 +261,25 @@ class Controller:
         return actions
 
 
-def warn_of_vehicle(source: Any, flown: Vehicle) -> None:
-    """Warn of an expert that is made for another vehicle than the one that it flies."""
+def warn_of_vehicle(source: Any, vehicles: Sequence[Any]) -> None:
+    """Warn of an expert that is made for another vehicle than one that it flies.
+
+    :param vehicles: those of all rows.
+    """
     known = getattr(source, "vehicle", None)
     if not isinstance(known, Vehicle) or getattr(source, "is_privileged", False):
         return
-    if not known.flies_as(flown):
-        name = type(source).__name__
-        warnings.warn(
-            f"{name}: is made for the vehicle {known.name} and flies {name_beside(known, flown)};"
-            f" make it for this one: {name}(vehicle)",
-            stacklevel=3,
-        )
+    # Many rows have the same one.
+    for flown in {id(vehicle): vehicle for vehicle in vehicles}.values():
+        if isinstance(flown, Vehicle) and not known.flies_as(flown):
+            name = type(source).__name__
+            warnings.warn(
+                f"{name}: is made for the vehicle {known.name} and flies"
+                f" {name_beside(known, flown)}; make it for this one: {name}(vehicle), or give a"
+                " privileged expert, which knows the vehicle of each row",
+                stacklevel=3,
+            )
+            return
 
 
 def limits_of(space: spaces.Box) -> Float32Array:

@@ -214,7 +214,11 @@ def _warn_if_unlike(controller: Any, settings: FlightSettings) -> None:
     # A distribution has no particular vehicle.
     if settings.vehicles is not None:
         return
-    warn_of_vehicle(controller, first_vehicle(settings.vehicle, settings.rotor_layout))
+    sources = (
+        settings.vehicle if isinstance(settings.vehicle, (list, tuple)) else [settings.vehicle]
+    )
+    vehicles = [first_vehicle(source, settings.rotor_layout) for source in sources]
+    warn_of_vehicle(controller, vehicles)
     record = getattr(controller, KEY, None)
     if isinstance(record, dict):
         name = type(controller).__name__

@@ -142,14 +142,23 @@ class FlightSettings(ObservationSettings):
 
     def write_into(self, model: Any) -> None:
         """Write these settings into an SB3 model: ``model.flight_settings``, plain JSON with the
-        parameters of the vehicle, of several the first. A reference stays if it is a curve by name.
+        parameters of the vehicle. Of several vehicles and scalings they are the first, of several
+        levels of noise the mean. A reference stays if it is a curve by name.
 
         From then on its zips hold them, and ``load`` of Stable-Baselines3 keeps them, even without
         this package.
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
-        changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
+        changes: dict[str, Any] = {
+            "vehicle": first_vehicle(self.vehicle),
+            "vehicles": self.vehicles,
+        }
+        if isinstance(self.noise, list):
+            changes["noise"] = float(np.mean(self.noise))
+        for name in ("observation_mean", "observation_std"):
+            if np.ndim(getattr(self, name) or ()) == 2:
+                changes[name] = getattr(self, name)[0]
         if self.rotor_layout is not None:
             changes["rotor_layout"] = load_vehicle(self.rotor_layout)
         if self.reference is not None and self.reference.curve in ("file", "function"):

@@ -15,6 +15,7 @@ from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.types import Report, StrDict
+from sb3_quad.controllers.agent_settings import env_kwargs
 from sb3_quad.controllers.statistics import STATISTICS, share_statistics
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
@@ -173,7 +174,7 @@ def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluat
     # Without a suite, the episodes are those of the closing table of train.
     if suite is None:
         for task in TASKS:
-            settings = FlightSettings(task=task, **job.flight_settings.in_any_task())
+            settings = FlightSettings(task=task, **env_kwargs(model))
             flights[task] = _numbers(fly_settings(model, settings, row_seeds(seed, episodes)))
         return flights
     spec = ControllerSpec("agent", str(agent))

@@ -14,6 +14,7 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import Configuration, SweepSpec
+from sb3_quad.training.config import as_agent
 from sb3_quad.training.options import (
     DEFAULT_ALGO,
     DEFAULT_ENV,
@@ -161,6 +162,8 @@ def _pipeline(configuration: Configuration) -> Pipeline:
         return with_settings(load_pipeline(file), settings)
     algo = configuration.algo or DEFAULT_ALGO
     env = configuration.env or DEFAULT_ENV
+    if configuration.trained_agent is not None and file is None:
+        settings = as_agent(agent_path(configuration.trained_agent), algo, env, settings)
     return Pipeline(
         stages=[Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings)]
     )

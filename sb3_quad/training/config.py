@@ -44,6 +44,7 @@ from sb3_quad.training.algorithms import (
     takes_expert,
 )
 from sb3_quad.training.options import JobOptions
+from sb3_quad.vehicles.layout import Turn, find_turn
 from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 
 _FOLDERS = ("any_quadcopter", "nominal", "px4", "robust", "thesis", "value_based")
@@ -447,14 +448,16 @@ def check_environment(env_id: str) -> None:
         )
 
 
-def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict:
-    """Return ``changes`` to a settings file with the observation and networks of a zip added.
+def as_agent(path: StrPath, algo: str, env_id: str, changes: StrDict) -> StrDict:
+    """Return ``changes`` to the settings of an algorithm with the observation and networks of a zip
+    added.
 
     What is in ``changes`` takes precedence. Evaluations fly with the agent's position integral, if
     it has one; training does without. A zip that does not say how its agent flies adds nothing.
 
-    :param config: the settings with ``changes`` alone.
+    :raises ConfigError: a zip or settings that do not fit; rotors that are elsewhere.
     """
+    config = load_config(algo, env_id, None, changes)
     own, source = agent_settings(path)
     if source is None or not config.task:
         return changes
@@ -463,6 +466,9 @@ def as_agent(path: StrPath, config: TrainingConfig, changes: StrDict) -> StrDict
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
     observed = own.observed
+    # The agent knows one order of the rotors.
+    if find_turn(first_vehicle(config.flight_settings.vehicle), own.layout) != Turn():
+        observed["rotor_layout"] = own.layout.model_dump(mode="json")
     integral = observed.pop("position_integral")
     adopted = {
         **changes,

@@ -185,11 +185,10 @@ def make_config(options: Namespace) -> Any:
     algo = options.algo or DEFAULT_ALGO
     env = options.env or DEFAULT_ENV
     changes = changed_settings(options)
-    config = load_config(algo, env, options.conf_file, changes)
     # A file of settings takes precedence over those of the agent.
     if options.trained_agent is not None and options.conf_file is None:
-        return load_config(algo, env, None, as_agent(options.trained_agent, config, changes))
-    return config
+        changes = as_agent(options.trained_agent, algo, env, changes)
+    return load_config(algo, env, options.conf_file, changes)
 
 
 def changed_settings(options: Namespace) -> StrDict:
