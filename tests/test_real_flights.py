@@ -54,6 +54,26 @@ def flown(vehicle, seconds=12.0, seed=0):
     return pd.DataFrame(rows, columns=["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS, *THRUSTS])
 
 
+def turning(seconds=6.0, turn=3.0):
+    """Return a log at 100 Hz of a vehicle at one place that wobbles and turns at ``turn`` rad/s."""
+    time = STEP * np.arange(round(seconds / STEP))
+    wobble = [0.4 * np.sin(5.0 * time), 0.3 * np.cos(3.0 * time)]
+    rates = np.stack([*wobble, turn + 0.2 * np.sin(time)], axis=1)
+    attitude = [np.array([[1.0, 0.0, 0.0, 0.0]])]
+    for before, after in zip(rates[:-1], rates[1:], strict=True):
+        attitude.append(rotated_by(attitude[-1], 0.5 * STEP * (before + after)[None]))
+    table = pd.DataFrame({"t": time, **dict.fromkeys(CAPTURE_COLUMNS, 0.0)})
+    table["pz"] = 1.0
+    table[CAPTURE_COLUMNS[QUATERNION]] = np.concatenate(attitude)
+    table[GYRO_COLUMNS] = rates
+    return table.assign(**dict.fromkeys(THRUSTS, 0.1))
+
+
+def read_back(table, folder, step=STEP):
+    table.to_csv(folder / "flight.csv", index=False)
+    return read_logs(folder, step)[0]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("logs")
@@ -107,6 +127,25 @@ def test_a_late_clock_tilted_markers_and_an_uneven_motor_are_calibrated(folder, 
     assert np.abs(log.thrusts - true.thrusts)[inside].mean() < 4e-3
 
 
+@pytest.mark.parametrize("missing", [2, 3, 5, 7, 12])
+def test_nothing_is_known_within_a_long_gap(tmp_path, missing):
+    table = turning()
+    log = read_back(table.drop(range(200, 200 + missing)), tmp_path)
+    is_long = (missing + 1) * STEP > 0.05
+    assert not log.flying[200 : 200 + missing].any() if is_long else log.flying.all()
+    assert log.flying[:199].all() and log.flying[201 + missing :].all()
+
+
+def test_a_quaternion_and_its_negative_are_one_attitude(tmp_path):
+    table = turning()
+    expected = read_back(table, tmp_path, 1.0 / 130.0).motion
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(table), 1))
+    table[CAPTURE_COLUMNS[QUATERNION]] *= signs
+    motion = read_back(table, tmp_path, 1.0 / 130.0).motion
+    cosines = (motion * expected)[:, QUATERNION].sum(axis=1)
+    np.testing.assert_allclose(np.abs(cosines), 1.0, atol=1e-9)
+
+
 def test_the_fit_finds_the_parameters_that_were_flown(folder):
     logs = raw(read_logs(folder, STEP), folder)
     wrong = VEHICLE.model_copy(
@@ -158,6 +197,10 @@ def test_check_vehicle_prints_the_errors(folder, capsys):
         (lambda table: table.drop(columns=["qw"]), "lacks qw; a log is a CSV file with"),
         (lambda table: table.assign(qw="a"), "not a table of numbers"),
         (lambda table: table[:1], "fewer than two rows"),
+        (
+            lambda table: table.assign(imu_gyro_y=table["imu_gyro_y"].where(table.index != 8)),
+            "bad.csv: row 9: imu_gyro_y is missing, or is not a finite number",
+        ),
         (lambda table: table.assign(pz=0.0), "no log flies above 0.3 m for 1 s"),
         (lambda table: table.drop(columns=THRUSTS), f"lacks {', '.join(sorted(PWM))}"),
     ],

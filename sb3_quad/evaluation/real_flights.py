@@ -89,6 +89,19 @@ def read_log(path: Path, step: float) -> Log:
         raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
     if len(table) < 2:
         raise ConfigError(f"{path}: fewer than two rows")
+    # Commands may be missing where none came, and do not count there.
+    needed = table[["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS]]
+    unfit = np.argwhere(~np.isfinite(needed.to_numpy()))
+    if len(unfit):
+        row, column = unfit[0]
+        raise ConfigError(
+            f"{path}: row {row + 1}: {needed.columns[column]} is missing, or is not a finite number"
+        )
+    # q and -q are the same attitude, but in between lie others.
+    quaternions = table[CAPTURE_COLUMNS[QUATERNION]].to_numpy(copy=True)
+    cosines = (quaternions[1:] * quaternions[:-1]).sum(axis=1)
+    quaternions[1:] *= np.cumprod(np.where(cosines < 0.0, -1.0, 1.0))[:, None]
+    table[CAPTURE_COLUMNS[QUATERNION]] = quaternions
     time = table["t"]
     grid = np.arange(time.iloc[0], time.iloc[-1], step)
 
@@ -99,7 +112,9 @@ def read_log(path: Path, step: float) -> Log:
     attitude = motion[:, QUATERNION]
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     flying = motion[:, 2] > LEAST_HEIGHT
-    flying &= np.interp(grid, time, np.gradient(time)) < LONGEST_GAP
+    # From each row to the next; none follows the last one.
+    gaps = np.diff(time, append=time.iloc[-1])
+    flying &= gaps[np.searchsorted(time, grid, side="right") - 1] < LONGEST_GAP
     # Rᵀ dR/dt has the body rates in three places.
     rotation = rotation_matrices(attitude)
     turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, step, axis=0))
