@@ -108,6 +108,12 @@ def read_log(path: Path, step: float) -> Log:
     def resampled(names: list[str], behind: float = 0.0) -> FloatArray:
         return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
 
+    def commanded(behind: float = 0.0) -> FloatArray:
+        thrusts = resampled(commands, behind)
+        if commands is PWM:
+            thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
+        return thrusts
+
     motion = resampled(CAPTURE_COLUMNS + GYRO_COLUMNS)
     attitude = motion[:, QUATERNION]
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
@@ -115,19 +121,21 @@ def read_log(path: Path, step: float) -> Log:
     # From each row to the next; none follows the last one.
     gaps = np.diff(time, append=time.iloc[-1])
     flying &= gaps[np.searchsorted(time, grid, side="right") - 1] < LONGEST_GAP
+    # Some logs are extrapolated after the radio was lost.
+    flying &= np.isfinite(commanded()).all(axis=1)
     # Rᵀ dR/dt has the body rates in three places.
     rotation = rotation_matrices(attitude)
     turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, step, axis=0))
     rates = turning[flying][:, [2, 0, 1], [1, 2, 0]]
-    offset = float(
-        max(OFFSETS, key=lambda behind: np.vdot(rates, resampled(GYRO_COLUMNS, behind)[flying]))
-    )
+
+    def disagreement(behind: float) -> float:
+        gap = rates - resampled(GYRO_COLUMNS, behind)[flying]
+        return float(np.square(gap).sum())
+
+    offset = float(min(OFFSETS, key=disagreement))
     motion[:, BODY_RATES] = resampled(GYRO_COLUMNS, offset)
 
-    thrusts = resampled(commands, offset)
-    if commands is PWM:
-        thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
-    # Some logs are extrapolated after the radio was lost.
+    thrusts = commanded(offset)
     flying &= np.isfinite(thrusts).all(axis=1)
     if flying.any():
         force = np.gradient(motion[:, VELOCITY], step, axis=0)
