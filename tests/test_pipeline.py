@@ -233,6 +233,27 @@ def test_the_offset_of_an_agent_that_crashes_cannot_be_measured():
         hover_offset(model, n_flights=8)
 
 
+@pytest.mark.parametrize("scale", [-1.0, 0.0, np.nan, 0.5])
+def test_a_correction_that_fails_leaves_the_agent_as_it_was(scale, monkeypatch):
+    model = PPO("MlpPolicy", QuadcopterVecEnv(4, seed=1), n_steps=8, batch_size=8, device="cpu")
+    offsets = iter([np.ones(3)])
+
+    def fail_the_second_time(*_, **__):
+        try:
+            return next(offsets)
+        except StopIteration:
+            raise ConfigError("the agent crashes") from None
+
+    monkeypatch.setattr("sb3_quad.algorithms.offset_correction.hover_offset", fail_the_second_time)
+    before = {name: values.clone() for name, values in model.policy.state_dict().items()}
+    with pytest.raises(
+        ConfigError, match="the agent crashes" if scale > 0.0 else "^scale .*above 0"
+    ):
+        correct_offset(model, scale=scale)
+    for name, values in model.policy.state_dict().items():
+        assert values.equal(before[name])
+
+
 @pytest.mark.slow
 def test_the_correction_cancels_the_offset_of_a_trained_agent(monkeypatch):
     monkeypatch.setattr(

@@ -139,7 +139,7 @@ class ExpertMixin:
         :param scale: α of Eq. 4.10; below 1, the agent is quicker near its target.
         :return: the offset before and after, m.
         :raises ConfigError: no quadcopter environment; an agent that crashes on the way to targets,
-            or whose first layer does not read the 18 features.
+            or whose first layer does not read the 18 features. The agent is then as it was.
         """
         settings = flight_settings_of(self.env)
         if settings is None:

@@ -9,6 +9,7 @@ the agent flies without any wrapper, and its zip stays stock. An α well below 1
 far targets; PPO after it wins them back.
 """
 
+import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,12 +49,22 @@ def correct_offset(
 
     :param seed: of the flights that measure it.
     :param settings: vehicle, noise and scaling that the agent flies with.
-    :param scale: α.
+    :param scale: α, above 0.
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not
-        read the 18 features.
+        read the 18 features. It is then as it was.
     """
-    own = settings or FlightSettings()
-    first_layer(model)
+    if not scale > 0.0:
+        raise ConfigError(f"scale {scale}: must be above 0; 1 leaves distances as they are")
+    layer = first_layer(model)
+    weights = copy.deepcopy(layer.state_dict())
+    try:
+        return _corrected(model, seed, settings or FlightSettings(), scale)
+    except BaseException:
+        layer.load_state_dict(weights)
+        raise
+
+
+def _corrected(model: BaseAlgorithm, seed: int, own: FlightSettings, scale: float) -> Correction:
     std = DEFAULT_STD if own.observation_std is None else np.asarray(own.observation_std)
     statistics = statistics_of(model)
     if statistics is not None:
