@@ -95,6 +95,26 @@ def test_flights_that_carry_on_end_at_their_time_limit():
             tape.step(np.zeros((8, 4), np.float32))
 
 
+def test_a_later_tape_carries_on_where_the_one_before_ended():
+    """As in each further call of learn: all rows continue but those that were lost."""
+    env = QuadcopterVecEnv(64, task="state_recovery", seed=0)
+    first = env.record(190)
+    first.reset()
+    for _ in range(190):
+        first.step(np.full((64, 4), -1.0, np.float32))
+    end = env.batch.state.copy()
+    snapshot = env.batch.snapshot()
+    assert 0 < first.lost.sum() < 64
+    for _ in range(2):
+        env.record(5).reset(carry_on=True)
+        steps = np.where(first.lost, 0, 190)
+        np.testing.assert_array_equal(env.batch.streams[STEP], steps)
+        np.testing.assert_array_equal(env.batch.state[:, ~first.lost], end[:, ~first.lost])
+        # In a process that resumes
+        env = QuadcopterVecEnv(64, task="state_recovery", seed=1)
+        env.batch.restore(snapshot)
+
+
 def test_a_cost_of_ones_own_is_what_is_minimised():
     def level(flown):
         return 1.0 - flown.r33 + 0.01 * flight_cost(flown)

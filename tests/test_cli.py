@@ -82,6 +82,9 @@ def settings_file(tmp_path):
 
 def job(tmp_path, algo="dagger", **changes):
     settings = {**(SMALL_DAGGER if algo == "dagger" else SMALL), **changes}
+    if algo == "apg":
+        settings["carry_on"] = True
+        del settings["batch_size"], settings["env_kwargs"]
     return TrainingJob(
         config=build_config(algo, ENV, settings), log_folder=str(tmp_path / "logs"), eval_episodes=0
     )
@@ -303,7 +306,8 @@ def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
 
 
 @pytest.mark.parametrize(
-    ("algo", "after"), [("dagger", 8), ("dagger", 900), ("ppo", 1000), ("ppo_bc", 900)]
+    ("algo", "after"),
+    [("dagger", 8), ("dagger", 900), ("ppo", 1000), ("ppo_bc", 900), ("apg", 900)],
 )
 def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after):
     interruption = {"test_cli.Interrupt": {"after": after}}

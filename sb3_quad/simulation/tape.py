@@ -33,7 +33,7 @@ from sb3_quad.simulation.observation import (
     with_noise,
 )
 from sb3_quad.simulation.physics import limit_speeds, rotor_speed
-from sb3_quad.simulation.random import STEP, random_words, standard_normals
+from sb3_quad.simulation.random import EPISODE, STEP, random_words, standard_normals
 from sb3_quad.simulation.state import STATE_SIZE, P
 from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
 
@@ -71,7 +71,7 @@ class FlightTape:
         self.rewards = np.zeros((n_steps, n), np.float32)
         # Control steps that each row has flown, and whether it crashed or left the range then
         self.lengths = np.full(n, n_steps)
-        self.lost = np.ones(n, np.bool_)
+        self.lost = np.zeros(n, np.bool_)
         self._integrals = np.zeros((n_steps, *batch.integral.shape))
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
         self._winds = np.zeros((n_steps, *batch.wind.shape))
@@ -83,7 +83,8 @@ class FlightTape:
             reached their time limit.
         """
         batch = self.batch
-        ended = self.lost | (batch.streams[STEP] >= batch.limits)
+        # Rows that have not flown yet are in no episode.
+        ended = (batch.streams[EPISODE] == 0) | (batch.streams[STEP] >= batch.limits)
         observations = batch.reset(np.flatnonzero(ended) if carry_on else None)
         # A rotor must not overshoot its commanded speed because the physics steps are long.
         vehicles = batch.vehicles
@@ -119,6 +120,8 @@ class FlightTape:
         newly_lost = ~batch.outcome["truncated"] & ~self.lost
         self.lengths[newly_lost] = self._at
         self.lost |= newly_lost
+        # Their episodes are over for later recordings, too, and for those of a resumed run.
+        batch.limits[newly_lost] = 0
         return observations
 
     @property
