@@ -135,6 +135,20 @@ def test_a_cost_of_ones_own_is_what_is_minimised():
     assert tilt(agent) < 0.7 * before
 
 
+@pytest.mark.parametrize("n_envs", [8, 160])
+def test_the_log_has_all_flights_of_an_update(n_envs):
+    """Here only the first ones are lost, by a noise that makes the agent blind."""
+    env = QuadcopterVecEnv(n_envs, task="target_tracking", seed=0)
+    env.set_noise(np.where(np.arange(n_envs) < n_envs // 2, 5.0, 0.0))
+    agent = APG("MlpPolicy", env, initial_policy="itm-recovery", n_steps=200, seed=0)
+    agent.learn(n_envs * 200, log_interval=100)
+    survived = ~agent._tape.lost
+    assert 0 < survived.sum() < n_envs
+    assert np.mean(agent.ep_success_buffer) == pytest.approx(survived.mean())
+    rewards = [info["r"] for info in agent.ep_info_buffer]
+    np.testing.assert_allclose(rewards, agent._tape.episodes()[0])
+
+
 def test_what_cannot_be_differentiated_is_refused():
     env = QuadcopterVecEnv(2, seed=0)
     with pytest.raises(ConfigError, match="VecFrameStack: APG differentiates the environment"):

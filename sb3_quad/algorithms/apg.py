@@ -1,5 +1,6 @@
 """Analytic policy gradient: an agent learns from the exact gradient of its flights' cost."""
 
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
@@ -100,6 +101,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         scaled down to this many times the median length over all of them. With a vehicle for each
         episode a few flights on the verge of chaos outweigh the others without it; 3 is a good
         value. None: it is left as it is.
+    :param stats_window_size: Flights that ``rollout/`` averages over; at least all of an update.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. From scratch, whole flights learn badly: clone an expert first (DAgger), or
         fly short windows with ``carry_on``.
@@ -269,6 +271,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         :raises TrainingError: no row has a finite gradient; the parameters stay as they were.
         """
         # Layers such as dropout act as they did in the recorded flight.
+                # All flights end at once, and each counts.
+                window = max(self._stats_window_size, env.num_envs)
+                self.ep_info_buffer = deque(self.ep_info_buffer or (), window)
+                self.ep_success_buffer = deque(self.ep_success_buffer or (), window)
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         cost = self._tape.begin(partial(cost_and_gradients, self._whole_cost))
