@@ -205,3 +205,11 @@ def test_an_own_cost_must_be_given_again(tmp_path):
         APG.load(tmp_path / "agent", env=env).learn(10)
     APG.load(tmp_path / "agent", env=env, cost=cost).learn(10)
     APG.load(tmp_path / "agent", env=env, own_cost=False).learn(10)
+    # A zip that was saved before the training says so, too.
+    APG("MlpPolicy", env, n_steps=5, cost=cost).save(tmp_path / "new")
+    APG.load(tmp_path / "agent", env=env, own_cost=False).save(tmp_path / "default")
+    APG.load(tmp_path / "default", env=env, cost=cost).save(tmp_path / "changed")
+    for name in ("new", "changed"):
+        with pytest.raises(ConfigError, match="a cost of your own, which no zip holds"):
+            APG.load(tmp_path / name, env=env).learn(10)
+    APG.load(tmp_path / "default", env=env).learn(10)

@@ -182,6 +182,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             self._set_up(initial)
 
     def _setup_model(self) -> None:
+        if not callable(self.cost):
+            raise ConfigError(
+                f"cost {self.cost!r}: must be a function; leave it out for the default"
+            )
+        # A zip may say so already, of a cost that it does not hold.
+        self.own_cost |= self.cost is not flight_cost
         super()._setup_model()
         # policy_kwargs do not name SOAP, so that a zip loads where this package is missing.
         if "optimizer_class" not in self.policy_kwargs:
