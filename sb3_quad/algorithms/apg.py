@@ -118,7 +118,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         vehicles whose firmware takes a thrust that stays low for a crash.
     :param substeps: Physics steps in a control step of the training; None: those of the vehicle.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
-    :raises TrainingError: a gradient that is not finite, in every environment.
+    :raises TrainingError: a gradient that is not finite, if only of one environment.
     """
 
     policy_aliases = PPO.policy_aliases
@@ -274,7 +274,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     def train(self) -> None:
         """Carry the gradient of the mean cost back through the recorded flights, and descend.
 
-        :raises TrainingError: no row has a finite gradient; the parameters stay as they were.
+        :raises TrainingError: some row's gradient is not finite; the parameters stay as they were.
         """
         # Layers such as dropout act as they did in the recorded flight.
                 # All flights end at once, and each counts.
