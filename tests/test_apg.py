@@ -149,6 +149,29 @@ def test_the_log_has_all_flights_of_an_update(n_envs):
     np.testing.assert_allclose(rewards, agent._tape.episodes()[0])
 
 
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"substeps": 1.5}, "substeps 1.5: must be a whole number"),
+        ({"n_steps": 20.0}, "n_steps 20.0: must be a whole number"),
+        ({"cost": None}, "cost None: must be a function"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, "SOAP takes betas"),
+        ({"policy_kwargs": {"net_arch": "64,64"}}, "net_arch '64,64': must be a list"),
+        ({"policy": "MultiInputPolicy"}, "MultiInputPolicy: needs Dict observations"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_named(keywords, message):
+    with pytest.raises(ConfigError, match=message) as raised:
+        APG(**{"policy": "MlpPolicy", "env": QuadcopterVecEnv(2, seed=0), "n_steps": 5, **keywords})
+    assert "\n" not in str(raised.value)
+
+
+def test_a_file_of_vec_monitor_is_refused_since_it_would_stay_empty(tmp_path):
+    env = VecMonitor(QuadcopterVecEnv(2, seed=0), str(tmp_path / "episodes"))
+    with pytest.raises(ConfigError, match=r"VecMonitor: .* remove filename"):
+        APG("MlpPolicy", env, n_steps=5).learn(10)
+
+
 def test_what_cannot_be_differentiated_is_refused():
     env = QuadcopterVecEnv(2, seed=0)
     with pytest.raises(ConfigError, match="VecFrameStack: APG differentiates the environment"):

@@ -8,6 +8,7 @@ from stable_baselines3 import PPO
 
 from sb3_quad import APG, QuadcopterVecEnv
 from sb3_quad.algorithms.soap import SOAP
+from sb3_quad.base.errors import ConfigError
 
 
 def problem(seed: int):
@@ -90,5 +91,5 @@ def test_an_optimizer_class_of_the_user_holds(kind):
 
 def test_what_it_does_not_do_is_refused():
     kwargs = {"optimizer_kwargs": {"weight_decay": 0.1}}
-    with pytest.raises(TypeError, match="weight_decay"):
+    with pytest.raises(ConfigError, match=r"SOAP takes betas and eps.*weight_decay"):
         APG("MlpPolicy", QuadcopterVecEnv(2, seed=0), n_steps=10, policy_kwargs=kwargs)

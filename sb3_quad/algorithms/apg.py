@@ -29,7 +29,7 @@ from sb3_quad.algorithms.flight_cost import (
 )
 from sb3_quad.algorithms.networks.gradients import RecordedPolicy
 from sb3_quad.algorithms.soap import SOAP
-from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.simulation.tape import FlightCost
 
@@ -193,7 +193,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         if "optimizer_class" not in self.policy_kwargs:
             policy = self.policy
             rate = self.lr_schedule(1.0)
-            policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
+            unfit = "optimizer_kwargs: SOAP takes betas and eps; give an optimizer_class for others"
+            with raised_as(ConfigError, unfit):
+                policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
 
     def learn(
         self,
@@ -212,6 +214,11 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         env: Any = self.env
         # The statistics of episodes come from the tape.
         if isinstance(env, VecMonitor):
+            if env.results_writer is not None:
+                raise ConfigError(
+                    "VecMonitor: no flight of APG passes it, so that its file would stay empty;"
+                    " remove filename"
+                )
             env = env.venv
         if env is not env.unwrapped:
             raise ConfigError(
@@ -264,6 +271,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 ):
                     info["episode"] = {"r": float(reward), "l": int(length), "t": 0.0}
                     info["is_success"] = not is_lost
+                # All flights end at once, and each counts.
+                window = max(self._stats_window_size, env.num_envs)
+                self.ep_info_buffer = deque(self.ep_info_buffer or (), window)
+                self.ep_success_buffer = deque(self.ep_success_buffer or (), window)
                 self._update_info_buffer(infos, dones)
             callback.update_locals(locals())
             if not callback.on_step():
@@ -277,10 +288,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         :raises TrainingError: some row's gradient is not finite; the parameters stay as they were.
         """
         # Layers such as dropout act as they did in the recorded flight.
-                # All flights end at once, and each counts.
-                window = max(self._stats_window_size, env.num_envs)
-                self.ep_info_buffer = deque(self.ep_info_buffer or (), window)
-                self.ep_success_buffer = deque(self.ep_success_buffer or (), window)
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         cost = self._tape.begin(partial(cost_and_gradients, self._whole_cost))

@@ -111,6 +111,7 @@ class ExpertMixin:
     expert: ExpertLike | None
     bc_coef: Any
     batch_size: Any
+    policy_kwargs: StrDict
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
     # What else of an algorithm no zip holds.
@@ -154,15 +155,17 @@ class ExpertMixin:
         for name, value in [*vars(self).items()]:
             if isinstance(value, np.generic):
                 setattr(self, name, value.item())
-        for name, (least, _) in LIMITS.items():
+        for name, limits in LIMITS.items():
             value = getattr(self, name, None)
             if callable(value):
                 value = value(1.0)  # a schedule, at its start
             # Some arguments can be None, and train_freq a tuple.
             if value is None or isinstance(value, tuple):
                 continue
-            if not isinstance(value, (int, float)) or not value >= least:
-                raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
+            if not isinstance(value, (int, float)) or not value >= limits[0]:
+                raise ConfigError(f"{name} {value!r}: must be a number and at least {limits[0]}")
+            if limits is _COUNT and not isinstance(value, int):
+                raise ConfigError(f"{name} {value!r}: must be a whole number")
         # PPO cannot load the None that DAgger allows.
         if getattr(self, "max_grad_norm", 0.0) is None:
             self.max_grad_norm = math.inf
@@ -180,6 +183,12 @@ class ExpertMixin:
                 f"policy {self.policy_class.__name__}: {type(self).__name__} has none of this kind;"
                 " give an agent of another algorithm as expert=... to a new model"
             )
+        is_for_parts = issubclass(self.policy_class, self.policy_aliases["MultiInputPolicy"])
+        if is_for_parts and not isinstance(self.observation_space, spaces.Dict):
+            raise ConfigError("policy MultiInputPolicy: needs Dict observations; give MlpPolicy")
+        net_arch = self.policy_kwargs.get("net_arch")
+        if isinstance(net_arch, str):
+            raise ConfigError(f"net_arch {net_arch!r}: must be a list of numbers, as in [64, 64]")
 
     def _check_names(self, **valid: Sequence[str]) -> None:
         """Check arguments whose valid values are given by their names."""
