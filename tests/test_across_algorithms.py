@@ -74,6 +74,15 @@ def test_a_zip_goes_on_in_any_algorithm_of_its_kind(zips, made, loader):
     assert model.num_timesteps >= before + 80
 
 
+@pytest.mark.parametrize("loader", OURS)
+@pytest.mark.parametrize("name", ["initial_policy", "demonstrations"])
+def test_what_only_a_new_model_takes_is_refused_by_load(zips, loader, name):
+    path = zips / loader.__name__
+    with pytest.raises(ConfigError, match=rf"^{loader.__name__}.load does not take {name}; "):
+        loader.load(path, **keywords_of(loader, **{name: "itm-imitation"}))
+    loader.load(path, **keywords_of(loader, **{name: None}))
+
+
 @pytest.mark.parametrize("made", MADE)
 @pytest.mark.parametrize("loader", LOADERS)
 def test_custom_objects_replace_what_a_zip_holds(zips, made, loader):

@@ -67,6 +67,11 @@ LIMITS = {
 """Valid range of each argument of the algorithms; the greatest holds for settings files alone."""
 History = dict[str, list[float]]
 """The terms of an update's losses in each of its mini-batches, by logged name."""
+# Arguments that SB3 would note in a loaded model without using them
+_OF_NEW_MODELS = {
+    "initial_policy": "a zip holds its policy; give the other one to a new model",
+    "demonstrations": "a loaded model of DAgger takes them by model.dataset.load(...)",
+}
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 # A limit further than this from the middle of the range is none at all.
@@ -213,6 +218,17 @@ class ExpertMixin:
             if hasattr(self, STATISTICS):
                 share_statistics(getattr(self, STATISTICS), self.env, training=True)
             self._note_flight_settings()
+
+    @classmethod
+    def load(cls, *arguments: Any, **keywords: Any) -> Self:
+        """Load a model by SB3's ``load``.
+
+        :raises ConfigError: an argument that only a new model takes.
+        """
+        for name, way_out in _OF_NEW_MODELS.items():
+            if keywords.get(name) is not None:
+                raise ConfigError(f"{cls.__name__}.load does not take {name}; {way_out}")
+        return super().load(*arguments, **keywords)  # type: ignore[misc, no-any-return]
 
     def set_parameters(self, *arguments: Any, **keywords: Any) -> None:
         """Take the parameters of another model by SB3's ``set_parameters``.
