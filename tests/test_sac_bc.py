@@ -215,6 +215,21 @@ def test_a_loaded_agent_is_the_same_and_needs_its_expert_to_go_on(tmp_path):
         SACBC.load(tmp_path / "agent.zip", device="cpu", env=straight.get_env()).learn(8)
 
 
+@pytest.mark.parametrize(("saved", "present"), [(0.0, 0.5), (0.5, 0.0)])
+def test_a_buffer_with_other_actions_is_refused_when_it_is_loaded(tmp_path, saved, present):
+    path = tmp_path / "buffer.pkl"
+    pendulum(bc_coef=saved).learn(40).save_replay_buffer(path)
+    model = pendulum(bc_coef=present).learn(40)
+    buffer = model.replay_buffer
+    with pytest.raises(ConfigError, match=r"buffer\.pkl: has . numbers for each action") as raised:
+        model.load_replay_buffer(path)
+    assert "\n" not in str(raised.value) and model.replay_buffer is buffer
+    model.learn(40, reset_num_timesteps=False)
+    same = pendulum(bc_coef=saved)
+    same.load_replay_buffer(path)
+    same.learn(40, reset_num_timesteps=False)
+
+
 def test_the_batch_gives_the_buffer_what_sb3_wants_of_ends():
     """A time limit is no end of the values; the state before it is the last of the same flight."""
     env = QuadcopterVecEnv(4, "target_tracking", seed=0, max_episode_steps=6)

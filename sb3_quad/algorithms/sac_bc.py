@@ -205,6 +205,22 @@ class SACBC(ExpertMixin, SAC):
         """Return whether the expert is needed at all."""
         return self._clones
 
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """Load a replay buffer by SB3's ``load_replay_buffer``.
+
+        :raises ConfigError: one with the expert's actions where this model does not clone, or one
+            without where it does; the present buffer then stays.
+        """
+        present: Any = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded: Any = self.replay_buffer
+        if loaded.action_dim != present.action_dim:
+            self.replay_buffer = present
+            raise ConfigError(
+                f"replay buffer {path}: has {loaded.action_dim} numbers for each action, must have"
+                f" {present.action_dim}; where bc_coef is above 0, the expert's are among them"
+            )
+
     def learn(
         self,
         total_timesteps: int,
