@@ -309,15 +309,19 @@ values = st.floats(-10, 10, allow_nan=False)
 @given(
     cells=st.lists(st.tuples(values, values, values), min_size=2, max_size=5),
     row=st.sampled_from([SUCCESS, time_row(1)]),
+    some=st.booleans(),
 )
-def test_the_best_is_better_than_all_others_for_certain(cells, row):
+def test_the_best_is_better_than_all_others_for_certain(cells, row, some):
     made = [Cell(middle, (low, high)) for low, middle, high in map(sorted, cells)]
+    if some:
+        # A mean time of the few flights that arrive is comparable with no other.
+        made[-1] = made[-1]._replace(note="3 % arrive")
     marked = mark_best(row, made)
     for cell in marked:
         others = [other for other in marked if other is not cell]
         (low, high), ends = cell.ends, [other.ends for other in others]
         apart = all(low > other[1] if row == SUCCESS else high < other[0] for other in ends)
-        assert cell.best == apart
+        assert cell.best == (apart and (row == SUCCESS or not some))
 
 
 def test_a_report_is_not_replaced_silently(folder, page, capsys):

@@ -181,7 +181,8 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a row, the best marked if its interval is apart from all others'."""
     if row in HIGHER_IS_BETTER:
         sign = 1.0
-    elif row.verb or row in FOLLOWING[:-1]:
+    elif row in FOLLOWING[:-1] or (row.verb and not any(cell.note for cell in cells)):
+        # A note says that a mean time is of some flights alone, perhaps of the nearest ones.
         sign = -1.0
     else:
         return list(cells)
