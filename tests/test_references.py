@@ -154,6 +154,9 @@ def test_a_file_and_a_function_give_the_same_table(csv):
     [
         {"curve": "function", "function": spiral, "duration": 3.0},
         {"curve": "helix", "duration": 3.0},
+        # An end within a control step, and the greatest speed that a curve can have
+        {"curve": "function", "function": spiral, "duration": 3.004},
+        {"curve": "helix", "duration": 2.996, "size": (0.1, 0.1, 0.0), "speed": 6.28},
         {"curve": "polynomial", "waypoints": WAYPOINTS, "heading": "path"},
         "csv",
     ],
@@ -162,13 +165,10 @@ def test_what_does_not_loop_rests_at_its_end(fields, csv):
     reference = Reference.model_validate(csv if fields == "csv" else fields)
     motion, seconds = reference._motion(DT)
     table = reference.tracks(DT).table
-    # The last control step may begin half a step before or after the end.
-    ends = motion(np.array([0.0, seconds - DT / 2, seconds, seconds + DT / 2]))[:, :3]
-    gap = np.linalg.norm(table[-1, :3] - (ends[2] - ends[0]))
-    assert gap <= np.linalg.norm(ends[3] - ends[1]) + 1e-9
+    start, end = motion(np.array([0.0, seconds]))[:, :3]
+    np.testing.assert_allclose(table[-1, :3], end - start, atol=1e-9)
+    assert len(table) - 1 == math.ceil(seconds / DT - 1e-6)
     assert not table[-1, 3:9].any() and not table[-1, 11].any()
-    if seconds == 3.0 or fields == "csv":
-        assert gap < 1e-9
 
 
 def test_random_pieces_that_rest_do_not_turn_along_their_path():
@@ -195,10 +195,20 @@ def test_random_pieces_that_rest_do_not_turn_along_their_path():
         ({"duration": 3}, "only helix, function"),
         ({"function": spiral, "heading": "path"}, "gives headings of its own"),
         ("no_such.csv", "no_such.csv"),
+        ("long.csv", "long.csv: takes 601 s; at most 600 s"),
+        ({"waypoints": [(1e4, 0, 0), (-1e4, 0, 0)], "speed": 0.1}, "at most 600 s are possible"),
+        ({"curve": "circle", "size": (1e4, 1e4, 0), "speed": 0.1}, "at most 600 s are possible"),
+        ({"waypoints": [(0, 0, 0)]}, "one alone, the start"),
+        ({"waypoints": [(1, 0, 0), (1, 0, 0)]}, "same point"),
+        ({"waypoints": [(1e-60, 0, 0)]}, "reference polynomial"),
+        ({"curve": "circle", "size": (0.1, 0.1, 0), "speed": 10}, "6.28 m/s, less than speed 10"),
+        ({"curve": "helix", "size": (0.1, 0.1, 0), "speed": 7}, "6.28 m/s"),
         (lambda times: times, "must be finite numbers"),
     ],
 )
-def test_what_is_no_reference_is_refused(fields, message):
+def test_what_is_no_reference_is_refused(fields, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "long.csv").write_text("t,x,y,z\n0,0,0,0\n601,0,0,0\n")
     with pytest.raises(ConfigError, match=message):
         QuadcopterVecEnv(1, reference=fields)
 
@@ -463,7 +473,6 @@ def test_a_file_may_have_spaces_behind_its_commas(tmp_path):
         ("t,x,y,z\n0,nan,0,0\n1,0,0,0\n", "row 1: x is missing, or is not a finite number"),
         ("t,x,y,z\n0,0,0,0\n1,0,0,0\n1,0,0,0\n", "row 3: t is 1 after 1"),
         ("t,x,y,z\n0,0,0,0\n2,0,0,0\n1,0,0,0\n", "row 3: t is 1 after 2"),
-        ("t,x,y,z\n0,0,0,0\n601,0,0,0\n", "takes 601 s"),
         ("t,x,y,z\n0,0,0,zero\n1,0,0,0\n", "zero"),
     ],
 )

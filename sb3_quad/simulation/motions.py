@@ -13,7 +13,6 @@ from sb3_quad.base.types import FloatArray
 
 Motion = Callable[[FloatArray], FloatArray]
 """The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
-MAX_SECONDS = 600.0
 HARMONICS = np.arange(1, 7)
 _COLUMNS = ["t", "x", "y", "z", "heading"]
 # Of a segment of a polynomial with the least snap
@@ -71,10 +70,6 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
         raise ConfigError(
             f"{path}: row {row + 1}: t is {numbers[row, 0]:g} after {numbers[row - 1, 0]:g};"
             " it must rise from row to row"
-        )
-    if times[-1] > MAX_SECONDS:
-        raise ConfigError(
-            f"{path}: takes {times[-1]:g} s; t must rise by {MAX_SECONDS:g} s at most"
         )
     # Headings may be given from -π to π: between two of them is the shorter way.
     numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)

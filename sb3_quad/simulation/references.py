@@ -18,7 +18,6 @@ from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.simulation.motions import (
     HARMONICS,
-    MAX_SECONDS,
     SINES,
     Motion,
     interpolated,
@@ -32,6 +31,7 @@ Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]
 _PLACES = row_slices(REFERENCE_PARTS).values()
 _POSITION, _VELOCITY, _ACCELERATION, _HEADING, _HEADING_RATE, _AHEAD = _PLACES
+MAX_SECONDS = 600.0  # of a round or of all; a table must not fill the memory
 # Random motion: so many pieces of so many seconds, each a sum of sines that fit into it.
 PIECES = 256
 PIECE_SECONDS = 10.0
@@ -164,15 +164,22 @@ class Reference(Frozen):
         """
         if self.curve == "random_smooth":
             return self._random_tracks(dt)
-        motion, seconds = self._motion(dt)
-        steps = round(seconds / dt)
+        with raised_as(ConfigError, f"reference {self.curve}"):
+            motion, seconds = self._motion(dt)
+        if seconds > MAX_SECONDS:
+            raise ConfigError(
+                f"reference {self.file or self.curve}: takes {seconds:g} s; at most"
+                f" {MAX_SECONDS:g} s are possible: make it shorter or faster"
+            )
+        # The end may lie within the last control step. Rounding errors add no step.
+        steps = math.ceil(seconds / dt - 1e-6)
         loops = self.curve in SINES and self.curve != "helix"
         if loops and self.heading_rate:
             # The heading must loop, too: whole turns in many periods are nearly at its rate.
             steps *= math.ceil(MAX_SECONDS / dt / steps)
         # One row more where it does not loop: the end, at which it rests.
         with raised_as(ConfigError, f"reference {self.curve}"):
-            table = self._table(motion, steps + (not loops), dt, loops)
+            table = self._table(motion, steps + (not loops), dt, loops, seconds)
         if not loops:
             table[-1, _VELOCITY.start : _ACCELERATION.stop] = 0.0
             table[-1, _HEADING_RATE] = 0.0
@@ -192,22 +199,34 @@ class Reference(Frozen):
         # The greatest speed per ω, on a fine grid
         grid = np.linspace(0.0, 2.0 * math.pi, 7201)
         way = np.gradient(np.stack(sines(grid, a, b, c)), grid, axis=1)
+        length = 2.0 * math.pi * np.linalg.norm(way, axis=0).max()
+        # With fewer than 10 control steps in a round, differences are no velocities any more.
+        fastest = length / (10 * dt)
+        if 0.0 < fastest < self.speed:
+            raise ConfigError(
+                f"reference {self.curve}: of this size it has at most {fastest:.3g} m/s, less than"
+                f" speed {self.speed:g}; lower speed, or enlarge size"
+            )
         # A whole number of control steps, so that it loops without a jump.
-        steps = round(2.0 * math.pi * np.linalg.norm(way, axis=0).max() / self.speed / dt)
-        seconds = max(steps, 10) * dt
+        seconds = max(round(length / self.speed / dt), 10) * dt
         omega = 2.0 * math.pi / seconds
         if self.curve == "helix":
             seconds = self.duration
         return lambda t: np.stack(sines(omega * t, a, b, c), axis=1), seconds
 
-    def _table(self, motion: Motion, steps: int, dt: float, loops: bool) -> FloatArray:
+    def _table(
+        self, motion: Motion, steps: int, dt: float, loops: bool, end: float = math.inf
+    ) -> FloatArray:
         """Return a table of a function, its derivatives by central differences.
 
+        :param end: s, after which it rests where it does not loop.
         :raises ValueError: it gives something else than positions.
         """
         # Where it loops, two steps more on each side: both differences have their neighbours.
         more = 2 if loops else 0
         times = dt * np.arange(-more, steps + more, dtype=np.float64)
+        if not loops:
+            times = np.minimum(times, end)
         values = np.asarray(motion(times), dtype=np.float64)
         columns = values.size / len(times)
         if values.ndim != 2 or columns not in (3, 4) or not np.isfinite(values).all():
@@ -245,8 +264,11 @@ class Reference(Frozen):
         if points[0].any():
             points = np.vstack([np.zeros(3), points])
         seconds = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        if not seconds.all():
-            raise ConfigError("reference polynomial: two waypoints in a row are the same point")
+        if len(points) < 2 or not seconds.all():
+            raise ConfigError(
+                "reference polynomial: two waypoints in a row are the same point, or there is one"
+                " alone, the start; give others"
+            )
         grid = np.linspace(0.0, seconds.sum(), 5000)
         way = np.gradient(least_snap(points, seconds)(grid), grid, axis=0)
         seconds = seconds * np.linalg.norm(way, axis=1).max() / self.speed
