@@ -101,8 +101,11 @@ def test_a_comparison_is_plain_text_and_a_table_in_notebooks():
         ({"PID": "pid"}, {"vehicel": "itm"}, "did you mean 'vehicle'"),
         ({"PID": "pid"}, {"tasks": ["recovery"]}, "unknown task 'recovery'"),
         ({"PID": "pid"}, {"tasks": [Task(), Task()]}, "several tasks are named custom"),
-        ({"PID": "pid"}, {"n_flights": 0}, "n_flights is 0, must be at least 1"),
+        ({"PID": "pid"}, {"n_flights": 0}, "n_flights 0: must be a whole number of 1 to"),
+        ({"PID": "pid"}, {"seed": -5}, "seed -5: must be a whole number of 0 to"),
+        ({"PID": "pid"}, {"thesis_columns": ["expret"]}, "did you mean 'expert'"),
         ({}, {}, "give at least one controller"),
+        (["pid"], {}, "at least one controller with its label"),
         ({"PID": "pid"}, {"reward": "no_such_module:reward"}, "reward no_such_module:reward"),
         ({"gone": "missing.zip"}, {}, "missing.zip: no such file"),
     ],
@@ -110,3 +113,9 @@ def test_a_comparison_is_plain_text_and_a_table_in_notebooks():
 def test_bad_input_is_named(controllers, keywords, message):
     with pytest.raises(ConfigError, match=message):
         compare(controllers, **keywords)
+
+
+@pytest.mark.parametrize("task", ["target_tracking", {"state_recovery": 1}, Task()])
+def test_a_single_task_needs_no_list(task):
+    keywords = {"n_flights": 2, "max_episode_steps": 5}
+    assert compare({"PID": "pid"}, task, **keywords) == compare({"PID": "pid"}, [task], **keywords)

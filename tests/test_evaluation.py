@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from sb3_quad import env_kwargs, load_pretrained
-from sb3_quad.base.errors import ControllerError
+from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation import statistics
@@ -37,12 +37,12 @@ def hover(observation):
     return np.zeros((len(observation), 4), dtype=np.float32)
 
 
-def same(a: Flights, b: Flights) -> None:
+def same(a: Flights, b: Flights, tolerances=TOLERANCES) -> None:
     assert (a.success == b.success).all() and (a.survival == b.survival).all()
     assert (a.length == b.length).all()
     for name in ("reward", "path_length", "final_error"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-6)
-    for tolerance in TOLERANCES:
+    for tolerance in tolerances:
         np.testing.assert_allclose(a.time_to[tolerance], b.time_to[tolerance], atol=1e-9)
 
 
@@ -160,6 +160,27 @@ class Changes:
 def test_an_own_reward_that_does_not_fit_is_named(reward, message):
     with pytest.raises(ControllerError, match=f"reward <lambda>: {message}"):
         fly(hover, n_flights=3, max_steps=2, reward=reward)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"n_flights": 4.0}, "n_flights 4.0: must be a whole number of 1 to"),
+        ({"n_flights": 0}, "n_flights 0"),
+        ({"seed": -1}, "seed -1: must be a whole number of 0 to"),
+        ({"seed": 0.5}, "seed 0.5"),
+        ({"tolerances": "near"}, "tolerances 'near': must be numbers"),
+    ],
+)
+def test_numbers_that_do_not_fit_are_named(keywords, message):
+    with pytest.raises(ConfigError, match=message):
+        fly("pid", **keywords)
+
+
+def test_a_single_tolerance_and_the_name_of_the_environments_are_taken():
+    flights = fly("pid", n_flights=2, max_episode_steps=20, tolerances=0.5)
+    same(flights, fly("pid", n_flights=2, max_steps=20, tolerances=[0.5]), [0.5])
+    assert [*flights.time_to] == [0.5] and flights.length.max() == 20
 
 
 def test_the_conventions_give_the_specified_metrics():

@@ -1,27 +1,27 @@
 """Controllers on the same episodes of some tasks, in one table for each task."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Group
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.errors import ConfigError, refuse_unknown
+from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.controllers.agent_settings import settings_of_record
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
-from sb3_quad.evaluation.flights import OwnReward, fly_settings
+from sb3_quad.evaluation.flights import OwnReward, episode_seeds, fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.simulation.settings import KEY, FlightSettings, levels
-from sb3_quad.simulation.tasks import in_words
+from sb3_quad.simulation.tasks import Task, in_words
 from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
 THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
@@ -48,11 +48,11 @@ class Comparison(dict[str, dict[str, Metrics]]):
 
 def compare(
     controllers: StrMapping,
-    tasks: Sequence[Any] = ("target_tracking", "state_recovery"),
+    tasks: Any = ("target_tracking", "state_recovery"),
     n_flights: int = 240,
     seed: int | None = None,
     reward: OwnReward = None,
-    thesis_columns: Iterable[str] = (),
+    thesis_columns: Sequence[str] = (),
     **env_kwargs: Any,
 ) -> Comparison:
     """Fly several controllers through the same episodes of some tasks and compare their metrics.
@@ -74,7 +74,8 @@ def compare(
     :param controllers: by label: the name of an expert (``"pid"``) or of an agent that comes with
         the package (``"itm-robust"``), the path of a zip, ``"package.module:factory"``, an SB3
         model, an expert, or a function from observations (n, 18) to actions (n, 4).
-    :param tasks: names, :class:`~sb3_quad.simulation.tasks.Task` or mixtures ``{name: weight}``.
+    :param tasks: names, :class:`~sb3_quad.simulation.tasks.Task` or mixtures ``{name: weight}``, or
+        one of these alone.
     :param n_flights: episodes of each task.
     :param seed: of the episodes, as :func:`~sb3_quad.evaluation.flights.fly` takes it; None: one
         that no training flies.
@@ -91,17 +92,22 @@ def compare(
         zip that cannot be read.
     :raises ControllerError: a controller or reward that fails in flight.
     """
-    if not controllers:
-        raise ConfigError("compare: give at least one controller, such as {'PID': 'pid'}")
-    if n_flights < 1:
-        raise ConfigError(f"compare: n_flights is {n_flights}, must be at least 1")
+    if not isinstance(controllers, Mapping) or not controllers:
+        raise ConfigError(
+            "compare: give at least one controller with its label, such as {'PID': 'pid'}"
+        )
+    if isinstance(tasks, (str, Mapping, Task)):
+        tasks = [tasks]
     names = [in_words(task) for task in tasks]
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"compare: several tasks are named {name}; name them differently")
     if seed is None:
         seed = seed_for("table")
-    seeds = row_seeds(seed, n_flights)
+    seeds = episode_seeds(seed, n_flights)
+    suite = load_suite("thesis")
+    published = [suite.scenario(name).published for name in THESIS_SCENARIOS.values()]
+    refuse_unknown("thesis column", thesis_columns, {*published[0], *published[1]})
     own_reward = load_reward(reward)
     settings = _settings(controllers, env_kwargs)
     pilots = {}
@@ -159,7 +165,7 @@ def _task_table(
     task: str,
     metrics: Mapping[str, Metrics],
     settings: Mapping[str, FlightSettings],
-    thesis_columns: Iterable[str],
+    thesis_columns: Sequence[str],
     n_flights: int,
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task."""

@@ -27,6 +27,8 @@ from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.evaluation.supervisor import Supervisor
 from sb3_quad.simulation import MAX_EPISODE_STEPS
+from sb3_quad.simulation.batch import MAX_ROWS
+from sb3_quad.simulation.checks import per_row, whole_number
 from sb3_quad.simulation.settings import KEY, FlightSettings, known_layout
 from sb3_quad.simulation.state import TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
@@ -39,6 +41,7 @@ ACTIONS = quadcopter_spaces()[1]
 TILT = np.radians(45.0)
 RATE = 2.0
 HOLD = 0.2
+LARGEST_SEED = 2**53  # Seeds that the package itself makes are below it.
 
 Reward: TypeAlias = Callable[[QuadcopterState, Float32Array], npt.ArrayLike]
 """A reward of your own: the state after a control step and the actions (n, 4) that led to it, to
@@ -158,7 +161,7 @@ def fly(
     noise: float = 0.05,
     backend: str = "batch",
     max_steps: int = MAX_EPISODE_STEPS,
-    tolerances: Sequence[float] = TOLERANCES,
+    tolerances: Sequence[float] | float = TOLERANCES,
     hooks: Sequence[Hook] = (),
     reward: Reward | None = None,
     record: StrPath | None = None,
@@ -180,33 +183,42 @@ def fly(
         ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
         ``rotor_layout``, unless you give another.
     :param backend: ``batch``, or ``pybullet`` for the reference.
-    :param max_steps: control steps of an episode that nothing ends before.
-    :param tolerances: of arrival, |r - r_T|, m.
+    :param max_steps: control steps of an episode that nothing ends before. The environments call it
+        ``max_episode_steps``, which holds if you give both.
+    :param tolerances: of arrival, |r - r_T|, m; one or several.
     :param hooks: are called along the way.
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
         control step and the actions (n, 4); its sums are ``Flights.own_reward``. A class is
         instantiated for these episodes and may remember.
     :param record: an ``.npz`` file for the observations and actions of all control steps, which
         ``DAgger(demonstrations=...)`` and ``dataset.load`` take; an existing one is replaced.
-    :raises ConfigError: an unknown name, backend or keyword, or fewer than one episode.
+    :raises ConfigError: an unknown name, backend or keyword, a seed below 0, or fewer than one
+        episode.
     :raises ControllerError: a controller of another kind, or a controller or reward that fails in
         flight.
     """
-    if n_flights < 1:
-        raise ConfigError(f"n_flights {n_flights}: must be at least 1")
+    seeds = episode_seeds(seed, n_flights)
+    limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
     layout = environment.get("rotor_layout")
     controller = resolve_expert(controller, vehicle, "controller", layout)
     # A model flies with its rotors where it knows them.
     if layout is None:
         environment["rotor_layout"] = known_layout(controller)
-    settings = FlightSettings().with_changes(
-        task=task, vehicle=vehicle, noise=noise, max_episode_steps=max_steps, **environment
-    )
+    environment.setdefault("max_episode_steps", max_steps)
+    settings = FlightSettings().with_changes(task=task, vehicle=vehicle, noise=noise, **environment)
     _warn_if_unlike(controller, settings)
-    seeds = row_seeds(seed, n_flights)
     return fly_settings(
-        controller, settings, seeds, backend, tolerances, hooks, reward=reward, record=record
+        controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
+
+
+def episode_seeds(seed: int, n_flights: int) -> list[int]:
+    """Return the seed of each flight.
+
+    :raises ConfigError: something else than whole numbers, a seed below 0, or no flights.
+    """
+    n = whole_number("n_flights", n_flights, 1, MAX_ROWS)
+    return row_seeds(whole_number("seed", seed, 0, LARGEST_SEED), n)
 
 
 def _warn_if_unlike(controller: Any, settings: FlightSettings) -> None:
