@@ -12,9 +12,9 @@ from gymnasium.error import ResetNeeded
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.types import FloatArray, StrDict, StrMapping
+from sb3_quad.base.types import AnyArray, FloatArray, StrDict, StrMapping
 from sb3_quad.base.validate import validate
-from sb3_quad.simulation.batch import QuadcopterBatch, Rows
+from sb3_quad.simulation.batch import QuadcopterBatch, Rows, StepResult
 from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.simulation.motions import Motion
@@ -79,6 +79,7 @@ class BatchEnv:
 
     batch: QuadcopterBatch
     flight_settings: FlightSettings
+    _has_begun = False
 
     def _make_batch(
         self,
@@ -106,6 +107,18 @@ class BatchEnv:
         """Return a copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""
         # A single column stands for all rows where they do not differ.
         return np.broadcast_to(columns.T, (self.batch.n, *columns.shape[:-1])).copy()
+
+    def _require_reset(self, what: str, rows: Rows = None) -> None:
+        # Before its first reset the attitude of a row is zero. A restored batch needs none.
+        if not self.batch.state[QUATERNION, self.batch.rows(rows)].any(axis=0).all():
+            raise ResetNeeded(f"call reset() before {what}")
+
+    def _fly(self, actions: AnyArray) -> StepResult:
+        """Step the batch, which must have begun its episodes."""
+        if not self._has_begun:
+            self._require_reset("step()")
+            self._has_begun = True
+        return self.batch.step(actions)
 
     def true_state(self) -> QuadcopterState:
         """Return the true state of all rows, free of noise.
@@ -161,9 +174,8 @@ class BatchEnv:
         if heading is not None:
             angle = per_row("heading", heading, n)[0]
             turning = np.stack([np.cos(angle), np.sin(angle), rate])
-        # Before its first reset the attitude of a row is zero. That reset would set another target.
-        if not self.batch.state[QUATERNION, rows].any(axis=0).all():
-            raise ResetNeeded("call reset() before set_target() or set_reference()")
+        # That reset would set another target.
+        self._require_reset("set_target() or set_reference()", rows)
         # Nobody knows its future, so the acceleration ahead is the present one.
         parts = [positions, velocities, accelerations, turning, accelerations]
         self.batch.set_reference(np.concatenate(parts), rows)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
@@ -34,6 +35,7 @@ class BatchVecEnv(VecEnv):
     max_episode_steps = ENDLESS
     #: Random numbers for your episodes, which :meth:`seed` seeds.
     rng: np.random.Generator
+    _lengths: IntArray | None = None
 
     def __init__(
         self,
@@ -80,6 +82,8 @@ class BatchVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows; return observations (n, ...), rewards (n,), done (n,), infos."""
+        if self._lengths is None:
+            raise ResetNeeded("call reset() before step()")
         results = self.advance(self._actions)
         if not isinstance(results, (tuple, list)) or len(results) != 3:
             raise ConfigError("advance: must return observations, rewards and terminated")

@@ -109,7 +109,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         :return: observations (n, observation size), rewards (n,), terminated (n,), truncated (n,),
             infos.
         """
-        observations, rewards, done = self.batch.step(actions)
+        observations, rewards, done = self._fly(actions)
         # In mode NextStep a step of a row that has ended is its reset, without reward.
         if self._mode is AutoresetMode.NEXT_STEP and self._ended.any():
             observations = self._begin(self._ended)

@@ -12,13 +12,21 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import IntArray, StrDict
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.batch_vec_env import BatchVecEnv
 from sb3_quad.simulation.tape import FlightTape
 from sb3_quad.simulation.tasks import TaskSpec
 
-_OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
+_OF_ROWS = (
+    "target",
+    "noise",
+    "observation_mean",
+    "observation_std",
+    "wrench",
+    "wind",
+    "max_episode_steps",
+)
 _METHODS = ("set_target", "set_reference", "set_wrench", "set_wind", "set_noise")
 
 
@@ -85,6 +93,11 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces(self.batch.observation.size))
 
+    @property
+    def max_episode_steps(self) -> IntArray:  # type: ignore[override]
+        """Control steps after which an episode is truncated, (n,), as the constructor took them."""
+        return self.batch.max_steps.copy()
+
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; observations float32 (n, observation size)."""
         # SB3 passes options through a method of their own, before the reset.
@@ -110,7 +123,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         # An info holds until the next step.
         for row in self._ended:
             self._infos[row] = {}
-        observations, rewards, dones = self.batch.step(self._actions)
+        observations, rewards, dones = self._fly(self._actions)
         rows = dones.nonzero()[0]
         self._ended = rows.tolist()
         if self._ended:

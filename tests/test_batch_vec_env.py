@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -97,6 +98,13 @@ def test_sb3_and_our_algorithms_train_in_it(kind):
     model = kind("MlpPolicy", VecNormalize(Rows(4)), seed=0, device="cpu", **keywords)
     model.learn(256)
     assert len(model.ep_info_buffer) > 10
+
+
+def test_steps_wait_for_the_first_reset():
+    env = Rows(2)
+    with pytest.raises(ResetNeeded, match="call reset"):
+        env.step(np.zeros((2, 1), np.float32))
+    assert not env.state.any()
 
 
 def test_its_random_numbers_follow_the_seed():

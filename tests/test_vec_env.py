@@ -21,6 +21,7 @@ from sb3_quad import envs
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import print_once
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.compiled import compile_notice
@@ -535,6 +536,29 @@ def test_bad_actions_are_refused_and_change_nothing():
 def test_bad_settings_are_refused(method, arguments, says):
     with pytest.raises(ConfigError, match=says):
         getattr(QuadcopterVecEnv(2), method)(*arguments)
+
+
+@pytest.mark.parametrize("kind", [QuadcopterVecEnv, QuadcopterVectorEnv])
+def test_steps_wait_for_the_first_reset(kind):
+    env, other = kind(2, seed=0), kind(2, seed=0)
+    actions = np.zeros((2, 4), np.float32)
+    for _ in range(2):
+        with pytest.raises(ResetNeeded, match="call reset"):
+            env.step(actions)
+    other.reset()
+    # A restored run goes on without a reset.
+    env.batch.restore(other.batch.snapshot())
+    np.testing.assert_array_equal(env.step(actions)[0], other.step(actions)[0])
+
+
+def test_the_length_of_episodes_is_read_and_not_set():
+    env = QuadcopterVecEnv(3, max_episode_steps=[10, 25])
+    assert env.get_attr("max_episode_steps", [1, 2]) == [25, 10]
+    with pytest.raises(AttributeError, match="max_episode_steps"):
+        env.max_episode_steps = 5
+    with pytest.raises(AttributeError, match="max_episode_steps"):
+        env.set_attr("max_episode_steps", 5)
+    assert env.max_episode_steps.tolist() == [10, 25, 10]
 
 
 def test_targets_wait_for_the_first_reset():
