@@ -20,10 +20,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
+from sb3_quad.training.algorithms import ALGORITHMS
 from sb3_quad.training.config import build_config, load_config
 from sb3_quad.tuning import search as search_module
 from sb3_quad.tuning.search import score
-from sb3_quad.tuning.space import load_space
+from sb3_quad.tuning.space import SPACES, load_space
 
 ENV = "QuadTargetTracking-v0"
 SMALL = {
@@ -388,6 +389,8 @@ def test_without_optuna_it_names_the_extra_to_install(command, monkeypatch, caps
             )
         ),
         ("ppo", "ppo.yml"),
+        ("apg", "apg.yml"),
+        ("apg", "robust/apg.yml"),
     ],
 )
 def test_the_shipped_spaces_fit_the_shipped_settings(algo, file):
@@ -399,9 +402,14 @@ def test_the_shipped_spaces_fit_the_shipped_settings(algo, file):
         assert yaml.safe_load(yaml.safe_dump(settings)) == settings
         suggested = build_config(algo, config.env_id, settings)
         assert suggested.policy_kwargs["net_arch"] == config.policy_kwargs["net_arch"]
-        assert 0 < suggested.hyperparams["gamma"] < 1
+        assert 0 < suggested.hyperparams.get("gamma", 0.5) < 1
     if "thesis" not in file:
         assert space.start() is not None
+
+
+def test_every_algorithm_has_a_space():
+    for algo in ALGORITHMS:
+        assert SPACES.read(algo)[0]
 
 
 rewards = st.floats(-1e4, 1e4).map(lambda value: round(value, 3))
