@@ -18,7 +18,7 @@ from sb3_quad.simulation.observation import (
     turn_features,
 )
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.simulation.state import REFERENCE, X
+from sb3_quad.simulation.state import REFERENCE_PARTS, X, row_slices
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.simulation.tracks import ACCELERATION_STD
 from sb3_quad.vehicles.layout import find_turn
@@ -146,6 +146,10 @@ def compare(
     # What a file sees of the same states: the present features, without the position integral.
     present = settings.with_changes(history=None, last_action=False, position_integral=None)
     shown = QuadcopterBatch(batch.n, present)
+    # The same as if the target rested; apart from that the file is given what the target does.
+    resting = QuadcopterBatch(batch.n, present)
+    for part in ("target_velocity", "target_heading", "target_heading_rate"):
+        resting.tracks[:, row_slices(REFERENCE_PARTS)[part]] = 0.0
     ahead = np.zeros(3 * len(batch.previews))
     mean = np.append(trained.mean, ahead)
     std = np.append(trained.std, ahead + ACCELERATION_STD)
@@ -162,6 +166,7 @@ def compare(
         compared &= flying
         for name in ("state", "course", "streams"):
             getattr(shown, name)[...] = getattr(batch, name)
+            getattr(resting, name)[...] = getattr(batch, name)
         features = shown.observe() * std + mean
         if integral is not None:
             # So close to a limit, rounding may begin to integrate one step earlier or later.
@@ -170,15 +175,11 @@ def compare(
                 compared &= np.abs(norm / limit - 1.0) > ROUNDING
         references = []
         if relates:
-            # The same as if the target rested, and apart from it what it does.
             moving = batch.state[X.target_velocity :]
             heading = np.arctan2(moving[7], moving[6])
             numbers = np.stack([*moving[:3], heading, moving[8]], axis=1)
             references = [numbers.astype(np.float32, order="C")]
-            resting = shown.state[REFERENCE].copy()
-            resting[3:] = 0.0
-            shown.set_reference(resting, shown.rows(None))
-            features = shown.observe() * std + mean
+            features = resting.observe() * std + mean
         features[:, :OBSERVATION_SIZE] = features[:, :OBSERVATION_SIZE] @ turned
         results, file_state = call(features.astype(np.float32), file_state, *references)
         if trained.clip:
