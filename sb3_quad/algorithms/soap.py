@@ -8,6 +8,9 @@ import torch as th
 # How slowly the second moments of a matrix's gradients change, and updates between two bases
 MOMENT_DECAY = 0.95
 REFRESH = 5
+# Updates after which the rate is the full one. Second moments of a few gradients say little, and an
+# update moves weights along all eigenvectors by the same length.
+WARM_UP = 30
 
 
 class SOAP(th.optim.Adam):
@@ -22,7 +25,7 @@ class SOAP(th.optim.Adam):
     Its state holds all that Adam's does, so that ``PPO.load`` takes it for Adam's.
 
     :param params: parameters to learn, or groups of them, as for ``torch.optim.Adam``.
-    :param lr: the rate.
+    :param lr: the rate. In the first ``WARM_UP`` updates it rises to that.
     :param betas: how the momentum decays, and the second moments of biases.
     :param eps: is added to each deviation by which an update is divided.
     """
@@ -78,7 +81,7 @@ class SOAP(th.optim.Adam):
         update = momentum / (1.0 - beta**n) / deviation
         if is_matrix:
             update = left @ update @ right.T
-        parameter.sub_(update, alpha=group["lr"])
+        parameter.sub_(update, alpha=group["lr"] * min(1.0, n / WARM_UP))
 
     @staticmethod
     def _bases(state: dict[str, Any], gradient: th.Tensor) -> list[th.Tensor]:
