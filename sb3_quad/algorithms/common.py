@@ -354,9 +354,13 @@ def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
     """
     if env is None or not env.has_attr(KEY):
         return None
-    for wrapper in (gymnasium.ObservationWrapper, gymnasium.ActionWrapper):
-        if any(env.env_is_wrapped(wrapper)):
-            return None
+    changing = (
+        gymnasium.ObservationWrapper,
+        gymnasium.ActionWrapper,
+        gymnasium.wrappers.MaxAndSkipObservation,
+    )
+    if any(any(env.env_is_wrapped(wrapper)) for wrapper in changing):
+        return None
     settings: FlightSettings = env.get_attr(KEY, [0])[0]
     return settings if env.observation_space.shape == (settings.observation.size,) else None
 
