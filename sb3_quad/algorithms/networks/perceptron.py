@@ -10,6 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_quad.algorithms.networks.kernel import (
+    FEW,
     LINEAR,
     RELU,
     ROWS,
@@ -152,8 +153,9 @@ class Perceptron:
 
         :return: for what the layers give, (calls, ...), and for the sums of all calls.
         """
-        blocks = -(-n // ROWS)
-        size = int(self._widths.sum()) * ROWS
+        rows = FEW if n <= FEW else ROWS
+        blocks = -(-n // rows)
+        size = int(self._widths.sum()) * rows
         activations = _aligned(calls * blocks * size).reshape(calls, blocks, size)
         return activations, np.empty((_chunks(n), self._size), np.float32)
 
