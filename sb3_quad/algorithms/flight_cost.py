@@ -121,7 +121,10 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
 
 
 def body_rates_cost(flown: FlownStates) -> th.Tensor:
-    """Return a further cost of body rates at the target, (steps, n): |ω| / (1 + (d / 0.5)²)."""
+    """Return a further cost of body rates at the target, (steps, n).
+
+    It is ``|ω| / (1 + (d / 0.5)²)`` at the distance d, m.
+    """
     return length(flown.body_rates) / (1.0 + (flown.distance / COARSE) ** 2)
 
 
