@@ -34,20 +34,24 @@ from sb3_quad.controllers.zips import load_model
 from sb3_quad.simulation.settings import KEY, FlightSettings
 
 _SHARE = (0, 1)
-_COUNT = (1, 2**40)
 _WEIGHT = (0, 2**40)
+# Arguments that are whole numbers
+_COUNTS = (
+    "n_steps",
+    "batch_size",
+    "n_epochs",
+    "stats_window_size",
+    "buffer_size",
+    "train_freq",
+    "target_update_interval",
+    "substeps",
+)
 LIMITS = {
+    **dict.fromkeys(_COUNTS, (1, 2**40)),
     "learning_rate": _SHARE,
     "gamma": _SHARE,
     "gae_lambda": _SHARE,
     "tau": _SHARE,
-    "n_steps": _COUNT,
-    "batch_size": _COUNT,
-    "n_epochs": _COUNT,
-    "stats_window_size": _COUNT,
-    "buffer_size": _COUNT,
-    "train_freq": _COUNT,
-    "target_update_interval": _COUNT,
     "max_grad_norm": _WEIGHT,
     "clip_range": _WEIGHT,
     "clip_range_vf": _WEIGHT,
@@ -59,7 +63,6 @@ LIMITS = {
     "beta": _SHARE,
     "beta_final": _SHARE,
     "beta_decay": _WEIGHT,
-    "substeps": _COUNT,
     "max_row_ratio": (1, 2**40),
     "body_rates_coef": _WEIGHT,
     "low_force_coef": _WEIGHT,
@@ -160,16 +163,16 @@ class ExpertMixin:
         for name, value in [*vars(self).items()]:
             if isinstance(value, np.generic):
                 setattr(self, name, value.item())
-        for name, limits in LIMITS.items():
+        for name, (least, _) in LIMITS.items():
             value = getattr(self, name, None)
             if callable(value):
                 value = value(1.0)  # a schedule, at its start
             # Some arguments can be None, and train_freq a tuple.
             if value is None or isinstance(value, tuple):
                 continue
-            if not isinstance(value, (int, float)) or not value >= limits[0]:
-                raise ConfigError(f"{name} {value!r}: must be a number and at least {limits[0]}")
-            if limits is _COUNT and not isinstance(value, int):
+            if not isinstance(value, (int, float)) or not value >= least:
+                raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
+            if name in _COUNTS and not isinstance(value, int):
                 raise ConfigError(f"{name} {value!r}: must be a whole number")
         # PPO cannot load the None that DAgger allows.
         if getattr(self, "max_grad_norm", 0.0) is None:
