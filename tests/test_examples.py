@@ -340,7 +340,7 @@ def test_a_batch_of_ones_own_learns(run):
 
 
 def test_a_gradient_of_ones_own_leads_to_the_mark(run):
-    output = run("gradient_of_your_environment.py", "--updates", "20")
+    output = run("gradient_of_your_environment.py", "--updates", "40")
     before, after = map(float, re.findall(r"([\d.]+) m from the mark", output))
     assert after < 0.5 * before
 

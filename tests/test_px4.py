@@ -78,6 +78,7 @@ def test_nothing_but_the_position_is_relative_to_a_reference_that_moves():
 @pytest.mark.parametrize("noise", [0.0, {"relative": 0.05, "additive": 0.02}])
 def test_noise_does_not_show_what_is_hidden(noise):
     env = QuadcopterVecEnv(50, seed=1, features="px4", noise=noise, history=[0, 2])
+    env.reset()
     for _ in range(4):
         observation, *_ = env.step(np.zeros((50, 4), np.float32))
     assert not observation.reshape(50, 2, 18)[:, :, HIDDEN].any()
