@@ -18,6 +18,7 @@ from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import BoolArray, FloatArray, StrPath
 from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.motions import refuse_gaps
 from sb3_quad.simulation.physics import quaternion_product
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import (
@@ -90,13 +91,7 @@ def read_log(path: Path, step: float) -> Log:
     if len(table) < 2:
         raise ConfigError(f"{path}: fewer than two rows")
     # Commands may be missing where none came, and do not count there.
-    needed = table[["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS]]
-    unfit = np.argwhere(~np.isfinite(needed.to_numpy()))
-    if len(unfit):
-        row, column = unfit[0]
-        raise ConfigError(
-            f"{path}: row {row + 1}: {needed.columns[column]} is missing, or is not a finite number"
-        )
+    refuse_gaps(path, table[["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS]])
     # q and -q are the same attitude, but in between lie others.
     quaternions = table[CAPTURE_COLUMNS[QUATERNION]].to_numpy(copy=True)
     cosines = (quaternions[1:] * quaternions[:-1]).sum(axis=1)

@@ -56,13 +56,9 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
         )
     if len(frame) < 2:
         raise ConfigError(f"{path}: needs two or more rows behind the names of its columns")
+    frame.columns = names
+    refuse_gaps(path, frame)
     numbers = frame.to_numpy()
-    unfit = np.argwhere(~np.isfinite(numbers))
-    if len(unfit):
-        row, column = unfit[0]
-        raise ConfigError(
-            f"{path}: row {row + 1}: {names[column]} is missing, or is not a finite number"
-        )
     times = numbers[:, 0] - numbers[0, 0]
     falling = np.flatnonzero(np.diff(times) <= 0.0)
     if falling.size:
@@ -74,6 +70,19 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     # Headings may be given from -π to π: between two of them is the shorter way.
     numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)
     return times, numbers[:, 1:]
+
+
+def refuse_gaps(path: Path, frame: pd.DataFrame) -> None:
+    """Refuse a table of which a number is missing or not finite.
+
+    :raises ConfigError: names the row, counted from 1 behind the names, and the column.
+    """
+    unfit = np.argwhere(~np.isfinite(frame.to_numpy()))
+    if len(unfit):
+        row, column = unfit[0]
+        raise ConfigError(
+            f"{path}: row {row + 1}: {frame.columns[column]} is missing, or is not a finite number"
+        )
 
 
 def interpolated(times: FloatArray, points: FloatArray) -> Motion:
