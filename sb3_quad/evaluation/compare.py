@@ -19,6 +19,7 @@ from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
+from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.simulation.settings import KEY, FlightSettings, levels
 from sb3_quad.simulation.tasks import Task, in_words
@@ -124,7 +125,9 @@ def compare(
             how = settings[label].with_changes(task=task)
             metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
             comparison.setdefault(label, {})[name] = metrics[label]
-        comparison.tables.append(_task_table(name, metrics, settings, thesis_columns, n_flights))
+        comparison.tables.append(
+            _task_table(name, metrics, settings, suite, thesis_columns, n_flights)
+        )
     return comparison
 
 
@@ -165,14 +168,18 @@ def _task_table(
     task: str,
     metrics: Mapping[str, Metrics],
     settings: Mapping[str, FlightSettings],
+    suite: Suite,
     thesis_columns: Sequence[str],
     n_flights: int,
 ) -> Table:
-    """Return the table of some controllers that flew the same episodes of a task."""
+    """Return the table of some controllers that flew the same episodes of a task.
+
+    :param suite: the thesis's, which has the rows and what it published.
+    """
     vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
     first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
-    scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
+    scenario = suite.scenario(THESIS_SCENARIOS.get(task, "tracking"))
     reference = settings[next(iter(settings))].reference
     if reference is not None:
         # Nothing is published of targets that move.

@@ -28,7 +28,7 @@ from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.evaluation.supervisor import Supervisor
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.batch import MAX_ROWS
-from sb3_quad.simulation.checks import per_row, whole_number
+from sb3_quad.simulation.checks import load_vehicles, per_row, whole_number
 from sb3_quad.simulation.settings import KEY, FlightSettings, known_layout
 from sb3_quad.simulation.state import TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
@@ -226,11 +226,8 @@ def _warn_if_unlike(controller: Any, settings: FlightSettings) -> None:
     # A distribution has no particular vehicle.
     if settings.vehicles is not None:
         return
-    sources = (
-        settings.vehicle if isinstance(settings.vehicle, (list, tuple)) else [settings.vehicle]
-    )
-    vehicles = [first_vehicle(source, settings.rotor_layout) for source in sources]
-    warn_of_vehicle(controller, vehicles)
+    flown = load_vehicles(settings.vehicle_sources, settings.rotor_layout)
+    warn_of_vehicle(controller, flown)
     record = getattr(controller, KEY, None)
     if isinstance(record, dict):
         name = type(controller).__name__

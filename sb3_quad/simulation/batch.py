@@ -147,10 +147,10 @@ class QuadcopterBatch:
             NO_TRACKS if settings.reference is None else settings.reference.tracks(control_step)
         )
         self.previews = np.array(self.observation.preview or (), dtype=np.int64)
+        self.moves = RESTS if settings.reference is None else MOVES
         # A preview reads all that the rows of the target say of its motion.
-        self.moves = TURNS if tracks.has_heading or self.previews.size > 0 else RESTS
-        if settings.reference is not None:
-            self.moves = max(self.moves, MOVES)
+        if tracks.has_heading or self.previews.size > 0:
+            self.moves = TURNS
         self.tracks = tracks.table
         self.track_numbers = tracks.numbers()
         self.course = np.zeros((COURSE_SIZE, n * (len(tracks.table) > 0)))
@@ -184,10 +184,7 @@ class QuadcopterBatch:
         """
         self.distribution = settings.vehicles
         self.randomize = settings.randomize or Randomization()
-        sources = settings.vehicle
-        if not isinstance(sources, (list, tuple)):
-            sources = [sources]
-        vehicles = load_vehicles(sources, settings.rotor_layout)
+        vehicles = load_vehicles(settings.vehicle_sources, settings.rotor_layout)
         self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, self.n)
         self.base_vehicles = np.stack([vehicle.parameters() for vehicle in vehicles], axis=1)
         if len(vehicles) > 1:

@@ -92,6 +92,11 @@ class FlightSettings(ObservationSettings):
         return self
 
     @property
+    def vehicle_sources(self) -> list[Any]:
+        """The vehicles as a list, also where there is one for all rows."""
+        return list(self.vehicle) if isinstance(self.vehicle, (list, tuple)) else [self.vehicle]
+
+    @property
     def longest_episode(self) -> int:
         """Control steps of an episode; of the longest where rows differ."""
         return int(np.max(self.max_episode_steps))
