@@ -45,6 +45,12 @@ class Layers(NamedTuple):
     transposed: Float32Array
 
 
+@compiled
+def are_few(n):
+    """Return whether n rows lie in a block of ``FEW``; the memory for them must agree."""
+    return n <= FEW
+
+
 @compiled(fastmath=_FAST)
 def _multiply(w, x, h, size):
     """h = w x; w (rows, columns), x (columns, size), h (rows, size)."""
@@ -258,7 +264,7 @@ def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, act
     :param activations: (blocks, ``ROWS`` numbers for each unit), is written for :func:`pullback`;
         or (0, any).
     """
-    if len(index) <= FEW:
+    if are_few(len(index)):
         _forward_blocks(
             first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations, FEW
         )
@@ -342,50 +348,23 @@ def pullback(
     :param grad_inputs: float32 (m, inputs), is written.
     :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
     """
-    if len(index) <= FEW:
+    if are_few(len(index)):
         _pullback_blocks(
-            first_chunk,
-            last_chunk,
-            chunks,
-            scratch,
-            layers,
-            activations,
-            index,
-            grad_outputs,
-            grad_inputs,
-            sums,
-            FEW,
-        )
+            first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
+            grad_inputs, sums, FEW,
+        )  # fmt: skip
     else:
         _pullback_blocks(
-            first_chunk,
-            last_chunk,
-            chunks,
-            scratch,
-            layers,
-            activations,
-            index,
-            grad_outputs,
-            grad_inputs,
-            sums,
-            ROWS,
-        )
+            first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
+            grad_inputs, sums, ROWS,
+        )  # fmt: skip
 
 
 @compiled
 def _pullback_blocks(
-    first_chunk,
-    last_chunk,
-    chunks,
-    scratch,
-    layers,
-    activations,
-    index,
-    grad_outputs,
-    grad_inputs,
-    sums,
-    size,
-):
+    first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
+    grad_inputs, sums, size,
+):  # fmt: skip
     blocks = (len(index) + size - 1) // size
     behind = layers.widths.sum() * size
     for chunk in range(first_chunk, last_chunk):

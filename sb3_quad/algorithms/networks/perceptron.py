@@ -16,6 +16,7 @@ from sb3_quad.algorithms.networks.kernel import (
     ROWS,
     TANH,
     Layers,
+    are_few,
     forward,
     gradient,
     pullback,
@@ -153,7 +154,7 @@ class Perceptron:
 
         :return: for what the layers give, (calls, ...), and for the sums of all calls.
         """
-        rows = FEW if n <= FEW else ROWS
+        rows = FEW if are_few(n) else ROWS
         blocks = -(-n // rows)
         size = int(self._widths.sum()) * rows
         activations = _aligned(calls * blocks * size).reshape(calls, blocks, size)
