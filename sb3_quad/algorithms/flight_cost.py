@@ -111,7 +111,7 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     """
     d = flown.distance
     cost = d / (d + COARSE) + d / (d + FINE)
-    near = 1.0 / (1.0 + (d / COARSE) ** 2)
+    near = 1.0 / _farness(d)
     weight = 0.002 + BODY_RATES_WEIGHT * near
     cost = cost + weight * length(flown.body_rates) + 0.001 * (1.0 - flown.r33)
     cost = cost + HEADING * near * flown.heading_error
@@ -125,7 +125,12 @@ def body_rates_cost(flown: FlownStates) -> th.Tensor:
 
     It is ``|ω| / (1 + (d / 0.5)²)`` at the distance d, m.
     """
-    return length(flown.body_rates) / (1.0 + (flown.distance / COARSE) ** 2)
+    return length(flown.body_rates) / _farness(flown.distance)
+
+
+def _farness(d: th.Tensor) -> th.Tensor:
+    """Return by how much what costs at the target costs less at a distance d, m."""
+    return 1.0 + (d / COARSE) ** 2
 
 
 def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
