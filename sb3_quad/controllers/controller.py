@@ -155,8 +155,6 @@ class Controller:
         vehicles = env.get_attr("vehicle") if env.has_attr("vehicle") else ["itm"]
         source = resolve_expert(expert, vehicles[0])
         warn_of_vehicle(source, vehicles)
-        if env.has_attr(KEY):
-            warn_of_observation(f"expert {expert}", source, env.get_attr(KEY, [0])[0])
         controller = Controller(
             source,
             env.action_space,
@@ -165,6 +163,8 @@ class Controller:
             kind="expert",
             env=env,
         )
+        if env.has_attr(KEY):
+            warn_of_observation(controller._who, source, env.get_attr(KEY, [0])[0])
         if isinstance(source, BaseAlgorithm):
             controller._raw = unwrap_vec_normalize(env)
         controller.made_for = (expert, env)
