@@ -155,7 +155,7 @@ class BulletBody:
         state[QUATERNION, 0] = w, x, y, z
         state[VELOCITY, 0] = velocity
         # PyBullet's body rates are in the world frame.
-        state[BODY_RATES, 0] = to_body.py_func(rotation_rows.py_func(w, x, y, z), *rates)
+        state[BODY_RATES, 0] = to_body(rotation_rows(w, x, y, z), rates)
 
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""

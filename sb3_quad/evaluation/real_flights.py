@@ -156,7 +156,7 @@ def rotated_by(quaternion: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return attitudes, (n, 4), after rotations in body axes, (n, 3), rad."""
     half = 0.5 * np.linalg.norm(rotation, axis=1)
     axis = 0.5 * np.sinc(half / np.pi) * rotation.T
-    return np.stack(quaternion_product.py_func(*quaternion.T, np.cos(half), *axis), axis=1)
+    return np.stack(quaternion_product.py_func(quaternion.T, (np.cos(half), *axis)), axis=1)
 
 
 def open_loop(

@@ -9,7 +9,10 @@ import math
 import numpy as np
 
 from sb3_quad.experts.geometric_gains import G
-from sb3_quad.experts.vectors import (
+from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.physics import rotation, to_body, to_world
+from sb3_quad.simulation.state import AHEAD, P, W, X
+from sb3_quad.simulation.vectors import (
     cross,
     difference,
     divided,
@@ -17,9 +20,6 @@ from sb3_quad.experts.vectors import (
     total,
     vector_at,
 )
-from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.physics import rotation, to_body, to_world
-from sb3_quad.simulation.state import AHEAD, P, W, X
 
 
 @compiled
@@ -44,10 +44,10 @@ def fly_geometric(state, constants, wrench, actions):
         omega = vector_at(state, X.body_rates, i)
 
         # What the external wrench does: an acceleration in the world frame, a torque in the body's.
-        x, y, z = vector_at(wrench, W.force_body, j)
-        force = total(vector_at(wrench, W.force_world, j), to_world(body_to_world, x, y, z))
-        x, y, z = vector_at(wrench, W.torque_world, j)
-        torque = total(vector_at(wrench, W.torque_body, j), to_body(body_to_world, x, y, z))
+        pushed = to_world(body_to_world, vector_at(wrench, W.force_body, j))
+        force = total(vector_at(wrench, W.force_world, j), pushed)
+        turned = to_body(body_to_world, vector_at(wrench, W.torque_world, j))
+        torque = total(vector_at(wrench, W.torque_body, j), turned)
 
         # The force that the rotors should give per mass, and its direction b as the body will see
         # it when the command acts.
@@ -63,7 +63,7 @@ def fly_geometric(state, constants, wrench, actions):
             g,
         )
         size = math.sqrt(dot(f, f))
-        b = divided(to_body(body_to_world, f[0], f[1], f[2]), size)
+        b = divided(to_body(body_to_world, f), size)
         b = seen_later(b, omega, constants.lag[k])
 
         # Moments for the turn, against the yaw rate, and against the external torque.

@@ -6,10 +6,10 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
-from sb3_quad.experts.vectors import difference, vector_at
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.physics import rotation, to_body
 from sb3_quad.simulation.state import QuadcopterState, X
+from sb3_quad.simulation.vectors import difference, vector_at
 from sb3_quad.vehicles.vehicle import VehicleSource
 
 # The thesis takes φ_des and θ_des at a quarter, "to ensure smoother rotations" (3.2.1).
@@ -94,7 +94,7 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
         # The velocity in the body frame, and the Euler angles Z-Y-X.
         body_to_world = rotation(state[X.quaternion :], i)
         v = difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i))
-        vx, vy, vz = to_body(body_to_world, v[0], v[1], v[2])
+        vx, vy, vz = to_body(body_to_world, v)
         p, q, r = vector_at(state, X.body_rates, i)
         (r11, _, _), (r21, _, _), (r31, r32, r33) = body_to_world
         roll = math.atan2(r32, r33)

@@ -26,10 +26,7 @@ from sb3_quad.simulation.kernel import (
 from sb3_quad.simulation.observation import (
     DEFAULT_MEAN,
     DEFAULT_STD,
-    MOVES,
     OBSERVATION_SIZE,
-    RESTS,
-    TURNS,
 )
 from sb3_quad.simulation.random import new_streams
 from sb3_quad.simulation.randomization import Randomization
@@ -128,8 +125,6 @@ class QuadcopterBatch:
         if self.randomize.delay is not None:
             longest = max(longest, int(self.randomize.delay.high))
         self.queue = np.zeros((longest, 4, n))
-        is_shorter = self.base_vehicles[P.delay] < longest
-        self.own_delays = self.randomize.delay is not None or bool(is_shorter.any())
 
         # The frames that a policy sees besides the present features.
         self.observation = settings.observation
@@ -147,10 +142,8 @@ class QuadcopterBatch:
             NO_TRACKS if settings.reference is None else settings.reference.tracks(control_step)
         )
         self.previews = np.array(self.observation.preview or (), dtype=np.int64)
-        self.moves = RESTS if settings.reference is None else MOVES
         # A preview reads all that the rows of the target say of its motion.
-        if tracks.has_heading or self.previews.size > 0:
-            self.moves = TURNS
+        self.moves = settings.reference is not None or self.previews.size > 0
         self.tracks = tracks.table
         self.track_numbers = tracks.numbers()
         self.course = np.zeros((COURSE_SIZE, n * (len(tracks.table) > 0)))
@@ -305,7 +298,6 @@ class QuadcopterBatch:
             self.wrench,
             self.vehicles,
             self.physics_step,
-            self.own_delays,
         )
         return wrenches
 
@@ -426,11 +418,8 @@ class QuadcopterBatch:
 
     def _notice_motion(self) -> None:
         """Let steps read how targets move and turn, once one does."""
-        moves = MOVES if self.state[X.target_velocity :].any() else RESTS
-        if self.state[X.target_heading : X.target_ahead].any():
-            moves = TURNS
-        if moves > self.moves:
-            self.moves = moves
+        if not self.moves and self.state[X.target_velocity :].any():
+            self.moves = True
             self._bind()
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:

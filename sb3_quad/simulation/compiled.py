@@ -33,7 +33,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     differently under ``fastmath``.
     """
     if function is None:
-        return lambda inner: compiled(inner, **options)
+        return functools.partial(compiled, **options)
     dispatcher = numba.njit(error_model="numpy", nogil=True, forceinline=True, **options)(function)
     try:
         dispatcher.enable_caching()
@@ -70,7 +70,8 @@ def _source_stamp() -> str:
     digest = hashlib.sha256()
     for folder in _COMPILED_IN:
         for path in sorted((package / folder).glob("*.py")):
-            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+            digest.update(path.name.encode())
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

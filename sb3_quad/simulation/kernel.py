@@ -13,6 +13,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numba import float32
 
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled, inlined
 from sb3_quad.simulation.frames import (
@@ -22,11 +23,10 @@ from sb3_quad.simulation.frames import (
     store_action,
 )
 from sb3_quad.simulation.observation import (
+    FEATURE_SIZES,
     GUST_WORDS,
     NORMALS,
     OBSERVATION_SIZE,
-    RESTS,
-    TURNS,
     WORDS,
     observe,
 )
@@ -35,10 +35,8 @@ from sb3_quad.simulation.physics import (
     fly,
     moment,
     motor_factor,
-    store,
     total_thrust,
     turn_rotors,
-    vector,
 )
 from sb3_quad.simulation.random import STEP, gust_words
 from sb3_quad.simulation.reward import score, succeeds
@@ -53,13 +51,12 @@ from sb3_quad.simulation.state import (
     STATE_SIZE,
     WRENCH,
     WRENCH_SIZE,
-    P,
     X,
-    row_slices,
 )
 from sb3_quad.simulation.tasks import SCORED, T
 from sb3_quad.simulation.threads import DONE, LEFT, finish
 from sb3_quad.simulation.tracks import follow, observe_preview
+from sb3_quad.simulation.vectors import store, vector
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 CHUNK = 2 * LANES  # rows that a thread takes at once
@@ -88,28 +85,28 @@ OUTCOME = np.dtype(
 _CONTENTS: dict[str, dict[str, Any]] = {
     "i8": {"row": ()},  # of the batch
     "f8": {
-        "state": STATE_SIZE,
+        **STATE,
         # action, then the rotor speed it commands
         "command": 4,
         # rotor speeds to be reached in this control step
         "wanted_speeds": 4,
         "thrust": 4,  # of each rotor, N
-        "wrench": WRENCH_SIZE,
+        **WRENCH,
         "wind": 3,  # velocity of the air
-        "vehicle": len(PARAMETER_NAMES),
+        **dict.fromkeys(PARAMETER_NAMES, ()),
         # motor_factor of a rotor that speeds up, and of one that slows down
         "motor": 2,
         "velocity_gain": (),  # dt / m
         "rates_gain": 3,  # dt / I
         "fall": (),  # g dt
         "gyro": 3,  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
-        # Both divided by kF
-        "thrust_middle": (),
-        "thrust_half_range": (),
+        # of the squared rotor speeds that commands can be
+        "square_middle": (),
+        "square_half_range": (),
         "greatest_speed": (),  # of a rotor, with the battery as it is, rad/s
         "speed2": (),  # the larger of |v|² and |ω|²
         # limits and costs of the row's task
-        "scored": len(SCORED),
+        **dict.fromkeys(SCORED, ()),
         "reward": (),
         "distance": (),
     },
@@ -119,9 +116,24 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         "noise_level": (),  # relative
         "additive": (),  # level of the noise that is added, in σ
         "noise": NORMALS,
-        "feature": OBSERVATION_SIZE,
+        **{f"observed_{name}": size for name, size in FEATURE_SIZES.items()},
     },
     "u4": {"word": WORDS, "stream": 4},
+}
+# Rows of several quantities that follow each other: the first quantity, and the shape of them all
+_TOGETHER: dict[str, tuple[str, Any]] = {
+    "state": ("position", STATE_SIZE),
+    # the state with a target that rests
+    "resting": ("position", X.target_velocity),
+    "wrench": ("force_world", WRENCH_SIZE),
+    "vehicle": (PARAMETER_NAMES[0], len(PARAMETER_NAMES)),
+    "inertia": ("ixx", 3),
+    "drag": ("drag_x", 3),
+    # the moment of each rotor per thrust, by axis
+    "arm": ("roll_arm_0", (3, 4)),
+    "scored": (SCORED[0], len(SCORED)),
+    "scaling": ("mean", 2 * OBSERVATION_SIZE + 2),
+    "feature": ("observed_position", OBSERVATION_SIZE),
 }
 
 
@@ -136,27 +148,9 @@ def _block_type() -> Any:
         for name, shape in shapes.items():
             columns.append((name, kind, (*np.empty(shape).shape, LANES)))
     fields: Any = dict(np.dtype(columns).fields or {})
-    aliases: list[tuple[str, str, int, Any]] = [
-        ("vehicle", "inertia", P.ixx, 3),
-        ("vehicle", "drag", P.drag_x, 3),
-        ("vehicle", "lift", P.thrust_coefficient, ()),
-        ("vehicle", "exact", P.exact_motors, ()),
-        ("vehicle", "shared", P.shared_saturation, ()),
-        ("vehicle", "radius", P.collision_radius, ()),
-        ("vehicle", "delay", P.delay, ()),
-        # The moment of each rotor per thrust, by axis
-        ("vehicle", "arm", P.roll_arm_0, (3, 4)),
-    ]
-    for whole, sizes in (("state", STATE), ("wrench", WRENCH)):
-        for name, part in row_slices(sizes).items():
-            aliases.append((whole, name, part.start, sizes[name]))
-    aliases += [("scored", name, row, ()) for row, name in enumerate(SCORED)]
-    # The state with a target that rests
-    aliases.append(("state", "resting", 0, X.target_velocity))
-    for whole, name, row, shape in aliases:
-        # Rows of the whole, float64, from one row on
-        place = fields[whole][1] + 8 * LANES * row
-        fields[name] = np.dtype(("f8", (*np.empty(shape).shape, LANES))), place
+    for name, (first, shape) in _TOGETHER.items():
+        quantity, place = fields[first][:2]
+        fields[name] = np.dtype((quantity.base, (*np.empty(shape).shape, LANES))), place
     return np.dtype(fields)
 
 
@@ -172,7 +166,7 @@ def step(
     task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations,
     moves, for_px4, course, tracks, track_numbers, previews,
-    physics_step, substeps, own_delays, autoreset,
+    physics_step, substeps, autoreset,
 ):  # fmt: skip
     """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
     :func:`.threads.share_out`.
@@ -209,13 +203,12 @@ def step(
     :param limits: int64 (n,), control steps of the episodes under way; ``max_steps`` (n,), of those
         that follow.
     :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
-    :param moves: ``RESTS``, ``MOVES`` or ``TURNS``, see :func:`.observation.features`; while they
-        rest, the rows of the state behind the target's position are not read.
+    :param moves: whether references move or have a heading; else the rows of the state behind the
+        target's position are not read.
     :param for_px4: whether observations are those of ``features: px4``.
     :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, as for ``tracks`` and
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
-    :param own_delays: whether delays differ by row.
     :param autoreset: whether a row that ends begins its next episode within the same step.
     :return: False if an action is not finite, and then nothing has happened.
     """
@@ -228,7 +221,7 @@ def step(
     blocks = new_block()
     b = blocks[0]
     b.row[:] = 0
-    load_constants(b, 0, 1, True, scaling, vehicles, task_index, task_parameters, physics_step)
+    load_constants(b, 0, True, scaling, vehicles, task_index, task_parameters, physics_step)
 
     # The rows whose observations are due at the end: those that begin an episode, or all in LOOK.
     due = np.empty(n, np.int64)
@@ -252,35 +245,30 @@ def step(
             for lane in range(LANES):
                 b.row[lane] = first + min(lane, count - 1)
             load_constants(
-                b, first, count, False, scaling, vehicles, task_index, task_parameters,
+                b, first, False, scaling, vehicles, task_index, task_parameters,
                 physics_step,
             )  # fmt: skip
-            if moves != RESTS and tracks.shape[0] == 0:
-                load_rows(state, first, count, b.state)
+            if moves and tracks.shape[0] == 0:
+                load_rows(state, first, b.state)
             else:
-                load_rows(state, first, count, b.resting)
+                load_rows(state, first, b.resting)
             if mode == FLY:
                 # Gusts add to what was set or sampled.
-                load_rows(wrench, first, count, b.wrench)
-                load_rows(wind, first, count, b.wind)
+                load_rows(wrench, first, b.wrench)
+                load_rows(wind, first, b.wind)
                 add_gusts(b.force_world, gust, first, count)
                 add_gusts(b.wind, wind_gust, first, count)
-                _load_commands(b, first, count, actions, queue, own_delays)
+                _load_commands(b, first, count, actions, queue)
                 fly(b, physics_step, substeps)
-                for k in range(X.target):
-                    for lane in range(count):
-                        state[k, first + lane] = b.state[k, lane]
+                save_rows(b.state[: X.target], first, count, state)
             if tracks.shape[0] > 0:
-                turns = moves == TURNS
-                follow(b, 1, turns, state, streams, course, tracks, track_numbers)
-                for axis in range(3):
-                    for lane in range(count):
-                        state[X.target + axis, first + lane] = b.target[axis, lane]
+                follow(b, 1, state, streams, course, tracks, track_numbers)
+                save_rows(b.target, first, count, state[X.target :])
             score(b)
             # The noise of the observation is that of the next step.
             for lane in range(count):
-                streams[STEP, first + lane] += np.uint32(1)
-            load_rows(streams, first, count, b.stream)
+                streams[STEP, first + lane] += 1
+            load_rows(streams, first, b.stream)
             observe(b, moves, for_px4)
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)
@@ -292,21 +280,13 @@ def step(
                 # A policy sees more than the present features.
                 for lane in range(count):
                     i = first + lane
-                    store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
+                    store_action(i, b.stream[STEP, lane], actions[i], frames)
                     if integral.shape[0] > 0:
                         integrate_position(b, i, lane, integral_numbers, integral)
             _write_observations(
-                b,
-                count,
-                integral,
-                ages,
-                frames,
-                previews,
-                course,
-                tracks,
-                track_numbers,
+                b, count, integral, ages, frames, previews, course, tracks, track_numbers,
                 observations,
-            )
+            )  # fmt: skip
             ended = _end_episodes(
                 b, first, count, autoreset, observations, rewards, dones, returns, limits,
                 outcome, last_observations,
@@ -345,7 +325,7 @@ def step(
             for k in range(4):
                 b.stream[k, lane] = streams[k, b.row[lane]]
         if tracks.shape[0] > 0:
-            follow(b, 0, moves == TURNS, state, streams, course, tracks, track_numbers)
+            follow(b, 0, state, streams, course, tracks, track_numbers)
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
         observe(b, moves, for_px4)
@@ -365,7 +345,7 @@ BATCH_ARGUMENTS = _ARGUMENTS[_ARGUMENTS.index("state") :]
 
 
 @compiled
-def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, own_delays):
+def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step):
     """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body
     itself.
 
@@ -378,18 +358,19 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, o
     """
     blocks = new_block()
     blocks[0].row[:] = 0
-    load_rows(state, 0, 1, blocks[0].state)
-    load_rows(wrench, 0, 1, blocks[0].wrench)
-    load_vehicles(blocks[0], vehicles, 0, 1, physics_step)
-    _load_commands(blocks[0], 0, 1, actions, queue, own_delays)
+    load_rows(state, 0, blocks[0].state)
+    load_rows(wrench, 0, blocks[0].wrench)
+    load_vehicles(blocks[0], vehicles, 0, physics_step)
+    _load_commands(blocks[0], 0, 1, actions, queue)
+    b = blocks[0]
+    out[:, 0] = b.force_body[:, 0]
+    out[:, 1] = b.torque_body[:, 0]
     for substep in range(len(out)):
-        b = blocks[0]
         turn_rotors(b, 0)
-        for axis in range(3):
-            out[substep, 0, axis] = b.force_body[axis, 0]
-            out[substep, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0)
         out[substep, 0, 2] += total_thrust(b, 0)
-        state[X.rotor_speeds : X.target, 0] = b.rotor_speeds[:, 0]
+        for axis in range(3):
+            out[substep, 1, axis] += moment(b, axis, 0)
+    state[X.rotor_speeds : X.target, 0] = blocks[0].rotor_speeds[:, 0]
 
 
 @compiled
@@ -412,22 +393,28 @@ def _is_finite(actions):
 
 
 @compiled
-def load_rows(source, first, count, target):
-    """Copy some columns of a (rows, n) array to a block, or its only column to all lanes."""
+def load_rows(source, first, target):
+    """Copy the columns of a block from a (rows, n) array, or its only column to all lanes."""
+    last = min(first + LANES, source.shape[1]) - 1
     for k in range(target.shape[0]):
-        if source.shape[1] == 1:
-            for lane in range(LANES):
-                target[k, lane] = source[k, 0]
-        elif count == LANES:
+        if last - first == LANES - 1:
             for lane in range(LANES):
                 target[k, lane] = source[k, first + lane]
         else:
             for lane in range(LANES):
-                target[k, lane] = source[k, first + min(lane, count - 1)]
+                target[k, lane] = source[k, min(first + lane, last)]
+
+
+@compiled
+def save_rows(source, first, count, target):
+    """Copy the first lanes of a block to columns of a (rows, n) array."""
+    for k in range(source.shape[0]):
+        for lane in range(count):
+            target[k, first + lane] = source[k, lane]
 
 
 @inlined
-def load_constants(b, first, count, shared, scaling, vehicles, task_index, tasks, dt):
+def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
     """Load what does not change during an episode: scaling, vehicles, limits and costs.
 
     :param shared: whether to load what is the same for all rows, once for all blocks of a call, or
@@ -436,7 +423,7 @@ def load_constants(b, first, count, shared, scaling, vehicles, task_index, tasks
     if (scaling.shape[1] == 1) == shared:
         load_scaling(b, scaling)
     if (vehicles.shape[1] == 1) == shared:
-        load_vehicles(b, vehicles, first, count, dt)
+        load_vehicles(b, vehicles, first, dt)
     if (tasks.shape[0] == 1) == shared:
         # Limits and costs are the last columns of a task.
         for lane in range(LANES):
@@ -446,24 +433,23 @@ def load_constants(b, first, count, shared, scaling, vehicles, task_index, tasks
 
 
 @inlined
-def load_vehicles(b, vehicles, first, count, dt):
+def load_vehicles(b, vehicles, first, dt):
     """Load the vehicles of a block, with the divisions of a control step done."""
-    load_rows(vehicles, first, count, b.vehicle)
-    v = b.vehicle
+    load_rows(vehicles, first, b.vehicle)
     for lane in range(LANES):
-        lift = b.lift[lane]
-        exact = b.exact[lane]
-        b.motor[0, lane] = motor_factor(v[P.motor_gain_up, lane], exact, dt)
-        b.motor[1, lane] = motor_factor(v[P.motor_gain_down, lane], exact, dt)
-        b.thrust_middle[lane] = v[P.thrust_middle, lane] / lift
-        b.thrust_half_range[lane] = v[P.thrust_half_range, lane] / lift
-        most = b.thrust_middle[lane] + b.thrust_half_range[lane]
-        b.greatest_speed[lane] = math.sqrt(most * v[P.battery, lane])
-        b.velocity_gain[lane] = dt / v[P.mass, lane]
-        b.fall[lane] = dt * v[P.gravity, lane]
+        lift = b.thrust_coefficient[lane]
+        exact = b.exact_motors[lane]
+        b.motor[0, lane] = motor_factor(b.motor_gain_up[lane], exact, dt)
+        b.motor[1, lane] = motor_factor(b.motor_gain_down[lane], exact, dt)
+        b.square_middle[lane] = b.thrust_middle[lane] / lift
+        b.square_half_range[lane] = b.thrust_half_range[lane] / lift
+        most = b.square_middle[lane] + b.square_half_range[lane]
+        b.greatest_speed[lane] = math.sqrt(most * b.battery[lane])
+        b.velocity_gain[lane] = dt / b.mass[lane]
+        b.fall[lane] = dt * b.gravity[lane]
         ixx, iyy, izz = vector(b.inertia, lane)
-        store(b.gyro, lane, izz - iyy, ixx - izz, iyy - ixx)
-        store(b.rates_gain, lane, dt / ixx, dt / iyy, dt / izz)
+        store(b.gyro, lane, (izz - iyy, ixx - izz, iyy - ixx))
+        store(b.rates_gain, lane, (dt / ixx, dt / iyy, dt / izz))
 
 
 @compiled
@@ -471,19 +457,18 @@ def load_scaling(b, scaling):
     """Load μ, 1/σ and the noise levels of a block, in float32."""
     for lane in range(LANES):
         i = 0 if scaling.shape[1] == 1 else b.row[lane]
-        b.noise_level[lane] = scaling[2 * OBSERVATION_SIZE, i]
-        b.additive[lane] = scaling[2 * OBSERVATION_SIZE + 1, i]
+        for k in range(b.scaling.shape[0]):
+            b.scaling[k, lane] = scaling[k, i]
         for k in range(OBSERVATION_SIZE):
-            b.mean[k, lane] = scaling[k, i]
-            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(scaling[OBSERVATION_SIZE + k, i])
+            b.inverse_std[k, lane] = float32(1.0) / b.inverse_std[k, lane]
 
 
 @inlined
-def _load_commands(b, first, count, actions, queue, own_delays):
+def _load_commands(b, first, count, actions, queue):
     """Put the commands of a block into the queue, and take those that are due to
     ``b.wanted_speeds``.
 
-    A command enters at the queue's end, or where delays differ at the row's own delay.
+    A command enters at the row's own delay; the queue is as long as the longest.
     """
     command = b.command
     wanted = b.wanted_speeds
@@ -494,11 +479,9 @@ def _load_commands(b, first, count, actions, queue, own_delays):
             command[k, lane] = actions[b.row[lane], k]
     command_rotors(b)
     if delay == 0:
-        for k in range(4):
-            for lane in range(LANES):
-                wanted[k, lane] = command[k, lane]
+        wanted[:] = command
         return
-    load_rows(queue[0], first, count, wanted)
+    load_rows(queue[0], first, wanted)
     for k in range(4):
         for late in range(delay - 1):
             # Views, and both values read whichever is taken: else the loop is not vectorised.
@@ -507,14 +490,12 @@ def _load_commands(b, first, count, actions, queue, own_delays):
             for lane in range(count):
                 new = command[k, lane]
                 old = behind[lane]
-                here[lane] = new if own_delays and own[lane] == late + 1.0 else old
-        if own_delays:
-            for lane in range(LANES):
-                new = command[k, lane]
-                old = wanted[k, lane]
-                wanted[k, lane] = new if own[lane] == 0.0 else old
-        for lane in range(count):
-            queue[delay - 1, k, first + lane] = command[k, lane]
+                here[lane] = new if own[lane] == late + 1.0 else old
+        for lane in range(LANES):
+            new = command[k, lane]
+            old = wanted[k, lane]
+            wanted[k, lane] = new if own[lane] == 0.0 else old
+    save_rows(command, first, count, queue[delay - 1])
 
 
 @compiled
@@ -528,8 +509,7 @@ def _write_observations(
             for k in range(OBSERVATION_SIZE):
                 out[i, k] = b.feature[k, lane]
         else:
-            since = np.int64(b.stream[STEP, lane])
-            observe_frames(b, i, since, lane, integral, ages, frames, out)
+            observe_frames(b, i, b.stream[STEP, lane], lane, integral, ages, frames, out)
     if previews.size > 0:
         observe_preview(b, count, previews, course, tracks, track_numbers, out)
 
@@ -550,7 +530,7 @@ def _end_episodes(
         i = first + lane
         returns[i] += b.reward[lane]
         rewards[i] = b.reward[lane]
-        crashed = height[lane] <= b.radius[lane]
+        crashed = height[lane] <= b.collision_radius[lane]
         out_of_range = distance[lane] > b.max_distance[lane]
         dones[i] = crashed | out_of_range | (b.stream[STEP, lane] >= limits[i])
         ended += dones[i]
@@ -561,13 +541,14 @@ def _end_episodes(
         i = first + lane
         if autoreset and not dones[i]:
             continue
-        outcome[i].collision = height[lane] <= b.radius[lane]
-        outcome[i].out_of_range = distance[lane] > b.max_distance[lane]
-        outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
-        outcome[i].success = outcome[i].truncated and succeeds(b, lane)
-        outcome[i].distance = distance[lane]
-        outcome[i].total = returns[i]
-        outcome[i].reward = b.reward[lane]
-        outcome[i].length = b.stream[STEP, lane]
+        end = outcome[i]
+        end.collision = height[lane] <= b.collision_radius[lane]
+        end.out_of_range = distance[lane] > b.max_distance[lane]
+        end.truncated = not (end.collision or end.out_of_range)
+        end.success = end.truncated and succeeds(b, lane)
+        end.distance = distance[lane]
+        end.total = returns[i]
+        end.reward = b.reward[lane]
+        end.length = b.stream[STEP, lane]
         last_observations[i] = observations[i]
     return ended

@@ -12,9 +12,18 @@ from numba import float32
 
 from sb3_quad.base.types import FloatArray
 from sb3_quad.simulation.compiled import LANES, fast, inlined
-from sb3_quad.simulation.physics import rotation, store, to_body, vector
+from sb3_quad.simulation.physics import rotation, to_body
 from sb3_quad.simulation.random import random_words, standard_normals
 from sb3_quad.simulation.state import first_rows, row_slices
+from sb3_quad.simulation.vectors import (
+    difference,
+    dot,
+    store,
+    transposed,
+    turn,
+    vector,
+    vector_at,
+)
 from sb3_quad.vehicles.layout import Turn
 
 
@@ -46,17 +55,14 @@ FEATURES = (
     Feature("velocity", "velocity", _XYZ, 5.0, "m/s", "body"),
     Feature("body_rates", "body_rate", _XYZ, 5.0, "rad/s", "body"),
 )
-_SIZES = {feature.name: len(feature.parts) for feature in FEATURES}
-F = first_rows(_SIZES)
-GROUPS = row_slices(_SIZES)
+FEATURE_SIZES = {feature.name: len(feature.parts) for feature in FEATURES}
+F = first_rows(FEATURE_SIZES)
+GROUPS = row_slices(FEATURE_SIZES)
 """The place of each group in an observation, by its name."""
 FEATURE_NAMES = tuple(f"{feature.prefix}_{part}" for feature in FEATURES for part in feature.parts)
 OBSERVATION_SIZE = len(FEATURE_NAMES)
 DEFAULT_MEAN = np.zeros(OBSERVATION_SIZE)
-DEFAULT_STD = np.repeat([feature.std for feature in FEATURES], list(_SIZES.values()))
-
-# What a reference does: rest, move, or move and turn
-RESTS, MOVES, TURNS = range(3)
+DEFAULT_STD = np.repeat([feature.std for feature in FEATURES], list(FEATURE_SIZES.values()))
 
 # The noise takes a random word for each normal, and normals come in pairs. Two words for a gust
 # follow. Random words come in fours.
@@ -89,32 +95,31 @@ def features(b, moves, for_px4):
 
     They go to ``b.feature``, float32.
 
-    :param moves: ``RESTS``, ``MOVES`` or ``TURNS``: what references do; with the last they have a
-        heading.
+    :param moves: whether references move or have a heading.
     :param for_px4: whether the velocity has world axes, and nothing but the position is relative.
     """
     _features_at_rest(b, for_px4)
-    if moves != RESTS and not for_px4:
+    if moves and not for_px4:
         _relate(b)
-        if moves == TURNS:
-            _turn(b)
+        _turn(b)
 
 
 @fast
 def _features_at_rest(b, for_px4):
-    out = b.feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
-        vx, vy, vz = vector(b.velocity, lane)
+        v = vector(b.velocity, lane)
         if not for_px4:
-            vx, vy, vz = to_body(r, vx, vy, vz)
-        for k in range(3):
-            out[F.position + k, lane] = float32(b.position[k, lane] - b.target[k, lane])
-            out[F.body_rates + k, lane] = float32(b.body_rates[k, lane])
-            # From world to body: the transpose of r
-            for row in range(3):
-                out[F.rotation + 3 * row + k, lane] = float32(r[k][row])
-        store(out[F.velocity :], lane, float32(vx), float32(vy), float32(vz))
+            v = to_body(r, v)
+        offset = difference(vector(b.position, lane), vector(b.target, lane))
+        store(b.observed_position, lane, offset)
+        # From world to body: the columns of r
+        x, y, z = transposed(r)
+        store(b.observed_rotation, lane, x)
+        store(b.observed_rotation[3:], lane, y)
+        store(b.observed_rotation[6:], lane, z)
+        store(b.observed_velocity, lane, v)
+        store(b.observed_body_rates, lane, vector(b.body_rates, lane))
 
 
 @inlined
@@ -129,16 +134,12 @@ def heading_of(b, lane):
 @fast
 def _relate(b):
     """Make the velocity relative to that of a reference, in place."""
-    out = b.feature
     for lane in range(LANES):
-        ux = float32(b.target_velocity[0, lane])
-        uy = float32(b.target_velocity[1, lane])
-        uz = float32(b.target_velocity[2, lane])
+        x, y, z = vector(b.target_velocity, lane)
+        velocity = float32(x), float32(y), float32(z)
         for row in range(3):
-            x = out[F.rotation + 3 * row, lane]
-            y = out[F.rotation + 3 * row + 1, lane]
-            z = out[F.rotation + 3 * row + 2, lane]
-            out[F.velocity + row, lane] -= ux * x + uy * y + uz * z
+            axis = vector_at(b.observed_rotation, 3 * row, lane)
+            b.observed_velocity[row, lane] -= dot(velocity, axis)
 
 
 @fast
@@ -146,21 +147,14 @@ def _turn(b):
     """Turn the world axes of features to the heading of a reference, in place; body rates become
     relative to its rate.
     """
-    out = b.feature
     for lane in range(LANES):
         c, s = heading_of(b, lane)
         cosine, sine = float32(c), float32(s)
         rate = float32(b.target_heading_rate[0, lane])
         for row in range(3):
-            x = out[F.rotation + 3 * row, lane]
-            y = out[F.rotation + 3 * row + 1, lane]
-            z = out[F.rotation + 3 * row + 2, lane]
-            out[F.body_rates + row, lane] -= rate * z
-            out[F.rotation + 3 * row, lane] = cosine * x + sine * y
-            out[F.rotation + 3 * row + 1, lane] = cosine * y - sine * x
-        x, y = out[F.position, lane], out[F.position + 1, lane]
-        out[F.position, lane] = cosine * x + sine * y
-        out[F.position + 1, lane] = cosine * y - sine * x
+            turn(b.observed_rotation, 3 * row, lane, cosine, sine)
+            b.observed_body_rates[row, lane] -= rate * b.observed_rotation[3 * row + 2, lane]
+        turn(b.observed_position, 0, lane, cosine, sine)
 
 
 @inlined
@@ -203,14 +197,10 @@ def observe(b, moves, for_px4):
     standard_normals(b)
     _disturb_and_scale(b)
     if for_px4:
-        clear_hidden(b.feature)
+        clear_hidden(b.observed_rotation)
 
 
 @inlined
-def clear_hidden(values):
-    """Clear what PX4's module does not show, the last column of the rotation matrix.
-
-    :param values: by feature, (OBSERVATION_SIZE, LANES).
-    """
-    for row in range(3):
-        values[F.rotation + 3 * row + 2] = 0.0
+def clear_hidden(rotation):
+    """Clear what PX4's module does not show, the last column of the rotation matrix, (9, LANES)."""
+    rotation[2::3] = 0.0

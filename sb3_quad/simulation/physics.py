@@ -11,13 +11,24 @@ exponential of ω dt. The difference from PyBullet is rounding (1e-12 over 400 c
 The body rates are kept in the body frame: a rotation about ω leaves ω as it is, so PyBullet's
 world-frame update is the same.
 
-Functions with a ``lane`` compute one vehicle of a block, the others a whole block. The loops over
-three axes are written out where each axis has a formula of its own.
+Functions with a ``lane`` compute one vehicle of a block, the others a whole block.
 """
 
 import math
 
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
+from sb3_quad.simulation.vectors import (
+    difference,
+    dot,
+    four,
+    product,
+    scaled,
+    store,
+    times,
+    total,
+    transposed,
+    vector,
+)
 
 MAX_COORDINATE_VELOCITY = 100.0  # btMultiBody's m_maxCoordinateVelocity, m/s and rad/s
 
@@ -40,37 +51,15 @@ def rotation(quaternion, lane):
 
 
 @inlined
-def vector(rows, lane):
-    """Return x, y and z of a lane."""
-    return rows[0, lane], rows[1, lane], rows[2, lane]
-
-
-@inlined
-def four(rows, lane):
-    """Return the four numbers of a lane, such as those of its quaternion."""
-    return rows[0, lane], rows[1, lane], rows[2, lane], rows[3, lane]
-
-
-@inlined
-def store(rows, lane, x, y, z):
-    """Write x, y and z of a lane."""
-    rows[0, lane] = x
-    rows[1, lane] = y
-    rows[2, lane] = z
-
-
-@inlined
-def to_world(r, x, y, z):
+def to_world(r, a):
     """Rotate a vector from the body frame to the world frame."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = r
-    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+    return times(r, a)
 
 
 @inlined
-def to_body(r, x, y, z):
+def to_body(r, a):
     """Rotate a vector from the world frame to the body frame."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = r
-    return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
+    return times(transposed(r), a)
 
 
 @fast
@@ -86,7 +75,7 @@ def command_rotors(b):
 def rotor_speed(b, lane, action):
     """Return the rotor speed that an action commands, rad/s (Eqs. 3.18 and 2.4)."""
     bounded = min(max(action, -1.0), 1.0)
-    return math.sqrt(b.thrust_middle[lane] + b.thrust_half_range[lane] * bounded)
+    return math.sqrt(b.square_middle[lane] + b.square_half_range[lane] * bounded)
 
 
 @inlined
@@ -99,7 +88,7 @@ def limit_speeds(b, speeds, lane):
     """
     greatest = b.greatest_speed[lane]
     s0, s1, s2, s3 = four(speeds, lane)
-    excess = max(max(max(s0, s1), max(s2, s3)) - greatest, 0.0) * b.shared[lane]
+    excess = max(max(s0, s1, s2, s3) - greatest, 0.0) * b.shared_saturation[lane]
     for k in range(4):
         speeds[k, lane] = max(min(speeds[k, lane] - excess, greatest), 0.0)
 
@@ -129,7 +118,8 @@ def turn_rotors(b, lane):
         old = b.rotor_speeds[k, lane]
         missing = b.wanted_speeds[k, lane] - old
         new = old + missing * (speeding_up if missing > 0.0 else slowing_down)
-        b.thrust[k, lane] = b.lift[lane] * new * (new + b.exact[lane] * (old - new))
+        middle = new + b.exact_motors[lane] * (old - new)
+        b.thrust[k, lane] = b.thrust_coefficient[lane] * new * middle
         b.rotor_speeds[k, lane] = new
 
 
@@ -154,39 +144,34 @@ def accelerate(b):
 
     :return: whether some velocity may exceed PyBullet's limit.
     """
-    v = b.velocity
-    w = b.body_rates
     for lane in range(LANES):
         # The rotors come first: their thrusts are those of this physics step.
         turn_rotors(b, lane)
         r = rotation(b.quaternion, lane)
 
         # The force without gravity, first in the body frame. Drag is that of the airspeed.
-        vx, vy, vz = vector(v, lane)
-        wind_x, wind_y, wind_z = vector(b.wind, lane)
-        ux, uy, uz = to_body(r, vx - wind_x, vy - wind_y, vz - wind_z)
-        fx = b.force_body[0, lane] - b.drag[0, lane] * ux
-        fy = b.force_body[1, lane] - b.drag[1, lane] * uy
-        fz = b.force_body[2, lane] - b.drag[2, lane] * uz + total_thrust(b, lane)
-        fx, fy, fz = to_world(r, fx, fy, fz)
-        vx += b.velocity_gain[lane] * (b.force_world[0, lane] + fx)
-        vy += b.velocity_gain[lane] * (b.force_world[1, lane] + fy)
-        vz += b.velocity_gain[lane] * (b.force_world[2, lane] + fz) - b.fall[lane]
+        v = vector(b.velocity, lane)
+        airspeed = to_body(r, difference(v, vector(b.wind, lane)))
+        drag = product(vector(b.drag, lane), airspeed)
+        fx, fy, fz = difference(vector(b.force_body, lane), drag)
+        force = to_world(r, (fx, fy, fz + total_thrust(b, lane)))
+        force = total(vector(b.force_world, lane), force)
+        fall = (0.0, 0.0, b.fall[lane])
+        v = total(v, difference(scaled(b.velocity_gain[lane], force), fall))
 
         # Euler's equations in the body frame
-        gx, gy, gz = vector(b.torque_world, lane)
-        tx, ty, tz = to_body(r, gx, gy, gz)
-        wx, wy, wz = vector(w, lane)
-        tx += b.torque_body[0, lane] - b.gyro[0, lane] * wy * wz + moment(b, 0, lane)
-        ty += b.torque_body[1, lane] - b.gyro[1, lane] * wz * wx + moment(b, 1, lane)
-        tz += b.torque_body[2, lane] - b.gyro[2, lane] * wx * wy + moment(b, 2, lane)
-        wx += b.rates_gain[0, lane] * tx
-        wy += b.rates_gain[1, lane] * ty
-        wz += b.rates_gain[2, lane] * tz
+        torque = to_body(r, vector(b.torque_world, lane))
+        w = vector(b.body_rates, lane)
+        wx, wy, wz = w
+        in_body = vector(b.torque_body, lane)
+        gyroscopic = product(vector(b.gyro, lane), (wy * wz, wz * wx, wx * wy))
+        moments = moment(b, 0, lane), moment(b, 1, lane), moment(b, 2, lane)
+        torque = total(torque, total(difference(in_body, gyroscopic), moments))
+        w = total(w, product(vector(b.rates_gain, lane), torque))
 
-        store(v, lane, vx, vy, vz)
-        store(w, lane, wx, wy, wz)
-        b.speed2[lane] = max(wx * wx + wy * wy + wz * wz, vx * vx + vy * vy + vz * vz)
+        store(b.velocity, lane, v)
+        store(b.body_rates, lane, w)
+        b.speed2[lane] = max(dot(w, w), dot(v, v))
     # In a loop of its own: a sum over lanes keeps the one above from being vectorised.
     over = 0
     for lane in range(LANES):
@@ -195,30 +180,28 @@ def accelerate(b):
 
 
 @compiled
-def _limit(value):
-    return min(max(value, -MAX_COORDINATE_VELOCITY), MAX_COORDINATE_VELOCITY)
+def _limited(a):
+    low, high = -MAX_COORDINATE_VELOCITY, MAX_COORDINATE_VELOCITY
+    x, y, z = a
+    return min(max(x, low), high), min(max(y, low), high), min(max(z, low), high)
 
 
 @compiled
 def limit_velocities(b):
     """Limit each world component of v and ω as PyBullet does, in the rare lanes that exceed it."""
-    v = b.velocity
-    w = b.body_rates
     for lane in range(LANES):
-        for k in range(3):
-            v[k, lane] = _limit(v[k, lane])
-        wx, wy, wz = vector(w, lane)
-        if wx * wx + wy * wy + wz * wz <= MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY:
-            continue
-        r = rotation(b.quaternion, lane)
-        wx, wy, wz = to_world(r, wx, wy, wz)
-        wx, wy, wz = to_body(r, _limit(wx), _limit(wy), _limit(wz))
-        store(w, lane, wx, wy, wz)
+        store(b.velocity, lane, _limited(vector(b.velocity, lane)))
+        w = vector(b.body_rates, lane)
+        if dot(w, w) > MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY:
+            r = rotation(b.quaternion, lane)
+            store(b.body_rates, lane, to_body(r, _limited(to_world(r, w))))
 
 
 @inlined
-def quaternion_product(qw, qx, qy, qz, aw, ax, ay, az):
+def quaternion_product(q, a):
     """Return the product of two quaternions."""
+    qw, qx, qy, qz = q
+    aw, ax, ay, az = a
     return (
         qw * aw - qx * ax - qy * ay - qz * az,
         qw * ax + qx * aw + qy * az - qz * ay,
@@ -247,21 +230,15 @@ def move(b, dt):
     double precision. The new quaternion is off unit norm by rounding only; one step of Newton's
     method corrects it.
     """
-    q = b.quaternion
-    half_step = 0.5 * dt
     for lane in range(LANES):
-        for k in range(3):
-            b.position[k, lane] += dt * b.velocity[k, lane]
-        wx, wy, wz = vector(b.body_rates, lane)
-        hx = half_step * wx
-        hy = half_step * wy
-        hz = half_step * wz
-        sinc, cosine = sinc_and_cosine(hx * hx + hy * hy + hz * hz)
-        qw, qx, qy, qz = four(q, lane)
-        nw, nx, ny, nz = quaternion_product(qw, qx, qy, qz, cosine, sinc * hx, sinc * hy, sinc * hz)
-        scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
-        q[0, lane] = nw * scale
-        store(q[1:], lane, nx * scale, ny * scale, nz * scale)
+        way = scaled(dt, vector(b.velocity, lane))
+        store(b.position, lane, total(vector(b.position, lane), way))
+        h = scaled(0.5 * dt, vector(b.body_rates, lane))
+        sinc, cosine = sinc_and_cosine(dot(h, h))
+        w, x, y, z = quaternion_product(four(b.quaternion, lane), (cosine, *scaled(sinc, h)))
+        scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)
+        b.quaternion[0, lane] = w * scale
+        store(b.quaternion[1:], lane, scaled(scale, (x, y, z)))
 
 
 @inlined

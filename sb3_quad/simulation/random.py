@@ -21,6 +21,7 @@ import numpy.typing as npt
 from numba import float32, int32, uint32, uint64
 
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
+from sb3_quad.simulation.vectors import polynomial
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 # Purposes: the last word of the counter
@@ -33,6 +34,27 @@ _SHIFT = uint64(32)
 # The bits of sqrt(1/2) in float32
 _SQRT_HALF_BITS = 0x3F3504F3
 _LN2 = float32(math.log(2.0))
+# Of the polynomials, the highest power first
+_LOG = tuple(
+    np.array(
+        [
+            7.0376836292e-2,
+            -1.1514610310e-1,
+            1.1676998740e-1,
+            -1.2420140846e-1,
+            1.4249322787e-1,
+            -1.6668057665e-1,
+            2.0000714765e-1,
+            -2.4999993993e-1,
+            3.3333331174e-1,
+        ],
+        np.float32,
+    )
+)
+_SINE = tuple(np.array([-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1], np.float32))
+_COSINE = tuple(
+    np.array([2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2], np.float32)
+)
 _TO_UNIT = float32(2.0**-31)
 _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 
@@ -45,9 +67,8 @@ def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     """
     streams = np.zeros((4, len(seeds)), dtype=np.uint32)
     for row, seed in enumerate(seeds):
-        key = int(np.random.default_rng(seed).integers(2**64, dtype=np.uint64))
-        streams[KEY_LO, row] = key % 2**32
-        streams[KEY_HI, row] = key >> 32
+        key = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
+        streams[KEY_LO : KEY_HI + 1, row] = divmod(int(key), 2**32)[::-1]
     return streams
 
 
@@ -99,12 +120,13 @@ def random_words(b):
     word = b.word
     for block in range(word.shape[0] // 4):
         for lane in range(LANES):
-            w0, w1, w2, w3 = _words(b.stream, lane, block, OBSERVATION_NOISE)
             # Written out: a loop over the four is not vectorised.
-            word[4 * block, lane] = w0
-            word[4 * block + 1, lane] = w1
-            word[4 * block + 2, lane] = w2
-            word[4 * block + 3, lane] = w3
+            (
+                word[4 * block, lane],
+                word[4 * block + 1, lane],
+                word[4 * block + 2, lane],
+                word[4 * block + 3, lane],
+            ) = _words(b.stream, lane, block, OBSERVATION_NOISE)
 
 
 @compiled
@@ -120,13 +142,8 @@ def _log(x):
     bits = np.float32(x).view(np.int32)
     exponent = int32(int32(bits - int32(_SQRT_HALF_BITS)) >> int32(23))
     m = np.int32(bits - int32(exponent << int32(23))).view(np.float32) - float32(1.0)
-    p = float32(7.0376836292e-2)
-    for coefficient in (
-        *(-1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1),
-        *(-1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1),
-    ):
-        p = p * m + float32(coefficient)
-    return m + m * m * (m * p - float32(0.5)) + float32(exponent) * _LN2
+    p = m * polynomial(m, _LOG) - float32(0.5)
+    return m + m * m * p + float32(exponent) * _LN2
 
 
 @fast
@@ -144,14 +161,8 @@ def standard_normals(b):
             quadrant = int32(uint32(turn + uint32(0x20000000)) >> uint32(30))
             t = float32(int32(uint32(turn - (uint32(quadrant) << uint32(30))))) * _TO_ANGLE
             t2 = t * t
-            sine = t + t * t2 * (
-                float32(-1.6666654611e-1)
-                + t2 * (float32(8.3321608736e-3) + t2 * float32(-1.9515295891e-4))
-            )
-            p = float32(4.166664568298827e-2) + t2 * (
-                float32(-1.388731625493765e-3) + t2 * float32(2.443315711809948e-5)
-            )
-            cosine = float32(1.0) - float32(0.5) * t2 + t2 * t2 * p
+            sine = t + t * t2 * polynomial(t2, _SINE)
+            cosine = float32(1.0) - float32(0.5) * t2 + t2 * t2 * polynomial(t2, _COSINE)
             odd = (quadrant & 1) != 0
             first = sine if odd else cosine
             second = cosine if odd else sine

@@ -63,11 +63,6 @@ class Tracks(NamedTuple):
     length: int
     loops: bool
 
-    @property
-    def has_heading(self) -> bool:
-        """Whether some heading is commanded."""
-        return bool(self.table[:, _HEADING].any())
-
     def numbers(self) -> "np.ndarray[Any, np.dtype[np.int64]]":
         """Return length, loops and the number of pieces, for compiled code."""
         pieces = len(self.table) // self.length

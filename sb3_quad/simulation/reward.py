@@ -5,12 +5,22 @@
 import math
 
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
-from sb3_quad.simulation.physics import four, vector
+from sb3_quad.simulation.vectors import difference, dot, four, polynomial, vector
+
+# Of Cephes' arctangent, the highest power first
+_NUMERATOR = (
+    *(-8.750608600031904122785e-1, -1.615753718753365076637e1, -7.500855792314704667340e1),
+    *(-1.228866684490136173410e2, -6.485021904942025371773e1),
+)
+_DENOMINATOR = (
+    *(1.0, 2.485846490142306297962e1, 1.650270098316988542046e2),
+    *(4.328810604912902668951e2, 4.853903996359136964868e2, 1.945506571482613964425e2),
+)
 
 
 @inlined
-def _length(x, y, z):
-    return math.sqrt(x * x + y * y + z * z)
+def _length(a):
+    return math.sqrt(dot(a, a))
 
 
 @fast
@@ -23,20 +33,7 @@ def _tilt(sine2, cosine2):
     """
     t = math.sqrt(min(sine2, cosine2)) / (1.0 + math.sqrt(max(sine2, cosine2)))
     z = t * t
-    # Horner's scheme, numerator and denominator
-    p = -8.750608600031904122785e-1
-    for coefficient in (
-        *(-1.615753718753365076637e1, -7.500855792314704667340e1),
-        *(-1.228866684490136173410e2, -6.485021904942025371773e1),
-    ):
-        p = p * z + coefficient
-    q = 1.0
-    for coefficient in (
-        *(2.485846490142306297962e1, 1.650270098316988542046e2),
-        *(4.328810604912902668951e2, 4.853903996359136964868e2, 1.945506571482613964425e2),
-    ):
-        q = q * z + coefficient
-    angle = 4.0 * (t + t * z * (p / q))
+    angle = 4.0 * (t + t * z * (polynomial(z, _NUMERATOR) / polynomial(z, _DENOMINATOR)))
     return angle if sine2 <= cosine2 else math.pi - angle
 
 
@@ -58,19 +55,15 @@ def score(b):
     which the thesis does not have, is steep in the last metre, where Eq. 4.5 is not.
     """
     for lane in range(LANES):
-        x, y, z = vector(b.position, lane)
-        target_x, target_y, target_z = vector(b.target, lane)
-        distance = _length(x - target_x, y - target_y, z - target_z)
-        wx, wy, wz = vector(b.body_rates, lane)
-        rates = _length(wx, wy, wz)
+        distance = _length(difference(vector(b.position, lane), vector(b.target, lane)))
         qw, qx, qy, qz = four(b.quaternion, lane)
         tilt = _tilt(qx * qx + qy * qy, qw * qw + qz * qz)
         near = distance / (distance + b.precision_range[lane])
         reward = -b.position_cost[lane] * distance - b.tilt_cost[lane] * tilt
         reward -= b.precision_cost[lane] * near
-        reward -= b.body_rates_cost[lane] * rates
+        reward -= b.body_rates_cost[lane] * _length(vector(b.body_rates, lane))
         # Products instead of branches, so that the loop vectorises.
-        reward -= b.collision_cost[lane] * (z <= b.radius[lane])
+        reward -= b.collision_cost[lane] * (b.position[2, lane] <= b.collision_radius[lane])
         reward -= b.out_of_range_cost[lane] * (distance > b.max_distance[lane])
         b.reward[lane] = reward
         b.distance[lane] = distance

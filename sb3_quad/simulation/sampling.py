@@ -30,6 +30,17 @@ GUST_SIZE = sum(GUSTS.values())
 GUST_VALUE = row_slices(GUSTS)["value"]
 GUST_ROWS = first_rows(GUSTS)
 TURN = 2.0 * math.pi
+# Parameters of a vehicle, the range of the factor of each, and the number of its uniform
+_FACTORS = (
+    (P.mass, R.mass, 1),
+    (P.hover_thrust, R.mass, 1),
+    (P.ixx, R.inertia, 2),
+    (P.iyy, R.inertia, 3),
+    (P.izz, R.inertia, 4),
+    (P.thrust_middle, R.thrust, 6),
+    (P.thrust_half_range, R.thrust, 6),
+    (P.battery, R.battery, 14),
+)
 _SEVEN_BITS = np.uint64(127)
 # Mean and deviation of the sum of three whole numbers, uniform from 0 to 127
 _SUM_MEAN = 3 * 127 / 2
@@ -58,7 +69,7 @@ def start_episode(
     task_index[i] = np.sum(weights[:-1] <= u[0])
     task = tasks[task_index[i]]
     s = state[:, i]
-    vehicle = vehicles[:, min(i, vehicles.shape[1] - 1)]
+    vehicle = _column(vehicles, i)
 
     # A uniform direction has a uniform height (Archimedes), which is cut where the target would lie
     # too close to the ground.
@@ -102,6 +113,12 @@ def start_episode(
 
 
 @inlined
+def _column(array, i):
+    """Return column i, or the only one."""
+    return array[:, min(i, array.shape[1] - 1)]
+
+
+@inlined
 def _spherical(length, up, azimuth):
     """Return the vector of that length and azimuth whose z is ``up`` times the length."""
     across = length * math.sqrt(max(0.0, 1.0 - up * up))
@@ -130,15 +147,15 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
     :param gust: float64 (GUST_SIZE, n), or (GUST_SIZE, 0) without gusts; ``wind_gust`` likewise.
     :param wind: float64 (3, n).
     """
-    streams[EPISODE, i] += np.uint32(1)
-    streams[STEP, i] = np.uint32(0)
+    streams[EPISODE, i] += 1
+    streams[STEP, i] = 0
     has_own_vehicle = vehicles.shape[1] == wrench.shape[1]
     if has_own_vehicle:
-        vehicles[:, i] = base[:, min(i, base.shape[1] - 1)]
+        vehicles[:, i] = _column(base, i)
         sample_from_distribution(i, streams, distribution, vehicles)
 
     # Forces in weights are those of the vehicle before it is randomized.
-    vehicle = vehicles[:, min(i, vehicles.shape[1] - 1)]
+    vehicle = _column(vehicles, i)
     weight = vehicle[P.mass] * vehicle[P.gravity]
     u = uniforms(streams, i, 4, DISTURBANCE)
     is_disturbed = np.float64(u[0] < table[R.wrench_share])
@@ -150,13 +167,13 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
     if gust.shape[1] > 0:
         u = uniforms(streams, i, 4, GUST)
         _begin_gusts(table, R.gusts, is_disturbed, weight, u, gust[:, i])
-    if table[R.wind + 2] != FIXED or wind_gust.shape[1] > 0:
+    if wind_gust.shape[1] > 0:
+        u = uniforms(streams, i, 4, WIND)
+        _begin_gusts(table, R.wind_gusts, is_disturbed, 1.0, u, wind_gust[:, i])
+    if table[R.wind + 2] != FIXED:
         u = uniforms(streams, i, 5, WIND)
-        if table[R.wind + 2] != FIXED:
-            # The wind is horizontal unless its direction is given.
-            _sample_vector(table, R.wind, is_disturbed, 1.0, (u[8], 0.5, u[9]), wind[:, i])
-        if wind_gust.shape[1] > 0:
-            _begin_gusts(table, R.wind_gusts, is_disturbed, 1.0, u, wind_gust[:, i])
+        # The wind is horizontal unless its direction is given.
+        _sample_vector(table, R.wind, is_disturbed, 1.0, (u[8], 0.5, u[9]), wind[:, i])
     if has_own_vehicle:
         _randomize_vehicle(i, streams, table, vehicles)
 
@@ -189,25 +206,17 @@ def _randomize_vehicle(i, streams, table, vehicles):
     if u[0] >= table[R.share]:
         return
     v = vehicles[:, i]
-    nominal_mass = v[P.mass]
-    mass = between(table, R.mass, u[1], 1.0)
-    v[P.mass] *= mass
-    v[P.hover_thrust] *= mass
-    inertia = v[P.ixx : P.izz + 1]
-    for axis in range(3):
-        inertia[axis] *= between(table, R.inertia, u[2 + axis], 1.0)
-        v[P.drag_x + axis] += nominal_mass * between(table, R.drag, u[13], 0.0)
+    v[P.drag_x : P.drag_z + 1] += v[P.mass] * between(table, R.drag, u[13], 0.0)
+    for parameter, factor, number in _FACTORS:
+        v[parameter] *= between(table, factor, u[number], 1.0)
     # No body has one moment larger than the other two together.
+    inertia = v[P.ixx : P.izz + 1]
     for axis in range(3):
         inertia[axis] = min(inertia[axis], inertia[axis - 1] + inertia[axis - 2])
 
     motor_gain = between(table, R.motor_gain, u[5], 1.0)
     v[P.motor_gain_up] *= motor_gain * between(table, R.motor_gain_up, u[11], 1.0)
     v[P.motor_gain_down] *= motor_gain * between(table, R.motor_gain_down, u[12], 1.0)
-    thrust = between(table, R.thrust, u[6], 1.0)
-    v[P.thrust_middle] *= thrust
-    v[P.thrust_half_range] *= thrust
-    v[P.battery] = between(table, R.battery, u[14], 1.0)
 
     # The arms are measured from the centre of mass: roll arms are y of the rotors, pitch arms -x.
     arm = between(table, R.arm, u[7], 1.0)

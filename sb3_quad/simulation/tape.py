@@ -23,10 +23,10 @@ from sb3_quad.simulation.kernel import (
     load_scaling,
     load_vehicles,
     new_block,
+    save_rows,
 )
 from sb3_quad.simulation.observation import (
     OBSERVATION_SIZE,
-    RESTS,
     F,
     clear_hidden,
     features,
@@ -60,9 +60,8 @@ class FlightTape:
 
     def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
         n = batch.n
-        self.substeps = batch.substeps if substeps is None else substeps
-        self.control_step = batch.physics_step * batch.substeps
-        self.physics_step = self.control_step / self.substeps
+        self.substeps = substeps or batch.substeps
+        self.physics_step = batch.physics_step * batch.substeps / self.substeps
         self.batch = batch
         self.n_steps = n_steps
         # The states before each control step and after the last one
@@ -227,12 +226,12 @@ def undo(
             count = min(LANES, n - first)
             for lane in range(LANES):
                 b.row[lane] = first + min(lane, count - 1)
-            load_vehicles(b, vehicles, first, count, physics_step)
-            load_rows(gradient, first, count, own)
+            load_vehicles(b, vehicles, first, physics_step)
+            load_rows(gradient, first, own)
             if step + 1 < len(actions):
                 load_scaling(b, scaling)
-                load_rows(states[step + 1], first, count, b.state)
-                load_rows(streams, first, count, b.stream)
+                load_rows(states[step + 1], first, b.state)
+                load_rows(streams, first, b.stream)
                 b.stream[STEP] += np.uint32(step + 1)
                 features(b, moves, for_px4)
                 random_words(b)
@@ -242,15 +241,15 @@ def undo(
                     grad_observation, grad_frames, grad_integral, grad_feature, grad_actions,
                 )  # fmt: skip
                 if for_px4:
-                    clear_hidden(grad_feature)
+                    clear_hidden(grad_feature[F.rotation : F.velocity])
                 undo_noise(b, grad_feature)
-                if moves != RESTS and not for_px4:
+                if moves and not for_px4:
                     undo_relation(b, grad_feature)
                 undo_features(b, grad_feature, own, for_px4)
 
-            load_rows(states[step], first, count, b.state)
-            load_rows(wrench, first, count, b.wrench)
-            load_rows(wind, first, count, b.wind)
+            load_rows(states[step], first, b.state)
+            load_rows(wrench, first, b.wrench)
+            load_rows(wind, first, b.wind)
             for lane in range(LANES):
                 i = b.row[lane]
                 acted = step - np.int64(b.delay[lane])
@@ -265,14 +264,13 @@ def undo(
                     own[:, lane] = 0.0
             undo_flight(b, substep_states, own, grad_wanted, physics_step, substeps)
             undo_limits(b, grad_wanted)
+            save_rows(own, first, count, gradient)
             for lane in range(count):
                 i = first + lane
-                for k in range(MOVING):
-                    gradient[k, i] = own[k, lane]
                 acted = step - np.int64(b.delay[lane])
                 for k in range(4):
                     if acted >= 0 and abs(actions[acted, i, k]) < float32(1.0):
-                        slope = b.thrust_half_range[lane] / (2.0 * b.command[k, lane])
+                        slope = b.square_half_range[lane] / (2.0 * b.command[k, lane])
                         grad_actions[acted, i, k] += slope * grad_wanted[k, lane]
     atomic_add(control, DONE, taken)
     if leads:
@@ -288,7 +286,7 @@ def _undo_frames(
     """Carry the gradient with respect to an observation to the frames in it, and that with respect
     to the present frame to its features, the last action and the position integral.
     """
-    grad_feature[:, :] = 0.0
+    grad_feature[:] = 0.0
     depth, size = grad_frames.shape[0], grad_frames.shape[2]
     for lane in range(count):
         i = first + lane
@@ -297,8 +295,7 @@ def _undo_frames(
         at = 0
         for age in ages:
             if age <= step:
-                for k in range(size):
-                    grad_frames[(step - age) % depth, i, k] += grad_observation[i, at + k]
+                grad_frames[(step - age) % depth, i] += grad_observation[i, at : at + size]
             at += size
         frame = grad_frames[step % depth, i]
         for k in range(size - OBSERVATION_SIZE):
@@ -306,8 +303,7 @@ def _undo_frames(
                 grad_actions[step - 1, i, k] += frame[OBSERVATION_SIZE + k]
         if grad_integral.shape[0] > 0:
             _undo_integral(b, lane, i, integrals[step], numbers, frame, grad_integral)
-        for k in range(OBSERVATION_SIZE):
-            grad_feature[k, lane] = frame[k]
+        grad_feature[:, lane] = frame[:OBSERVATION_SIZE]
         frame[:] = 0.0
 
 

@@ -69,8 +69,6 @@ def share_out(function: Function, helpers: int, *arguments: Any) -> Any:
     """
     pool = _pool
     control = np.zeros(CONTROL, np.int64)
-    if helpers < 1:
-        return function(control, True, *arguments)
     if pool.resting > 0:
         pool.resting -= 1
         helpers = 0

@@ -14,15 +14,14 @@ from numba import float32
 
 from sb3_quad.simulation.compiled import LANES, compiled, inlined
 from sb3_quad.simulation.observation import heading_of
-from sb3_quad.simulation.physics import vector
 from sb3_quad.simulation.random import REFERENCE, STEP, uniforms
 from sb3_quad.simulation.state import (
     REFERENCE_PARTS,
-    REFERENCE_SIZE,
     STATE_SIZE,
     X,
     first_rows,
 )
+from sb3_quad.simulation.vectors import vector, vector_at
 
 COURSE = {"anchor": 3, "begin": 1}
 COURSE_SIZE = sum(COURSE.values())
@@ -64,11 +63,8 @@ def deepest(i, streams, table, numbers):
 
 
 @compiled
-def follow(b, ahead, turns, state, streams, course, table, numbers):
-    """Load the targets of a block's rows as they are ``ahead`` control steps from now.
-
-    :param turns: whether some heading is commanded; without it, none is loaded.
-    """
+def follow(b, ahead, state, streams, course, table, numbers):
+    """Load the targets of a block's rows as they are ``ahead`` control steps from now."""
     for lane in range(LANES):
         i = b.row[lane]
         begin = course[C.begin, i]
@@ -77,13 +73,10 @@ def follow(b, ahead, turns, state, streams, course, table, numbers):
                 b.state[k, lane] = state[k, i]
             continue
         # Without a sign, numba does not look whether an index counts from the end.
-        row = np.uint64(_row_at(begin, np.int64(streams[STEP, i]) + ahead, numbers))
-        # Loops of a fixed length: a variable one would take five times as long.
-        for k in range(ACCELERATION):
+        row = np.uint64(_row_at(begin, streams[STEP, i] + ahead, numbers))
+        # A loop of a fixed length: a variable one would take five times as long.
+        for k in range(AHEAD):
             b.state[X.target + k, lane] = table[row, np.uint64(k)]
-        if turns:
-            for k in range(ACCELERATION, AHEAD):
-                b.state[X.target + k, lane] = table[row, np.uint64(k)]
         for axis in range(3):
             b.state[X.target + axis, lane] += course[C.anchor + axis, i]
 
@@ -94,9 +87,8 @@ def complete(state, streams, course, table, numbers):
     for i in range(state.shape[1]):
         begin = course[C.begin, i]
         if begin >= 0.0:
-            row = _row_at(begin, np.int64(streams[STEP, i]), numbers)
-            for k in range(3, REFERENCE_SIZE):
-                state[X.target + k, i] = table[row, k]
+            row = _row_at(begin, streams[STEP, i], numbers)
+            state[X.target_velocity :, i] = table[row, 3:]
 
 
 @compiled
@@ -116,11 +108,9 @@ def observe_preview(b, count, previews, course, table, numbers, out):
         for ahead in previews:
             x, y, z = vector(b.target_acceleration, lane)
             if table.shape[0] > 0 and course[C.begin, i] >= 0.0:
-                step = np.int64(b.stream[STEP, lane]) + ahead
-                future = table[_row_at(course[C.begin, i], step, numbers)]
-                x = future[ACCELERATION]
-                y = future[ACCELERATION + 1]
-                z = future[ACCELERATION + 2]
+                step = b.stream[STEP, lane] + ahead
+                row = _row_at(course[C.begin, i], step, numbers)
+                x, y, z = vector_at(table.T, ACCELERATION, row)
             out[i, at] = scale * float32(cosine * x + sine * y)
             out[i, at + 1] = scale * float32(cosine * y - sine * x)
             out[i, at + 2] = scale * float32(z)
