@@ -206,8 +206,9 @@ def test_experts_by_name(tmp_path, monkeypatch):
 
 
 def test_wrong_observations_and_gains_raise():
-    with pytest.raises(ExpertError, match=r"\(18,\)"):
-        PIDExpert().predict(np.zeros(17))
+    for shape in ((17,), (2, 3, 18)):
+        with pytest.raises(ExpertError, match=r"\(18,\)"):
+            PIDExpert().predict(np.zeros(shape))
     with pytest.raises(ConfigError, match="kp"):
         PIDExpert(kp=-1)
 

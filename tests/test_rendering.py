@@ -143,7 +143,7 @@ def test_render_without_a_mode_warns() -> None:
 
 @pytest.mark.parametrize("size", [0, 5000, 64.0, True])
 def test_bad_size_is_refused(size: Any) -> None:
-    with pytest.raises(ConfigError, match=r"render_width .*pixels"):
+    with pytest.raises(ConfigError, match=r"render_width .*to 2048"):
         QuadcopterEnv(render_mode="rgb_array", render_width=size)
 
 

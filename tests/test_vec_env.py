@@ -488,6 +488,8 @@ def test_vehicles_by_row():
 
 # --- refusals
 
+SLOW = load_vehicle("itm").model_copy(update={"control_step": 0.02})
+
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
@@ -496,11 +498,14 @@ def test_vehicles_by_row():
         ({"n_envs": 2, "noise": float("nan")}, "finite"),
         ({"n_envs": 2, "observation_std": np.zeros(18)}, "observation_std"),
         ({"n_envs": 2, "observation_mean": np.zeros(17)}, r"observation_mean of shape \(17,\)"),
+        ({"n_envs": 2, "observation_mean": []}, r"observation_mean of shape \(0,\)"),
         ({"n_envs": 2, "max_episode_steps": [5, 0]}, "max_episode_steps"),
         ({"n_envs": 2, "max_episode_steps": []}, "max_episode_steps"),
         ({"n_envs": 2, "max_episode_steps": True}, "true and false are not numbers"),
         ({"n_envs": 2, "max_episode_steps": [5] * 3}, "max_episode_steps: 3 values for 2"),
         ({"n_envs": 2, "vehicle": ["itm"] * 3}, "vehicle: 3 values for 2"),
+        ({"n_envs": 2, "vehicle": []}, "vehicle: 0 values for 2"),
+        ({"n_envs": 2, "vehicle": ["itm", SLOW]}, "vehicle of row 1: physics_step"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, says):
@@ -518,7 +523,7 @@ def test_bad_actions_are_refused_and_change_nothing():
     for value in (np.nan, np.inf, -np.inf):
         actions = np.zeros((70, 4))
         actions[68, 2] = value
-        with pytest.raises(ValueError, match="row 68"):
+        with pytest.raises(ValueError, match=rf"row 68 is \[0.0, 0.0, {value}, 0.0\]"):
             env.step(actions)
     np.testing.assert_array_equal(env.true_state().array, before.array)
 

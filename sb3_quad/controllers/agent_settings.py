@@ -159,6 +159,17 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     return settings
 
 
+def settings_of_model(model: Any) -> FlightSettings | None:
+    """Return the settings that a model holds; None: it holds none.
+
+    :raises ConfigError: they do not fit.
+    """
+    record = getattr(model, KEY, None)
+    if not isinstance(record, dict):
+        return None
+    return settings_of_record(record, f"{type(model).__name__}.{KEY}")
+
+
 def _settings_of_run(config: Path) -> FlightSettings:
     """Return the settings that the agent of a run was evaluated with.
 

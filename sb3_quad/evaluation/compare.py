@@ -10,7 +10,7 @@ from rich.console import Group
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrDict, StrMapping
-from sb3_quad.controllers.agent_settings import settings_of_record
+from sb3_quad.controllers.agent_settings import settings_of_model
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
@@ -21,7 +21,7 @@ from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.evaluation.tables import Column, Table
-from sb3_quad.simulation.settings import KEY, FlightSettings, levels
+from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.tasks import Task, in_words
 from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
@@ -158,10 +158,7 @@ def _own_settings(controller: Any) -> FlightSettings | None:
     if isinstance(controller, (str, Path)):
         path = agent_path(str(controller))
         return ControllerSpec(path, path).own
-    record = getattr(controller, KEY, None)
-    if not isinstance(record, dict):
-        return None
-    return settings_of_record(record, f"{type(controller).__name__}.{KEY}")
+    return settings_of_model(controller)
 
 
 def _task_table(

@@ -18,7 +18,7 @@ from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, unknow
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict, StrPath
-from sb3_quad.controllers.agent_settings import settings_of_record, unlike_trained
+from sb3_quad.controllers.agent_settings import settings_of_model, unlike_trained
 from sb3_quad.controllers.controller import Controller, warn_of_vehicle
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.batch_env import quadcopter_spaces
@@ -28,8 +28,8 @@ from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.evaluation.supervisor import Supervisor
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.batch import MAX_ROWS
-from sb3_quad.simulation.checks import load_vehicles, per_row, whole_number
-from sb3_quad.simulation.settings import KEY, FlightSettings, known_layout
+from sb3_quad.simulation.checks import per_row, whole_number
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
@@ -202,11 +202,12 @@ def fly(
     layout = environment.get("rotor_layout")
     controller = resolve_expert(controller, vehicle, "controller", layout)
     # A model flies with its rotors where it knows them.
-    if layout is None:
-        environment["rotor_layout"] = known_layout(controller)
+    own = settings_of_model(controller)
+    if layout is None and own is not None:
+        environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", max_steps)
     settings = FlightSettings().with_changes(task=task, vehicle=vehicle, noise=noise, **environment)
-    _warn_if_unlike(controller, settings)
+    _warn_if_unlike(controller, own, settings)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
@@ -221,18 +222,15 @@ def episode_seeds(seed: int, n_flights: int) -> list[int]:
     return row_seeds(whole_number("seed", seed, 0, LARGEST_SEED), n)
 
 
-def _warn_if_unlike(controller: Any, settings: FlightSettings) -> None:
+def _warn_if_unlike(controller: Any, own: FlightSettings | None, settings: FlightSettings) -> None:
     """Warn of an agent or an expert of another vehicle than it flies."""
     # A distribution has no particular vehicle.
     if settings.vehicles is not None:
         return
-    flown = load_vehicles(settings.vehicle_sources, settings.rotor_layout)
+    flown = settings.load_vehicles()
     warn_of_vehicle(controller, flown)
-    record = getattr(controller, KEY, None)
-    if isinstance(record, dict):
-        name = type(controller).__name__
-        own = settings_of_record(record, f"{name}.{KEY}")
-        notice = unlike_trained(name, own, first_vehicle(settings.vehicle))
+    if own is not None:
+        notice = unlike_trained(type(controller).__name__, own, first_vehicle(settings.vehicle))
         if notice:
             warnings.warn(f"{notice}; give **env_kwargs(the agent)", stacklevel=3)
 

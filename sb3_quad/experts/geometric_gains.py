@@ -120,8 +120,8 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
     inverse = np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0)
     # A randomized centre of mass may lie beyond the rotors: a share would be negative.
     inverse[:, 0] = np.maximum(inverse[:, 0], 0.01)
-    constants = (v, gains, command_lag(v, control_step), inverse)
-    return LawConstants._make(np.array(values, order="C") for values in constants)
+    lag = command_lag(v, control_step)
+    return LawConstants(v.copy(), gains, lag, np.ascontiguousarray(inverse))
 
 
 class TrueConstants:

@@ -30,13 +30,12 @@ def fly_geometric(state, constants, wrench, actions):
     :param constants: ``LawConstants`` with n columns, or one for all vehicles.
     :param wrench: the external wrench to compensate, (WRENCH_SIZE, n) or (WRENCH_SIZE, 1).
     """
-    # Each vehicle's gains are copied, so that they lie side by side. One column stands for all.
-    gains = np.empty(constants.gains.shape[0])
     tilting = np.empty(4)
     for i in range(actions.shape[0]):
+        # One column stands for all.
         k = min(i, constants.gains.shape[1] - 1)
         j = min(i, wrench.shape[1] - 1)
-        gains[:] = constants.gains[:, k]
+        gains = constants.gains[:, k]
         mass = constants.vehicles[P.mass, k]
         g = constants.vehicles[P.gravity, k]
         inertia = vector_at(constants.vehicles, P.ixx, k)
@@ -87,11 +86,11 @@ def reference_acceleration(state, i, lag, attitude):
 
     Upwards that is when a command acts, sideways when the vehicle has turned, too.
     """
-    x, y, z = vector_at(state, X.target_acceleration, i)
-    dx, dy, dz = difference(vector_at(state, X.target_ahead, i), (x, y, z))
+    now = vector_at(state, X.target_acceleration, i)
+    dx, dy, dz = difference(vector_at(state, X.target_ahead, i), now)
     upwards = lag / AHEAD
     sideways = upwards + 1.0 / (attitude * AHEAD)
-    return x + sideways * dx, y + sideways * dy, z + upwards * dz
+    return total(now, (sideways * dx, sideways * dy, upwards * dz))
 
 
 @compiled
@@ -145,10 +144,10 @@ def desired_force(e, v, a, gains, g):
     # λ that keeps |λ (fx, fy, fz) + (0, 0, g) - a| within that solves a quadratic equation:
     # λ² square + 2 λ across = room.
     weight = g - az
-    square = fx * fx + fy * fy + fz * fz
+    square = dot((fx, fy, fz), (fx, fy, fz))
     across = fz * weight - fx * ax - fy * ay
     limit = g * g * (1.0 + gains[G.tilt] * gains[G.tilt])
-    room = limit - (weight * weight + ax * ax + ay * ay)
+    room = limit - dot((weight, ax, ay), (weight, ax, ay))
     scale = 1.0
     if square + 2.0 * across > room:
         root = math.sqrt(max(0.0, across * across + square * max(0.0, room)))
@@ -259,21 +258,21 @@ def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, t
         scale = (highest - lowest) / (most - least)
     thrust = min(highest - scale * most, max(lowest - scale * least, thrust))
 
-    # The share of the yaw moment that every rotor has room for.
+    # The share of the yaw moment that every rotor has room for. The thrusts without it take the
+    # place of those that tilt.
     share = 1.0
+    without_yaw = tilting
     for rotor in range(4):
-        without_yaw = shares[rotor] * (thrust + scale * tilting[rotor])
+        without_yaw[rotor] = shares[rotor] * (thrust + scale * tilting[rotor])
         yaw = mixer_inverse[rotor, 3] * moments[2]
-        room = without_yaw - low
+        room = without_yaw[rotor] - low
         if yaw > 0.0:
-            room = high - without_yaw
+            room = high - without_yaw[rotor]
         if abs(yaw) * share > room:
             share = max(0.0, room / abs(yaw))
 
     # Eq. 3.18: actions are thrusts between the limits, as numbers from -1 to 1.
     for rotor in range(4):
         yaw = share * mixer_inverse[rotor, 3] * moments[2]
-        without_yaw = shares[rotor] * (thrust + scale * tilting[rotor])
-        actions[rotor] = min(
-            1.0, max(-1.0, (without_yaw + yaw - thrust_middle) / thrust_half_range)
-        )
+        action = (without_yaw[rotor] + yaw - thrust_middle) / thrust_half_range
+        actions[rotor] = min(1.0, max(-1.0, action))

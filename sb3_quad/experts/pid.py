@@ -72,12 +72,6 @@ class PIDExpert(Expert):
 
 
 @compiled
-def _rotor_thrust(mixer_row, u1, u2, u3, u4):  # type: ignore[no-untyped-def]
-    """Return the thrust of a rotor, N, for a thrust u1 and moments u2, u3, u4 (Eq. 2.7)."""
-    return mixer_row[0] * u1 + mixer_row[1] * u2 + mixer_row[2] * u3 + mixer_row[3] * u4
-
-
-@compiled
 def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
     """Write the actions of n vehicles, (n, 4), from their state, (STATE_SIZE, n)."""
     kp, kd, ki_dt, mass, g = gains
@@ -85,6 +79,7 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
     low, high = limits
     middle = (high + low) / 2
     half = (high - low) / 2
+    thrusts = np.empty(4)
     for i in range(actions.shape[0]):
         position_error = difference(vector_at(state, X.target, i), vector_at(state, X.position, i))
         ahead = vector_at(state, X.target_ahead, i)
@@ -123,10 +118,12 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
         # Scale all four thrusts by one factor, so that the largest is allowed.
         largest = -math.inf
         for k in range(4):
-            largest = max(largest, _rotor_thrust(mixer_inverse[k], u1, u2, u3, u4))
+            row = mixer_inverse[k]
+            thrusts[k] = row[0] * u1 + row[1] * u2 + row[2] * u3 + row[3] * u4
+            largest = max(largest, thrusts[k])
         scale = 1.0
         if largest > high:
             scale = high / largest
         for k in range(4):
-            thrust = max(low, scale * _rotor_thrust(mixer_inverse[k], u1, u2, u3, u4))
+            thrust = max(low, scale * thrusts[k])
             actions[i, k] = min(1.0, max(-1.0, (thrust - middle) / half))

@@ -10,7 +10,7 @@ from sb3_quad.base.process import available_cpus
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.validate import validate
-from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
+from sb3_quad.simulation.checks import per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import compile_notice
 from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.simulation.kernel import (
@@ -121,10 +121,10 @@ class QuadcopterBatch:
         self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
 
         # Commands wait in a queue that is as long as the longest delay of any episode.
-        longest = max(vehicle.delay for vehicle in vehicles)
+        delays = [vehicle.delay for vehicle in vehicles]
         if self.randomize.delay is not None:
-            longest = max(longest, int(self.randomize.delay.high))
-        self.queue = np.zeros((longest, 4, n))
+            delays.append(int(self.randomize.delay.high))
+        self.queue = np.zeros((max(delays), 4, n))
 
         # The frames that a policy sees besides the present features.
         self.observation = settings.observation
@@ -148,11 +148,10 @@ class QuadcopterBatch:
         self.track_numbers = tracks.numbers()
         self.course = np.zeros((COURSE_SIZE, n * (len(tracks.table) > 0)))
 
-        tasks = resolve_tasks(settings.task, settings.task_kwargs)
-        self.task_parameters, self.task_weights = tasks
+        self.task_parameters, self.task_weights = resolve_tasks(settings.task, settings.task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
-        steps = np.atleast_1d(settings.max_episode_steps).tolist()
-        self.max_steps = np.array(repeated("max_episode_steps", steps, n), dtype=np.int64)
+        steps = np.array(settings.max_episode_steps, dtype=np.int64, ndmin=1)
+        self.max_steps = steps[repeated("max_episode_steps", steps.size, n)]
         # The episodes under way may be shorter, see stagger.
         self.limits = self.max_steps.copy()
 
@@ -177,23 +176,23 @@ class QuadcopterBatch:
         """
         self.distribution = settings.vehicles
         self.randomize = settings.randomize or Randomization()
-        vehicles = load_vehicles(settings.vehicle_sources, settings.rotor_layout)
-        self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, self.n)
+        vehicles = settings.load_vehicles()
+        rows = repeated("vehicle", len(vehicles), self.n)
+        self.vehicle_list: list[Vehicle] = [vehicles[row] for row in rows]
         self.base_vehicles = np.stack([vehicle.parameters() for vehicle in vehicles], axis=1)
         if len(vehicles) > 1:
-            columns = np.arange(self.n) % len(vehicles)
-            self.base_vehicles = np.take(self.base_vehicles, columns, axis=1)
+            self.base_vehicles = np.take(self.base_vehicles, rows, axis=1)
         self.vehicles = self.base_vehicles.copy()
         if self.distribution is not None or self.randomize.sets_vehicle:
             self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.vehicles), self.n)).copy()
 
+        # All vehicles can fly if the hardest to fly can.
+        hardest = vehicles
         self.distribution_numbers = NO_DISTRIBUTION
         if self.distribution is not None:
+            hardest = [self.distribution.hardest(vehicle) for vehicle in vehicles]
             self.distribution_numbers = self.distribution.numbers()
-        # All vehicles can fly if the hardest to fly can.
-        for vehicle in vehicles:
-            if self.distribution is not None:
-                vehicle = self.distribution.hardest(vehicle)
+        for vehicle in hardest:
             self.randomize.hardest(vehicle)
         return vehicles
 
@@ -240,10 +239,8 @@ class QuadcopterBatch:
 
         :param substeps: physics steps in this control step, which lasts as long as any.
         """
-        physics_step = self.physics_step * self.substeps / substeps
-        return self._run(
-            FLY, actions, physics_step=physics_step, substeps=substeps, autoreset=False
-        )
+        step = self.physics_step * self.substeps / substeps
+        return self._run(FLY, actions, physics_step=step, substeps=substeps, autoreset=False)
 
     def score(self, actions: AnyArray) -> StepResult:
         """Score a control step that another simulator has flown and written into ``state``; else
@@ -274,7 +271,7 @@ class QuadcopterBatch:
         arguments = self._arguments | changes
         self._is_behind = len(self.tracks) > 0
         if not share_out(step, self.helpers, mode, array, *results, *arguments.values()):
-            row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+            row, _ = np.argwhere(~np.isfinite(array))[0]
             raise ValueError(
                 f"actions: row {row} is {array[row].tolist()}; every number must be finite"
             )

@@ -5,15 +5,12 @@ that are allowed.
 """
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import FloatArray
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.base.types import FloatArray, IntArray
 
 MAX_SIZE = 2048  # of a picture, pixels
 
@@ -38,44 +35,24 @@ def per_row(name: str, value: Any, rows: int, *size: int) -> FloatArray:
     return np.ascontiguousarray(np.broadcast_to(array, shape).T).reshape(columns, rows)
 
 
-def whole_number(name: str, value: Any, least: int, most: int, unit: str = "") -> int:
+def whole_number(name: str, value: Any, least: int, most: int) -> int:
     """Return ``value``, a whole number of ``least`` to ``most``."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or not least <= value <= most:
-        raise ConfigError(f"{name} {value!r}: must be a whole number of {least} to {most}{unit}")
+        raise ConfigError(f"{name} {value!r}: must be a whole number of {least} to {most}")
     return int(value)
 
 
-def repeated(name: str, values: Sequence[Any], n: int) -> list[Any]:
-    """Return the values of n rows: row i has the i-th, and fewer values than rows repeat."""
-    if not 0 < len(values) <= n:
-        raise ConfigError(
-            f"{name}: {len(values)} values for {n} environments; give from one to as many"
-        )
-    return [values[row % len(values)] for row in range(n)]
-
-
-def load_vehicles(
-    sources: Sequence[Any], layout: str | Path | Vehicle | None = None
-) -> list[Vehicle]:
-    """Return vehicles with the same time steps, in the layout of another vehicle if one is
-    named.
+def repeated(name: str, values: int, n: int) -> IntArray:
+    """Return which of some values each of n rows has: row i the i-th, and fewer values than rows
+    repeat.
     """
-    vehicles: list[Vehicle] = []
-    for row, source in enumerate(sources):
-        vehicle = load_vehicle(source)
-        if layout is not None:
-            vehicle = vehicle.in_layout_of(load_vehicle(layout))
-        vehicles.append(vehicle)
-        first = vehicles[0]
-        if (vehicle.physics_step, vehicle.substeps) != (first.physics_step, first.substeps):
-            raise ConfigError(
-                f"vehicle of row {row}: physics_step and control_step must be those of row 0"
-            )
-    return vehicles
+    if not 0 < values <= n:
+        raise ConfigError(f"{name}: {values} values for {n} environments; give from one to as many")
+    return np.arange(n) % values
 
 
 def check_size(width: int, height: int) -> None:
     """Check the size of a picture, in pixels."""
     for name, value in (("render_width", width), ("render_height", height)):
-        whole_number(name, value, 16, MAX_SIZE, " pixels")
+        whole_number(name, value, 16, MAX_SIZE)

@@ -49,14 +49,14 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     # Pandas takes what is too much in the rows for an index, and all columns would be shifted.
     if not isinstance(frame.index, pd.RangeIndex):
         raise ConfigError(f"{path}: its rows have more numbers than its first line has names")
-    names = [name.strip() for name in frame.columns]
+    frame.columns = frame.columns.str.strip()
+    names = [*frame.columns]
     if names not in (_COLUMNS[:4], _COLUMNS):
         raise ConfigError(
             f"{path}: its first line names {','.join(names)}; the columns must be t,x,y,z[,heading]"
         )
     if len(frame) < 2:
         raise ConfigError(f"{path}: needs two or more rows behind the names of its columns")
-    frame.columns = names
     refuse_gaps(path, frame)
     numbers = frame.to_numpy()
     times = numbers[:, 0] - numbers[0, 0]
@@ -108,23 +108,27 @@ def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
     :param seconds: (m,), from each point to the next.
     """
     m = len(seconds)
-    rows = []
-    right = []
+    size = _COEFFICIENTS * m
+    # Linear equations: for some segments, the factors of their coefficients
+    equations = []
     for k in range(m):
-        for time, point in ((0.0, points[k]), (seconds[k], points[k + 1])):
-            rows.append(_constraint(m, {k: _powers(time, 0)}))
-            right.append(point)
+        equations += [{k: _powers(0.0, 0)}, {k: _powers(seconds[k], 0)}]
     # In between, the optimum is continuous up to the sixth derivative.
     for k in range(1, m):
         for derivative in range(1, 7):
             ends = {k - 1: _powers(seconds[k - 1], derivative), k: -_powers(0.0, derivative)}
-            rows.append(_constraint(m, ends))
-            right.append(np.zeros(3))
+            equations.append(ends)
     for derivative in (1, 2, 3):
-        rows.append(_constraint(m, {0: _powers(0.0, derivative)}))
-        rows.append(_constraint(m, {m - 1: _powers(seconds[-1], derivative)}))
-        right += [np.zeros(3), np.zeros(3)]
-    coefficients = np.linalg.solve(np.array(rows), np.array(right)).reshape(m, _COEFFICIENTS, 3)
+        equations += [{0: _powers(0.0, derivative)}, {m - 1: _powers(seconds[-1], derivative)}]
+    factors = np.zeros((size, m, _COEFFICIENTS))
+    for row, equation in enumerate(equations):
+        for segment, powers in equation.items():
+            factors[row, segment] = powers
+    # Each segment begins at a point and ends at the next; the other equations are of zeros.
+    right = np.zeros((size, 3))
+    right[: 2 * m] = np.repeat(points, 2, axis=0)[1:-1]
+    solution = np.linalg.solve(factors.reshape(size, size), right)
+    coefficients = solution.reshape(m, _COEFFICIENTS, 3)
     starts = np.concatenate([[0.0], np.cumsum(seconds)])
 
     def motion(t: FloatArray) -> FloatArray:
@@ -135,17 +139,8 @@ def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
     return motion
 
 
-def _constraint(segments: int, parts: Mapping[int, FloatArray]) -> FloatArray:
-    """Return a row of the linear system: factors of the coefficients of some segments."""
-    row = np.zeros((segments, _COEFFICIENTS))
-    for segment, factors in parts.items():
-        row[segment] = factors
-    return row.ravel()
-
-
 def _powers(time: float, derivative: int) -> FloatArray:
     """Return the derivative of 1, t, t², … at a time."""
-    result = np.zeros(_COEFFICIENTS)
-    for power in range(derivative, _COEFFICIENTS):
-        result[power] = math.perm(power, derivative) * time ** (power - derivative)
-    return result
+    powers = range(_COEFFICIENTS)
+    # The factor is 0 where nothing is left of the power.
+    return np.array([math.perm(k, derivative) * time ** max(k - derivative, 0) for k in powers])

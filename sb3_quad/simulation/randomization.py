@@ -5,7 +5,7 @@ A :class:`Randomization` is data, ``randomize`` in ``env_kwargs``; :mod:`.sampli
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
@@ -22,7 +22,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray, StrMapping
 from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.state import first_rows
+from sb3_quad.simulation.state import first_rows, row_slices
 from sb3_quad.vehicles.vehicle import Vehicle
 
 # The kinds of range; a FIXED one samples nothing. Its numbers, like all that are not given, are 0.
@@ -274,13 +274,8 @@ class Randomization(Frozen):
 
         :param control_step: s.
         """
-        parts = {"share": [self.share * self.sets_vehicle], "wrench_share": [self.wrench_share]}
-        for name, given in self:
-            if isinstance(given, Gusts):
-                parts[name] = given.numbers(control_step)
-            elif isinstance(given, (Range, RandomVector)):
-                parts[name] = given.numbers()
-        table = table_row(RANDOMIZATION, parts)
+        table = numbers_of(self, RANDOMIZATION, control_step)
+        table[R.share] *= self.sets_vehicle
         if self.torque is not None and self.torque.frame is None:
             table[R.torque + V.in_body] = 1.0
         # floor(uniform(low, high + 1)) makes every whole number equally likely.
@@ -298,16 +293,21 @@ RANDOMIZATION = dict.fromkeys(Randomization.model_fields, RANGE) | {
 R = first_rows(RANDOMIZATION)
 
 
-def table_row(sizes: Mapping[str, int], parts: Mapping[str, Sequence[float]]) -> FloatArray:
-    """Return numbers one after the other, (sum of sizes,); what is not among them is 0.
+def numbers_of(record: Frozen, sizes: Mapping[str, int], control_step: float = 0.0) -> FloatArray:
+    """Return the numbers of a record one after the other, (sum of sizes,); 0 where none are given.
 
-    :param sizes: how many numbers each part can have, in their order.
+    :param sizes: how many numbers each field is, in their order.
+    :param control_step: s, of gusts.
     """
     row = np.zeros(sum(sizes.values()))
-    first = first_rows(sizes)
-    for name, numbers in parts.items():
-        start = getattr(first, name)
-        row[start : start + len(numbers)] = numbers
+    for name, place in row_slices(sizes).items():
+        given = getattr(record, name)
+        if isinstance(given, Gusts):
+            given = given.numbers(control_step)
+        elif isinstance(given, (Range, RandomVector)):
+            given = given.numbers()
+        if given is not None:
+            row[place] = given
     return row
 
 

@@ -29,8 +29,9 @@ from sb3_quad.simulation.state import AHEAD, REFERENCE_PARTS, REFERENCE_SIZE, ro
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]
-_PLACES = row_slices(REFERENCE_PARTS).values()
-_POSITION, _VELOCITY, _ACCELERATION, _HEADING, _HEADING_RATE, _AHEAD = _PLACES
+_POSITION, _VELOCITY, _ACCELERATION, _HEADING, _HEADING_RATE, _AHEAD = row_slices(
+    REFERENCE_PARTS
+).values()
 MAX_SECONDS = 600.0  # of a round or of all; a table must not fill the memory
 # Random motion: so many pieces of so many seconds, each a sum of sines that fit into it.
 PIECES = 256
@@ -93,7 +94,7 @@ class Reference(Frozen):
     """which curve; waypoints, a file or a function without one name theirs"""
     speed: PositiveFloat = Field(default=2.0, le=100)
     """greatest speed, m/s; of random_smooth the limit, below which each piece has its own"""
-    size: tuple[Metres, Metres, Metres] | None = None
+    size: Point | None = None
     """A, B and C, m; None: 2, 1 and 0.5 (figure_eight: 0)"""
     acceleration: PositiveFloat = Field(default=8.0, le=1e3)
     """random_smooth: limit of the acceleration, m/s²"""
@@ -123,14 +124,14 @@ class Reference(Frozen):
         Fields without a curve say which it is by what only one curve needs.
         """
         if isinstance(data, (str, Path)):
-            is_file = str(data).endswith(".csv")
-            return {"curve": "file", "file": data} if is_file else {"curve": data}
-        if callable(data):
-            return {"curve": "function", "function": data}
-        if isinstance(data, dict) and "curve" not in data:
+            field = "file" if str(data).endswith(".csv") else "curve"
+            data = {field: data}
+        elif callable(data):
+            data = {"function": data}
+        if isinstance(data, dict):
             for curve, field in NEEDED.items():
                 if data.get(field) is not None:
-                    return {**data, "curve": curve}
+                    return {"curve": curve, **data}
         return data
 
     @model_validator(mode="after")
@@ -175,10 +176,7 @@ class Reference(Frozen):
         # One row more where it does not loop: the end, at which it rests.
         with raised_as(ConfigError, f"reference {self.curve}"):
             table = self._table(motion, steps + (not loops), dt, loops, seconds)
-        if not loops:
-            table[-1, _VELOCITY.start : _ACCELERATION.stop] = 0.0
-            table[-1, _HEADING_RATE] = 0.0
-        return _tracks(table, len(table), loops, dt)
+        return Tracks(table, len(table), loops)
 
     def _motion(self, dt: float) -> tuple[Motion, float]:
         """Return a curve as a function of time, and how long it takes, s."""
@@ -189,11 +187,11 @@ class Reference(Frozen):
             return interpolated(times, points), times[-1]
         if self.curve == "function":
             return self.function, self.duration
-        a, b, c = self.size or (2.0, 1.0, 0.0 if self.curve == "figure_eight" else 0.5)
+        size = self.size or (2.0, 1.0, 0.0 if self.curve == "figure_eight" else 0.5)
         sines = SINES[self.curve]
         # The greatest speed per ω, on a fine grid
         grid = np.linspace(0.0, 2.0 * math.pi, 7201)
-        way = np.gradient(np.stack(sines(grid, a, b, c)), grid, axis=1)
+        way = np.gradient(np.stack(sines(grid, *size)), grid, axis=1)
         length = 2.0 * math.pi * np.linalg.norm(way, axis=0).max()
         # With fewer than 10 control steps in a round, differences are no velocities any more.
         fastest = length / (10 * dt)
@@ -207,12 +205,13 @@ class Reference(Frozen):
         omega = 2.0 * math.pi / seconds
         if self.curve == "helix":
             seconds = self.duration
-        return lambda t: np.stack(sines(omega * t, a, b, c), axis=1), seconds
+        return lambda t: np.stack(sines(omega * t, *size), axis=1), seconds
 
     def _table(
         self, motion: Motion, steps: int, dt: float, loops: bool, end: float = math.inf
     ) -> FloatArray:
-        """Return a table of a function, its derivatives by central differences.
+        """Return a table of a function, its derivatives by central differences; where it does not
+        loop, it rests in the last row.
 
         :param end: s, after which it rests where it does not loop.
         :raises ValueError: it gives something else than positions.
@@ -246,7 +245,14 @@ class Reference(Frozen):
             heading = self.heading + rate * times
         if heading is not None:
             _set_heading(table, heading, dt)
-        return table[more : more + steps]
+        table = table[more : more + steps]
+        if not loops:
+            table[-1, _VELOCITY.start : _ACCELERATION.stop] = 0.0
+            table[-1, _HEADING_RATE] = 0.0
+        later = np.arange(steps) + round(AHEAD / dt)
+        accelerations = table[:, _ACCELERATION]
+        table[:, _AHEAD] = accelerations.take(later, axis=0, mode="wrap" if loops else "clip")
+        return table
 
     def _polynomial(self) -> tuple[Motion, float]:
         """Return the motion of the least snap through the waypoints (Mellinger and Kumar, "Minimum
@@ -290,6 +296,7 @@ class Reference(Frozen):
             if number < self.resting * PIECES:
                 scale = 0.0
             table[:, : _ACCELERATION.stop] *= scale
+            table[:, _AHEAD] *= scale
             if scale == 0.0 and self.heading == "path":
                 # It has no path: the heading rests, too, as that of hover.
                 _set_heading(table, np.zeros(length), dt)
@@ -300,17 +307,7 @@ class Reference(Frozen):
                 angle = start + turns * base * dt * np.arange(length, dtype=np.float64)
                 _set_heading(table, angle, dt)
             pieces.append(table)
-        return _tracks(np.concatenate(pieces), length, True, dt)
-
-
-def _tracks(table: FloatArray, length: int, loops: bool, dt: float) -> Tracks:
-    """Return tables whose accelerations ahead are written, in place."""
-    pieces = table.reshape(-1, length, REFERENCE_SIZE)
-    later = np.arange(length) + round(AHEAD / dt)
-    pieces[..., _AHEAD] = pieces[..., _ACCELERATION].take(
-        later, axis=1, mode="wrap" if loops else "clip"
-    )
-    return Tracks(table, length, loops)
+        return Tracks(np.concatenate(pieces), length, True)
 
 
 def _set_heading(table: FloatArray, heading: FloatArray, dt: float) -> None:

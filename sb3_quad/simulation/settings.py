@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.simulation import MAX_EPISODE_STEPS
@@ -91,10 +92,20 @@ class FlightSettings(ObservationSettings):
             object.__setattr__(self, "max_episode_steps", mixture.max_episode_steps)
         return self
 
-    @property
-    def vehicle_sources(self) -> list[Any]:
-        """The vehicles as a list, also where there is one for all rows."""
-        return list(self.vehicle) if isinstance(self.vehicle, (list, tuple)) else [self.vehicle]
+    def load_vehicles(self) -> list[Vehicle]:
+        """Return the vehicles, one if it is that of all rows, in the layout that they are flown in.
+
+        :raises ConfigError: a vehicle that cannot be loaded, or with other time steps than others.
+        """
+        given = self.vehicle if isinstance(self.vehicle, (list, tuple)) else [self.vehicle]
+        vehicles = [load_vehicle(source, self.rotor_layout) for source in given]
+        for row, vehicle in enumerate(vehicles):
+            first = vehicles[0]
+            if (vehicle.physics_step, vehicle.substeps) != (first.physics_step, first.substeps):
+                raise ConfigError(
+                    f"vehicle of row {row}: physics_step and control_step must be those of row 0"
+                )
+        return vehicles
 
     @property
     def longest_episode(self) -> int:
@@ -155,10 +166,7 @@ class FlightSettings(ObservationSettings):
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
-        changes: dict[str, Any] = {
-            "vehicle": first_vehicle(self.vehicle),
-            "vehicles": self.vehicles,
-        }
+        changes: dict[str, Any] = {"vehicle": first_vehicle(self.vehicle)}
         if isinstance(self.noise, list):
             changes["noise"] = float(np.mean(self.noise))
         for name in ("observation_mean", "observation_std"):
@@ -170,23 +178,7 @@ class FlightSettings(ObservationSettings):
             # A function cannot be written, and the file may not be where the zip is read. The agent
             # does not need either: it follows any reference.
             changes["reference"] = None
-        setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
-
-
-def known_layout(model: Any) -> Vehicle | None:
-    """Return the layout that a model knows, as :meth:`FlightSettings.write_into` wrote it; None if
-    the model holds no settings.
-
-    :raises ConfigError: the settings that it holds do not fit.
-    """
-    own = getattr(model, KEY, None)
-    if not isinstance(own, dict):
-        return None
-    return validate(
-        Vehicle,
-        own.get("rotor_layout") or own.get("vehicle"),
-        f"{type(model).__name__}.{KEY}: vehicle",
-    )
+        setattr(model, KEY, self.model_copy(update=changes).model_dump(mode="json"))
 
 
 def levels(noise: Any) -> tuple[FloatArray, FloatArray]:

@@ -186,8 +186,8 @@ class QuadcopterState:
         columns = [(state.array, state.vehicles, state.wrench) for state in states]
         joined: list[Any] = []
         for arrays in zip(*columns, strict=True):
-            known = [array for array in arrays if array is not None]
-            joined.append(np.concatenate(known, axis=1) if len(known) == len(states) else None)
+            unknown = any(array is None for array in arrays)
+            joined.append(None if unknown else np.concatenate(arrays, axis=1))
         return QuadcopterState(*joined)
 
 
@@ -227,7 +227,8 @@ def make_wrench(
     wrench = np.zeros((WRENCH_SIZE, len(force)))
     rows: Any = row_slices(WRENCH)
     for kind, values, frame in (("force", force, force_frame), ("torque", torque, torque_frame)):
-        if frame not in ("world", "body"):
+        name = f"{kind}_{frame}"
+        if name not in rows:
             raise ConfigError(f"{kind}_frame {frame!r}: must be 'world' or 'body'")
-        wrench[rows[f"{kind}_{frame}"]] = values.T
+        wrench[rows[name]] = values.T
     return wrench

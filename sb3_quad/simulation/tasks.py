@@ -184,26 +184,27 @@ def resolve_tasks(
     overrides = dict(task_kwargs or {})
     mixture = find_mixture(task)
     if mixture is not None:
-        weights: Mapping[Any, Any] = mixture.weights
+        task = mixture.weights
         overrides = {**mixture.task_kwargs, **overrides}
-    elif isinstance(task, Mapping):
-        weights = task
+    if isinstance(task, Mapping):
+        if not task:
+            raise ConfigError(
+                "task: the mixture names no task; give at least one, such as"
+                " {'target_tracking': 1.0}"
+            )
+        tasks = [_resolve(name, TASKS, overrides) for name in task]
+        weights = list(task.values())
     else:
-        parameters = _resolve(task, TASK_NAMES, overrides).parameters()
-        return parameters[None], np.ones(1)
-    if not weights:
-        raise ConfigError(
-            "task: the mixture names no task; give at least one, such as {'target_tracking': 1.0}"
-        )
-    shares = per_row("task: the weights", list(weights.values()), len(weights))[0]
+        tasks = [_resolve(task, TASK_NAMES, overrides)]
+        weights = [1.0]
+    shares = per_row("task: the weights", weights, len(weights))[0]
     if (shares < 0).any() or not shares.any():
         raise ConfigError(
             f"task: the weights {shares.tolist()} must be not negative and not all zero"
         )
-    parameters = np.stack([_resolve(name, TASKS, overrides).parameters() for name in weights])
     cumulative = np.cumsum(shares / shares.sum())
     cumulative[-1] = 1.0
-    return parameters, cumulative
+    return np.stack([task.parameters() for task in tasks]), cumulative
 
 
 def _resolve(task: Any, names: Collection[str], overrides: dict[str, Any]) -> Task:

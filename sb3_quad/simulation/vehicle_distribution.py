@@ -7,10 +7,11 @@ delay, time steps, gravity.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from sb3_quad.base.types import FloatArray
@@ -26,7 +27,7 @@ from sb3_quad.simulation.randomization import (
     Range,
     between,
     flyable,
-    table_row,
+    numbers_of,
 )
 from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -76,10 +77,7 @@ class VehicleDistribution(Frozen):
         if not isinstance(data, Mapping) or "distribution" not in data:
             return data
         changes = dict(data)
-        source = changes.pop("distribution")
-        if not isinstance(source, (str, Path)):
-            raise ValueError("distribution: must be a name, or the path of a YAML file")
-        return {**DISTRIBUTIONS.read(source)[0], **changes}
+        return {**DISTRIBUTIONS.read(changes.pop("distribution"))[0], **changes}
 
     def hardest(self, base: Vehicle) -> Vehicle:
         """Return the vehicle with the least thrust and the fastest motors, at the base vehicle's
@@ -110,13 +108,7 @@ class VehicleDistribution(Frozen):
         """Return the numbers that :func:`sample_from_distribution` reads, in the order of
         ``DISTRIBUTION_NUMBERS``.
         """
-        parts: dict[str, Sequence[float]] = {"size_deviation": [self.size_deviation]}
-        for name, given in self:
-            if isinstance(given, Range):
-                parts[name] = given.numbers()
-        if self.inertia_ratios is not None:
-            parts["inertia_ratios"] = self.inertia_ratios
-        return table_row(DISTRIBUTION_NUMBERS, parts)
+        return numbers_of(self, DISTRIBUTION_NUMBERS)
 
 
 DISTRIBUTION_NUMBERS = dict.fromkeys(VehicleDistribution.model_fields, RANGE) | {
@@ -126,7 +118,7 @@ DISTRIBUTION_NUMBERS = dict.fromkeys(VehicleDistribution.model_fields, RANGE) | 
 """Numbers of :meth:`VehicleDistribution.numbers`; ratios that are not given are 0."""
 D = first_rows(DISTRIBUTION_NUMBERS)
 # Its ranges are FIXED.
-NO_DISTRIBUTION = table_row(DISTRIBUTION_NUMBERS, {})
+NO_DISTRIBUTION = np.zeros(sum(DISTRIBUTION_NUMBERS.values()))
 
 
 @compiled

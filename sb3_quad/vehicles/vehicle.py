@@ -181,7 +181,7 @@ class Vehicle(Frozen):
         given = [name for name in LIMITS if getattr(self, name) not in (None, _NO_LIMITS)]
         if len(given) != 1:
             raise ValueError(f"{' and '.join(given or LIMITS)}: give exactly one of them")
-        name = given[0]
+        (name,) = given
         if name == "thrust_limits":
             return self
         low, high = getattr(self, name)
@@ -282,14 +282,14 @@ class Vehicle(Frozen):
         changes: StrDict = {name: getattr(self, name) for name in _FOUND}
         changes["rotor_positions"] = positions.tolist()
         changes["rotor_directions"] = other.rotor_directions
-        for name, what in {"inertia": "Ixx and Iyy", "drag": "drag in x and in y"}.items():
+        for name in ("inertia", "drag"):
             values = getattr(self, name)
             turned = turn.axes @ np.diag(values) @ turn.axes.T
             if abs(turned[0, 1]) > 0.02 * min(values[:2]):
                 raise ConfigError(
                     f"rotor_layout: {self.name} has to be turned by "
                     f"{math.degrees(turn.angle):.0f}° to the layout of {other.name}, "
-                    f"but its {what} differ"
+                    f"but its {name} differs in x and y"
                 )
             changes[name] = turned.diagonal().tolist()
         return self.model_copy(update=changes)
@@ -452,37 +452,37 @@ VehicleSource = StrPath | Vehicle
 """The name of a vehicle (``"itm"``), the path of a YAML file, or a vehicle."""
 
 
-def load_vehicle(source: VehicleSource) -> Vehicle:
+def load_vehicle(source: VehicleSource, layout: VehicleSource | None = None) -> Vehicle:
     """Return a vehicle by name or path, or as it is.
 
     A line on stderr warns of a user's file whose inertia no rigid body has.
 
+    :param layout: the vehicle in whose layout it is flown, as of ``rotor_layout``; None: its own.
     :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown,
         missing or out of range.
     """
     if isinstance(source, Vehicle):
-        return source
-    data, where = VEHICLES.read(source)
-    vehicle = validate(Vehicle, data, where)
-    if vehicle.inertia_fault and VEHICLES.is_path(source):
-        print_once(
-            f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; "
-            "it is flown as it is"
-        )
-    return vehicle
+        vehicle = source
+    else:
+        data, where = VEHICLES.read(source)
+        vehicle = validate(Vehicle, data, where)
+        if vehicle.inertia_fault and VEHICLES.is_path(source):
+            print_once(
+                f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; "
+                "it is flown as it is"
+            )
+    if layout is None:
+        return vehicle
+    return vehicle.in_layout_of(load_vehicle(layout))
 
 
 def first_vehicle(given: Any, layout: VehicleSource | None = None) -> Vehicle:
-    """Return the vehicle that is given, or the first of a list, as ``env_kwargs`` may have one.
-
-    :param layout: the vehicle in whose layout it is flown, as of ``rotor_layout``; None: its own.
+    """Return the vehicle that is given, or the first of a list, as ``env_kwargs`` may have one, see
+    :func:`load_vehicle`.
     """
     if isinstance(given, (list, tuple)):
         if not given:
             raise ConfigError("vehicle []: give at least one")
         given = given[0]
-    vehicle = load_vehicle(given)
-    if layout is None:
-        return vehicle
-    return vehicle.in_layout_of(load_vehicle(layout))
+    return load_vehicle(given, layout)
