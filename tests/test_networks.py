@@ -17,9 +17,9 @@ from sb3_quad import APG, PPOBC, DAgger, GeometricExpert
 from sb3_quad.algorithms import dagger, ppo_bc
 from sb3_quad.algorithms.networks import gradients as networks
 from sb3_quad.algorithms.networks import losses
-from sb3_quad.algorithms.networks.gradients import Batch, Perceptrons
+from sb3_quad.algorithms.networks.gradients import Perceptrons
 from sb3_quad.algorithms.networks.losses import Loss
-from sb3_quad.algorithms.networks.perceptron import Perceptron, one_torch_thread
+from sb3_quad.algorithms.networks.perceptron import Batch, Perceptron, one_torch_thread
 from sb3_quad.envs import QuadcopterVecEnv
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
@@ -36,11 +36,10 @@ def cloning(net, x, labels, index):
     compiled code.
     """
     log_std = nn.Parameter(th.zeros(labels.shape[1]))
-    terms = Perceptron([*net]).gradient(
-        x.numpy(), index, labels.numpy(), Loss(bc_coef=1.0), log_std
-    )
+    batch = Batch(index, x.numpy(), labels.numpy())
+    terms = Perceptron([*net]).gradient(batch, Loss(bc_coef=1.0), log_std)
     return [
-        th.tensor(terms[losses.CLONING] / len(index)),
+        th.tensor(terms[losses.CLONING]),
         *(parameter.grad.clone() for parameter in net.parameters()),
     ]
 
@@ -337,6 +336,12 @@ class HalfPolicy(ActorCriticPolicy):
 def test_a_policy_with_methods_of_its_own_is_left_to_pytorch():
     model = DAgger(HalfPolicy, QuadcopterVecEnv(4, seed=0), device="cpu")
     assert networks.network_of(model.policy) is model.policy
+
+
+def test_layers_that_actor_and_critic_share_are_left_to_pytorch():
+    policy = PPO("MlpPolicy", QuadcopterVecEnv(4, seed=0), device="cpu").policy
+    policy.mlp_extractor.value_net = policy.mlp_extractor.policy_net
+    assert networks.network_of(policy) is policy
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ PPO.
 
 import csv
 import inspect
+import math
 
 import gymnasium as gym
 import numpy as np
@@ -423,6 +424,26 @@ def test_an_initial_policy_is_a_model_a_zip_or_a_name(kind, tmp_path):
     if kind == "model":
         with pytest.raises(ConfigError, match="policy_kwargs must be the same"):
             PPOBC("MlpPolicy", env, initial_policy=source, policy_kwargs={"net_arch": [8]})
+
+
+def test_an_initial_policy_of_no_use_is_refused():
+    source = PPO("MlpPolicy", "Pendulum-v1")
+    with pytest.raises(ConfigError, match="must be a model, the path of a zip, or a name"):
+        PPOBC("MlpPolicy", "Pendulum-v1", initial_policy=source.policy)
+    th.nn.init.constant_(source.policy.action_net.bias, math.nan)
+    with pytest.raises(
+        ConfigError, match="the policy of PPO: holds parameters that are not finite"
+    ):
+        PPOBC("MlpPolicy", "Pendulum-v1", initial_policy=source)
+
+
+def test_a_cloning_weight_needs_an_expert_and_actions_of_a_box():
+    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0)
+    with pytest.raises(ExpertError, match=r"PPOBC\(\.\.\., expert='geometric'\), .* bc_coef=0"):
+        model.set_bc_coef(0.1)
+    assert not model.will_clone()
+    with pytest.raises(ConfigError, match="Box action space only"):
+        PPOBC("MlpPolicy", "CartPole-v1", expert=swing_back)
 
 
 def test_an_initial_policy_that_observed_something_else_is_warned_of(capsys):

@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import ExpertMixin, model_of, policy_arguments
+from sb3_quad.algorithms.common import ExpertMixin, policy_arguments
 from sb3_quad.algorithms.flight_cost import (
     FlownStates,
     body_rates_cost,
@@ -29,6 +29,7 @@ from sb3_quad.algorithms.flight_cost import (
 )
 from sb3_quad.algorithms.networks.gradients import RecordedPolicy
 from sb3_quad.algorithms.soap import SOAP
+from sb3_quad.algorithms.transfer import model_of
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.simulation.tape import FlightCost
@@ -197,6 +198,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             with raised_as(ConfigError, unfit):
                 policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
 
+    def will_clone(self) -> bool:
+        """Return False: it has no expert."""
+        return False
+
     def learn(
         self,
         total_timesteps: int,
@@ -302,7 +307,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         if not (np.isfinite(cost) and th.isfinite(norm)):
-            self.policy.optimizer.zero_grad()
             raise TrainingError(
                 f"the gradient is not finite after {self.num_timesteps} timesteps (cost"
                 f" {cost:.3g}): try a smaller learning_rate or shorter flights (n_steps)"

@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_quad.algorithms.networks.gradients import Batch
+from sb3_quad.algorithms.networks.perceptron import Batch
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_arrays, write_arrays
 from sb3_quad.base.types import AnyArray, Arrays, Float32Array, IntArray, StrDict, StrPath
@@ -49,8 +48,8 @@ class ExpertRolloutBuffer(RolloutBuffer):
 
     def get(self, batch_size: int | None = None) -> Generator[ExpertRolloutSamples, None, None]:  # type: ignore[override]
         """Yield mini-batches in random order, as SB3's buffer does, with the expert's actions."""
-        for rows in self.minibatches(batch_size or self.buffer_size * self.n_envs):
-            yield self._get_samples(rows)
+        n_rows = batch_size or self.buffer_size * self.n_envs
+        yield from map(self.samples, self.minibatches(n_rows))
 
     def minibatches(self, batch_size: int, shuffle: bool = True) -> Iterator[IntArray]:
         """Yield the row numbers (b,) of mini-batches.
@@ -75,24 +74,20 @@ class ExpertRolloutBuffer(RolloutBuffer):
 
     def samples(self, rows: IntArray) -> ExpertRolloutSamples:
         """Return the rows of a mini-batch as tensors."""
-        return self._get_samples(rows)
+        stock = self._get_samples(rows)
+        return ExpertRolloutSamples(*stock, self.to_torch(self.expert_actions[rows]))
 
     def batches(self, rows: IntArray) -> tuple[Batch, Batch]:
         """Return a mini-batch as compiled code takes it: for the actor and for the critic."""
         if self._targets is None:
-            flown = [self.actions, self.log_probs, self.advantages]
-            labels = [self.expert_actions] if self.bc_coef != 0.0 else []
-            for_actor = np.hstack([*labels, *flown], dtype=np.float32)
-            self._targets = for_actor, np.hstack([self.values, self.returns])
-        for_actor, for_critic = self._targets
-        actor = Batch(rows, self.observations, for_actor)
-        return actor, Batch(rows, self.observations, for_critic)
-
-    def _get_samples(  # type: ignore[override]
-        self, batch_inds: IntArray, env: VecNormalize | None = None
-    ) -> ExpertRolloutSamples:
-        stock = super()._get_samples(batch_inds, env)
-        return ExpertRolloutSamples(*stock, self.to_torch(self.expert_actions[batch_inds]))
+            for_actor = [self.actions, self.log_probs, self.advantages]
+            if self.bc_coef != 0.0:
+                for_actor.insert(0, self.expert_actions)
+            for_critic = [self.values, self.returns]
+            self._targets = np.hstack(for_actor, dtype=np.float32), np.hstack(for_critic)
+        actor_targets, critic_targets = self._targets
+        actor = Batch(rows, self.observations, actor_targets)
+        return actor, Batch(rows, self.observations, critic_targets)
 
 
 class AggregatedDataset:

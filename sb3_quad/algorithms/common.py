@@ -1,10 +1,9 @@
 """The parts that all algorithms with an expert share."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import wraps
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,29 +11,25 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import Terms, network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, TrainingError, raised_as, unknown
+from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, raised_as
 from sb3_quad.base.files import one_line
-from sb3_quad.base.types import Float32Array, StrDict, StrPath
+from sb3_quad.base.types import Float32Array, StrDict
 from sb3_quad.controllers.controller import Controller, limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
-from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.statistics import STATISTICS, share_statistics
-from sb3_quad.controllers.zips import load_model
 from sb3_quad.simulation.settings import KEY, FlightSettings
 
-_SHARE = (0, 1)
-_WEIGHT = (0, 2**40)
+_MOST = 2**40
 # Arguments that are whole numbers
 _COUNTS = (
     "n_steps",
@@ -46,26 +41,24 @@ _COUNTS = (
     "target_update_interval",
     "substeps",
 )
+_SHARES = ("learning_rate", "gamma", "gae_lambda", "tau", "beta", "beta_final")
+_WEIGHTS = (
+    "max_grad_norm",
+    "clip_range",
+    "clip_range_vf",
+    "target_kl",
+    "critic_warmup",
+    "bc_coef",
+    "l2_coef",
+    "vf_coef",
+    "beta_decay",
+    "body_rates_coef",
+    "low_force_coef",
+)
 LIMITS = {
-    **dict.fromkeys(_COUNTS, (1, 2**40)),
-    "learning_rate": _SHARE,
-    "gamma": _SHARE,
-    "gae_lambda": _SHARE,
-    "tau": _SHARE,
-    "max_grad_norm": _WEIGHT,
-    "clip_range": _WEIGHT,
-    "clip_range_vf": _WEIGHT,
-    "target_kl": _WEIGHT,
-    "critic_warmup": _WEIGHT,
-    "bc_coef": _WEIGHT,
-    "l2_coef": _WEIGHT,
-    "vf_coef": _WEIGHT,
-    "beta": _SHARE,
-    "beta_final": _SHARE,
-    "beta_decay": _WEIGHT,
-    "max_row_ratio": (1, 2**40),
-    "body_rates_coef": _WEIGHT,
-    "low_force_coef": _WEIGHT,
+    **dict.fromkeys((*_COUNTS, "max_row_ratio"), (1, _MOST)),
+    **dict.fromkeys(_SHARES, (0, 1)),
+    **dict.fromkeys(_WEIGHTS, (0, _MOST)),
 }
 """Valid range of each argument of the algorithms; the greatest holds for settings files alone."""
 History = dict[str, list[float]]
@@ -100,34 +93,45 @@ def with_unit_actions(train: Callable[[Any], None]) -> Callable[[Any], None]:
     return scaled
 
 
-class ExpertMixin:
+class ExpertMixin(BaseAlgorithm):
     """The expert of an algorithm, and what its zips say about its flights."""
 
-    env: VecEnv | None
-    _vec_normalize_env: VecNormalize | None
     policy: Any
-    logger: Logger
-    num_timesteps: int
-    observation_space: spaces.Space[Any]
     action_space: Any
-    policy_class: Any
-    policy_aliases: ClassVar[Any]
     rollout_buffer: Any
     _last_obs: Any
     _last_episode_starts: Any
-    _n_updates: int
-    expert: ExpertLike | None
-    bc_coef: Any
     batch_size: Any
-    policy_kwargs: StrDict
+    bc_coef: Any
+    expert: ExpertLike | None = None
     # It asks the expert, and holds the state that a recurrent one carries on.
     _labeller: Controller | None = None
     # What else of an algorithm no zip holds.
     _not_saved: tuple[str, ...] = ()
 
     def set_expert(self, expert: ExpertLike | None) -> None:
-        """Learn from ``expert`` from now on, as a model must that was loaded without one."""
+        """Learn from ``expert`` from now on, as a model must that was loaded without one.
+
+        :raises ExpertError: an expert that does not fit the environment.
+        """
+        if expert is not None and self.env is not None:
+            self._labeller = Controller.for_env(expert, self.env, self._labeller)
         self.expert = expert
+
+    def _check_expert(self) -> None:
+        if self.expert is None:
+            name = type(self).__name__
+            raise ExpertError(
+                f"{name} needs an expert to clone: {name}(..., expert='geometric'),"
+                " model.set_expert(...), or bc_coef=0"
+            )
+
+    def will_clone(self) -> bool:
+        """Return whether learning asks the expert: whether the cloning term ever has a weight.
+
+        A hundred samples of its schedule are taken.
+        """
+        return any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Learn in another environment from now on; see SB3's ``set_env``.
@@ -135,7 +139,7 @@ class ExpertMixin:
         The model's zips say from then on that its agent flies as this environment does, or nothing
         of how it flies where that cannot be read.
         """
-        super().set_env(env, force_reset)  # type: ignore[misc]
+        super().set_env(env, force_reset)
         self._note_flight_settings()
 
     def correct_offset(self, seed: int = 0, scale: float = 1.0) -> offset_correction.Correction:
@@ -156,7 +160,7 @@ class ExpertMixin:
                 "correct_offset: the model has no quadcopter environment to measure the offset in;"
                 " give it one by model.set_env(...)"
             )
-        return offset_correction.correct_offset(self, seed, settings, scale)  # type: ignore[arg-type]
+        return offset_correction.correct_offset(self, seed, settings, scale)
 
     def _check_arguments(self) -> None:
         # SB3 would pickle NumPy numbers into the zip, and does not accept all of them.
@@ -198,24 +202,17 @@ class ExpertMixin:
         if isinstance(net_arch, str):
             raise ConfigError(f"net_arch {net_arch!r}: must be a list of numbers, as in [64, 64]")
 
-    def _check_names(self, **valid: Sequence[str]) -> None:
-        """Check arguments whose valid values are given by their names."""
-        for argument, names in valid.items():
-            value = getattr(self, argument)
-            if value not in names:
-                raise ConfigError(unknown(argument, value, names))
-
     def _set_up(self, initial: BaseAlgorithm | None) -> None:
         """Set the model up, with the policy of the agent that it starts from."""
         self._setup_model()
         if initial is not None:
-            transfer_policy(initial, self)  # type: ignore[arg-type]
+            transfer_policy(initial, self)
 
     def _setup_model(self) -> None:
         self._check_arguments()
         # The orthogonal weights of a new network depend on the number of threads that make them.
         with one_torch_thread(compiled=True):
-            super()._setup_model()  # type: ignore[misc]
+            super()._setup_model()  # type: ignore[safe-super]
         if self.env is not None:
             # A zip's statistics, which are read before this, go on in the environment.
             if hasattr(self, STATISTICS):
@@ -231,7 +228,7 @@ class ExpertMixin:
         for name, way_out in _OF_NEW_MODELS.items():
             if keywords.get(name) is not None:
                 raise ConfigError(f"{cls.__name__}.load does not take {name}; {way_out}")
-        return super().load(*arguments, **keywords)  # type: ignore[misc, no-any-return]
+        return super().load(*arguments, **keywords)
 
     def set_parameters(self, *arguments: Any, **keywords: Any) -> None:
         """Take the parameters of another model by SB3's ``set_parameters``.
@@ -239,7 +236,7 @@ class ExpertMixin:
         :raises RuntimeError: parameters of other networks, in one line.
         """
         try:
-            super().set_parameters(*arguments, **keywords)  # type: ignore[misc]
+            super().set_parameters(*arguments, **keywords)
         except RuntimeError as error:
             raise RuntimeError(f"set_parameters: {one_line(error)}") from None
 
@@ -277,11 +274,16 @@ class ExpertMixin:
         setattr(self, STATISTICS, self._vec_normalize_env)
 
     def learn(self, *arguments: Any, **keywords: Any) -> Self:
-        """Learn as SB3 does. Compiled code leaves PyTorch one thread."""
+        """Learn as SB3 does. Compiled code leaves PyTorch one thread.
+
+        :raises ExpertError: no expert where one is needed, or one that does not fit.
+        """
+        if self.env is not None and self.will_clone():
+            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
         policy = self.policy
         compiled = isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
         with one_torch_thread(compiled):
-            return super().learn(*arguments, **keywords)  # type: ignore[misc, no-any-return]
+            return super().learn(*arguments, **keywords)  # type: ignore[safe-super]
 
     def _labels(self, env: VecEnv) -> Float32Array:
         """Return the expert's actions for the present states, (n_envs, action_dim).
@@ -326,7 +328,7 @@ class ExpertMixin:
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
-        return [*super()._excluded_save_params(), *own, *self._not_saved]  # type: ignore[misc]
+        return [*super()._excluded_save_params(), *own, *self._not_saved]
 
 
 def unit_action_transform(
@@ -368,21 +370,6 @@ def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
     return settings if env.observation_space.shape == (settings.observation.size,) else None
 
 
-def model_of(initial_policy: BaseAlgorithm | StrPath | None) -> BaseAlgorithm | None:
-    """Return the model that ``initial_policy`` is or names.
-
-    :param initial_policy: a model, the path of a zip, a run folder, or the name of a shipped agent.
-    :raises ConfigError: a missing or damaged file, or something else.
-    """
-    if isinstance(initial_policy, (str, Path)):
-        return load_model(agent_path(str(initial_policy)))
-    if initial_policy is not None and not isinstance(initial_policy, BaseAlgorithm):
-        raise ConfigError(
-            f"initial_policy {initial_policy!r}: must be a model, the path of a zip, or a name"
-        )
-    return initial_policy
-
-
 def policy_arguments(
     given: StrDict | None,
     initial: BaseAlgorithm | None,
@@ -420,8 +407,3 @@ def actor_and_critic_parameters(policy: Any) -> tuple[list[Any], list[Any]]:
         else:
             actor.append(parameter)
     return actor, critic
-
-
-def is_ever_nonzero(schedule: Schedule) -> bool:
-    """Return whether a schedule gives its term a weight anywhere, by a hundred samples of it."""
-    return any(schedule(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())

@@ -25,13 +25,11 @@ from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
     actor_and_critic_parameters,
-    model_of,
     policy_arguments,
     unit_action_transform,
     with_unit_actions,
 )
 from sb3_quad.algorithms.networks.gradients import (
-    Batch,
     Perceptrons,
     mean_actions,
     network_of,
@@ -45,9 +43,11 @@ from sb3_quad.algorithms.networks.losses import (
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.algorithms.networks.perceptron import Batch
+from sb3_quad.algorithms.transfer import model_of
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.controllers.controller import Controller, limits_of
+from sb3_quad.controllers.controller import limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
 
 # Observations that the critic evaluates at once after a rollout
@@ -227,7 +227,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             raise ConfigError(
                 f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1"
             )
-        self._check_names(bc_loss=CLONING_LOSSES)
+        refuse_unknown("bc_loss", [self.bc_loss], CLONING_LOSSES)
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(
@@ -253,15 +253,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             dtype,
         )
         self.dataset.action_range = limits_of(self.action_space)
-
-    def set_expert(self, expert: ExpertLike | None) -> None:
-        """Learn from ``expert`` from now on. None: from the pairs that the dataset holds alone.
-
-        :raises ExpertError: an expert that does not fit the environment
-        """
-        if expert is not None and self.env is not None:
-            self._labeller = Controller.for_env(expert, self.env, self._labeller)
-        self.expert = expert
 
     def will_clone(self) -> bool:
         """Return whether learning asks the expert; else it clones the flights it was given."""
@@ -299,8 +290,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """
-        if self.will_clone() and self.env is not None:
-            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
         if reset_num_timesteps:
             self._n_rollouts = 0
         return super().learn(
@@ -331,7 +320,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
-        action_space = self.action_space
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
         not_yet = th.zeros(env.num_envs)
@@ -351,8 +339,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta
             actions = np.where(by_expert[step, :, None], labels, sampled)
-            shaped = actions.reshape(-1, *action_space.shape)
-            clipped_actions = np.clip(shaped, action_space.low, action_space.high)
+            shaped = actions.reshape(-1, *self.action_space.shape)
+            clipped_actions = shaped.clip(self.action_space.low, self.action_space.high)
 
             new_obs, rewards, dones, infos = env.step(clipped_actions)
 
@@ -494,7 +482,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             norm = th.nn.utils.clip_grad_norm_(actor_parameters, self.max_grad_norm)
             critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, self.max_grad_norm)
             if not np.isfinite([*terms.values(), float(norm), float(critic_norm)]).all():  # +
-                self.policy.optimizer.zero_grad()
                 raise self._diverged(terms)
             self.policy.optimizer.step()
             self.policy.log_std.data.clamp_(min=self.log_std_min)  # +

@@ -55,28 +55,25 @@ def correct_offset(
     """
     if not scale > 0.0:
         raise ConfigError(f"scale {scale}: must be above 0; 1 leaves distances as they are")
-    layer = first_layer(model)
-    weights = copy.deepcopy(layer.state_dict())
-    try:
-        return _corrected(model, seed, settings or FlightSettings(), scale)
-    except BaseException:
-        layer.load_state_dict(weights)
-        raise
-
-
-def _corrected(model: BaseAlgorithm, seed: int, own: FlightSettings, scale: float) -> Correction:
+    own = settings or FlightSettings()
     std = DEFAULT_STD if own.observation_std is None else np.asarray(own.observation_std)
     statistics = statistics_of(model)
     if statistics is not None:
         # VecNormalize scales what the environment has scaled.
         std = std * np.sqrt(statistics.obs_rms.var + statistics.epsilon)
-    before = after = hover_offset(model, seed=seed, settings=own)
-    if scale != 1.0:
-        scale_position(model, scale)
-        after = hover_offset(model, seed=seed, settings=own)
-    for seed_of_round in row_seeds(seed, ROUNDS):
-        shift_position(model, after, std[_POSITION])
-        after = hover_offset(model, seed=seed_of_round, settings=own)
+    layer = first_layer(model)
+    weights = copy.deepcopy(layer.state_dict())
+    try:
+        before = after = hover_offset(model, seed=seed, settings=own)
+        if scale != 1.0:
+            scale_position(model, scale)
+            after = hover_offset(model, seed=seed, settings=own)
+        for seed_of_round in row_seeds(seed, ROUNDS):
+            shift_position(model, after, std[_POSITION])
+            after = hover_offset(model, seed=seed_of_round, settings=own)
+    except BaseException:
+        layer.load_state_dict(weights)
+        raise
     return Correction(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
 
 

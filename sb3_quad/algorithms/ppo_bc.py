@@ -24,8 +24,6 @@ from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
     actor_and_critic_parameters,
-    is_ever_nonzero,
-    model_of,
     policy_arguments,
     with_unit_actions,
 )
@@ -41,7 +39,8 @@ from sb3_quad.algorithms.networks.losses import (
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.algorithms.transfer import model_of
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
@@ -191,8 +190,9 @@ class PPOBC(ExpertMixin, PPO):
             self._set_up(initial)
 
     def _setup_model(self) -> None:
+        refuse_unknown("bc_loss", [self.bc_loss], CLONING_LOSSES)
         filters = [name for name in BC_FILTERS if name != "q"]
-        self._check_names(bc_loss=CLONING_LOSSES, bc_filter=filters)
+        refuse_unknown("bc_filter", [self.bc_filter], filters)
         self._refuse_dict_observations()
         # SB3's own, as a zip of PPO names it, is one without labels.
         if self.rollout_buffer_class in (None, RolloutBuffer):
@@ -235,13 +235,6 @@ class PPOBC(ExpertMixin, PPO):
             self._check_cloning()
         self.bc_coef = FloatSchedule(float(bc_coef))
 
-    def will_clone(self) -> bool:
-        """Return whether the schedule ever gives the cloning term a weight.
-
-        A hundred samples of it are taken.
-        """
-        return is_ever_nonzero(self.bc_coef)
-
     def _scale_actions(self, inverse: bool = False) -> None:
         # Without a cloning term it is PPO, which counts actions as they are.
         may_clone = self.will_clone() or self.rollout_buffer.bc_coef
@@ -249,11 +242,7 @@ class PPOBC(ExpertMixin, PPO):
             super()._scale_actions(inverse)
 
     def _check_cloning(self) -> None:
-        if self.expert is None:
-            raise ExpertError(
-                "PPOBC needs an expert to clone: PPOBC(..., expert='geometric'),"
-                " model.set_expert(...), or bc_coef=0"
-            )
+        self._check_expert()
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError(
                 "use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for"

@@ -19,13 +19,7 @@ from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import (
-    ExpertMixin,
-    History,
-    is_ever_nonzero,
-    model_of,
-    policy_arguments,
-)
+from sb3_quad.algorithms.common import ExpertMixin, History, policy_arguments
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
     CLONING_LOSSES,
@@ -34,7 +28,8 @@ from sb3_quad.algorithms.networks.losses import (
     agree,
     cloning_errors,
 )
-from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.algorithms.transfer import model_of
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import AnyArray, Float32Array, StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
@@ -172,14 +167,15 @@ class SACBC(ExpertMixin, SAC):
     def _setup_model(self) -> None:
         # The negative log-likelihood is no error of an action that tanh squashes.
         kinds = [name for name in CLONING_LOSSES if name != "nll"]
-        self._check_names(bc_loss=kinds, bc_filter=BC_FILTERS)
+        refuse_unknown("bc_loss", [self.bc_loss], kinds)
+        refuse_unknown("bc_filter", [self.bc_filter], BC_FILTERS)
         if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
             raise ConfigError(
                 f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
                 " observations; give 1"
             )
         self._check_arguments()
-        self._clones = is_ever_nonzero(self.bc_coef)
+        self._clones = self.will_clone()
         if self._clones and self.replay_buffer_class not in _STOCK_BUFFERS:
             raise ConfigError(
                 f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's"
@@ -200,10 +196,6 @@ class SACBC(ExpertMixin, SAC):
     def policy_is_idle(self) -> bool:
         """Whether only the critic has learnt so far (``critic_warmup``)."""
         return 0 < self.critic_warmup >= self._n_updates
-
-    def will_clone(self) -> bool:
-        """Return whether the expert is needed at all."""
-        return self._clones
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """Load a replay buffer by SB3's ``load_replay_buffer``.
@@ -234,10 +226,8 @@ class SACBC(ExpertMixin, SAC):
 
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
-        if self.will_clone() and self.expert is None:
-            raise ExpertError(
-                "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
-            )
+        if self.will_clone():
+            self._check_expert()
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )

@@ -1,5 +1,6 @@
 """Starting from a trained agent: its policy and critic in a new algorithm with a new optimiser."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,28 @@ from stable_baselines3.common.utils import update_learning_rate
 from sb3_quad.algorithms.buffers import AggregatedDataset
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
-from sb3_quad.base.types import StrDict, StrMapping, StrPath
+from sb3_quad.base.types import StrPath
 from sb3_quad.controllers.agent_settings import warn_of_observation
 from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.statistics import share_statistics, statistics_of
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.simulation.settings import KEY
+
+
+def model_of(source: BaseAlgorithm | StrPath | None) -> BaseAlgorithm | None:
+    """Return the model that ``source`` is or names; None for None.
+
+    :param source: a model, the path of a zip, a run folder, or the name of a shipped agent.
+    :raises ConfigError: a missing or damaged file, or something else.
+    """
+    if isinstance(source, (str, Path)):
+        return load_model(agent_path(str(source)))
+    if source is not None and not isinstance(source, BaseAlgorithm):
+        raise ConfigError(
+            f"initial_policy {source!r}: must be a model, the path of a zip, or a name"
+        )
+    return source
 
 
 def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> None:
@@ -34,16 +51,15 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
 
     Statistics of VecNormalize go into the model's environment.
 
-    :param source: a model, or the path of an SB3 zip, of any algorithm.
+    :param source: a model of any algorithm, or what names one: the path of a zip or of a run
+        folder, or a shipped agent's name.
     :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ;
         the message names them.
     """
+    name = str(source)
     if isinstance(source, BaseAlgorithm):
         name = f"the policy of {type(source).__name__}"
-        teacher = source
-    else:
-        name = str(source)
-        teacher = load_model(source)
+    teacher: Any = model_of(source)
     warn_of_observation(name, teacher, getattr(model, KEY, None))
     theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()
@@ -61,7 +77,11 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
     share_statistics(statistics_of(teacher), model.get_env(), training=True)
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{name}: holds parameters that are not finite")
-    _add_preview(theirs, ours, getattr(model, KEY, {}))
+    # A preview that the agent did not have is read by weights of zero.
+    added = 3 * len(getattr(model, KEY, {}).get("preview") or ())
+    for key, weights in theirs.items():
+        if key in ours and weights.ndim == 2 and ours[key].shape[1] == weights.shape[1] + added:
+            theirs[key] = th.nn.functional.pad(weights, (0, added))
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:
         theirs["log_std"] = ours["log_std"]
     try:
@@ -72,16 +92,6 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
             f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
             " train takes them from it unless --conf-file is given"
         ) from None
-
-
-def _add_preview(theirs: StrDict, ours: StrDict, settings: StrMapping) -> None:
-    """Let parameters read a ``preview`` that their agent did not have, by weights of zero, in
-    place.
-    """
-    added = 3 * len(settings.get("preview") or ())
-    for name, weights in theirs.items():
-        if name in ours and weights.ndim == 2 and ours[name].shape[1] == weights.shape[1] + added:
-            theirs[name] = th.nn.functional.pad(weights, (0, added))
 
 
 # A clone flies at least this many states, and at least this many steps in each environment.

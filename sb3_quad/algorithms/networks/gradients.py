@@ -13,32 +13,11 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 
 from sb3_quad.algorithms.networks import losses
 from sb3_quad.algorithms.networks.losses import Loss
-from sb3_quad.algorithms.networks.perceptron import Perceptron
-from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, IntArray
+from sb3_quad.algorithms.networks.perceptron import Batch, Perceptron
+from sb3_quad.base.types import AnyArray, Float32Array, FloatArray
 
 Terms = dict[str, float]
 """The terms of a loss without their weights, and ``loss``, their weighted sum, by logged name."""
-
-
-class Batch(NamedTuple):
-    """A mini-batch as rows of arrays of length m, which are not copied.
-
-    :param rows: (b,).
-    :param observations: (m, ...).
-    :param targets: (m, columns), see :mod:`.losses`.
-    """
-
-    rows: IntArray
-    observations: AnyArray
-    targets: Float32Array
-
-    def tensors(self, device: th.device) -> tuple[th.Tensor, th.Tensor]:
-        """Return the observations (b, ...) and targets (b, columns)."""
-        # PyTorch gathers in a third of the time that NumPy's indexing and a copy take.
-        rows = th.from_numpy(self.rows)
-        observations = th.from_numpy(self.observations).index_select(0, rows)
-        targets = th.from_numpy(self.targets).index_select(0, rows)
-        return observations.to(device), targets.to(device)
 
 
 class Perceptrons(NamedTuple):
@@ -60,35 +39,12 @@ class Perceptrons(NamedTuple):
         :param critic: mini-batch of the value loss. None: the critic takes no part.
         :return: the terms that were computed; NaN for a policy that is no longer finite.
         """
-        for parameter in self.parameters():
-            parameter.grad = None
-        terms = self._actor_gradients(loss, actor)
-        if critic is not None:
-            sums = self.critic.gradient(
-                _flat(critic.observations), critic.rows, critic.targets, loss
-            )
-            terms["value_loss"] = sums[losses.VALUE] / len(critic.rows)
-        # The gradients of the entropy and of the weights are written out here.
-        with th.no_grad():
-            terms["entropy_loss"] = -float(losses.gaussian_entropy(self.log_std))
-            if loss.ent_coef != 0.0:
-                _add(self.log_std, th.full_like(self.log_std, -loss.ent_coef))
-            if loss.l2_coef != 0.0:
-                terms["l2_loss"] = float(losses.l2_loss(self.parameters()))
-                for weights in self.parameters():
-                    if weights.ndim > 1:
-                        _add(weights, loss.l2_coef * weights)
-        return {"loss": losses.weighted_sum(loss, terms), **terms}
-
-    def _actor_gradients(self, loss: Loss, batch: Batch) -> Terms:
-        n = len(batch.rows)
+        n = len(actor.rows)
         if loss.policy_coef != 0.0 and loss.normalize_advantage and n > 1:
-            advantages = batch.targets[batch.rows, -1]
+            advantages = actor.targets[actor.rows, -1]
             scale = 1.0 / (float(advantages.std(ddof=1)) + 1e-8)
             loss = loss._replace(advantage_shift=float(advantages.mean()), advantage_scale=scale)
-        observations = _flat(batch.observations)
-        sums = self.actor.gradient(observations, batch.rows, batch.targets, loss, self.log_std)
-        means = sums / n
+        means = self.actor.gradient(actor, loss, self.log_std)
         terms: Terms = {}
         if loss.bc_coef != 0.0:
             terms["bc_loss"] = means[losses.CLONING]
@@ -96,7 +52,26 @@ class Perceptrons(NamedTuple):
             terms["policy_gradient_loss"] = means[losses.POLICY]
             terms["approx_kl"] = means[losses.KL]
             terms["clip_fraction"] = means[losses.CLIPPED]
-        return terms
+        if critic is None:
+            # The weights' own term is added below.
+            for parameter in self.critic.parameters():
+                parameter.grad = th.zeros_like(parameter)
+        else:
+            terms["value_loss"] = self.critic.gradient(critic, loss)[losses.VALUE]
+        # The gradients of the entropy and of the weights are written out here.
+        with th.no_grad():
+            terms["entropy_loss"] = -float(losses.gaussian_entropy(self.log_std))
+            self.log_std.grad -= loss.ent_coef  # type: ignore[operator, assignment]
+            if loss.l2_coef != 0.0:
+                terms["l2_loss"] = float(losses.l2_loss(self.parameters()))
+                for weights in self.parameters():
+                    if weights.ndim > 1:
+                        weights.grad += loss.l2_coef * weights  # type: ignore[operator]
+        total = sum(
+            getattr(loss, coefficient) * terms.get(name, 0.0)
+            for name, coefficient in losses.WEIGHTS.items()
+        )
+        return {"loss": total, **terms}
 
 
 Network = ActorCriticPolicy | Perceptrons
@@ -122,7 +97,7 @@ def network_of(policy: ActorCriticPolicy) -> Network:
     if not (Perceptron.fits(actor) and Perceptron.fits(critic) and policy.log_std.requires_grad):
         return policy
     network = Perceptrons(Perceptron(actor), Perceptron(critic), policy.log_std)
-    # A policy with further parameters is computed by PyTorch.
+    # A policy with further parameters, or with layers that both share, is computed by PyTorch.
     if len(network.parameters()) != len([*policy.parameters()]):
         return policy
     return network
@@ -131,7 +106,7 @@ def network_of(policy: ActorCriticPolicy) -> Network:
 def mean_actions(network: Network, observations: AnyArray) -> Float32Array:
     """Return the means of a policy's Gaussian, (b, a), without gradients."""
     if isinstance(network, Perceptrons):
-        return network.actor(_flat(observations))
+        return network.actor(observations)
     with th.no_grad():
         means = network.get_distribution(th.as_tensor(observations, device=network.device)).mode()
     return np.asarray(means.cpu().numpy())
@@ -140,7 +115,7 @@ def mean_actions(network: Network, observations: AnyArray) -> Float32Array:
 def state_values(network: Network, observations: AnyArray) -> Float32Array:
     """Return V of observations, (b,), without gradients."""
     if isinstance(network, Perceptrons):
-        return network.critic(_flat(observations))[:, 0]
+        return network.critic(observations)[:, 0]
     with th.no_grad():
         values = network.predict_values(th.as_tensor(observations, device=network.device))
     return np.asarray(values.flatten().cpu().numpy())
@@ -188,7 +163,7 @@ class RecordedPolicy:
             if step == 0:
                 self._actor.pack()
                 self._sums.fill(0.0)
-            return self._actor(_flat(observations), self._activations[step])
+            return self._actor(observations, self._activations[step])
         self._activations[step] = observations
         return mean_actions(self._policy, observations)
 
@@ -210,11 +185,3 @@ class RecordedPolicy:
         means = self._policy.get_distribution(inputs).mode()
         means.backward(th.as_tensor(given, device=means.device))  # type: ignore[no-untyped-call]
         return np.asarray(inputs.grad.cpu().numpy())
-
-
-def _add(parameter: th.nn.Parameter, gradient: th.Tensor) -> None:
-    parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-
-
-def _flat(observations: AnyArray) -> Float32Array:
-    return np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)

@@ -36,19 +36,11 @@ class Layers(NamedTuple):
     :param widths: of all layers, the inputs first, padded.
     :param kinds: the activation of each but the first.
     :param parameters: of one layer after another.
-    :param transposed: the same with each layer's weights as (inputs, outputs).
     """
 
     widths: IntArray
     kinds: IntArray
     parameters: Float32Array
-    transposed: Float32Array
-
-
-@compiled
-def are_few(n):
-    """Return whether n rows lie in a block of ``FEW``; the memory for them must agree."""
-    return n <= FEW
 
 
 @compiled(fastmath=_FAST)
@@ -67,16 +59,15 @@ def _multiply(w, x, h, size):
                     w[j + _1, k + _2],
                     w[j + _1, k + _3],
                 )
-                if k == _0:
-                    for i in range(size):
-                        x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
-                        h[j, i] = a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
-                        h[j + _1, i] = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
-                else:
-                    for i in range(size):
-                        x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
-                        h[j, i] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
-                        h[j + _1, i] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                for i in range(size):
+                    x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
+                    one = a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
+                    other = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                    if k > _0:
+                        one += h[j, i]
+                        other += h[j + _1, i]
+                    h[j, i] = one
+                    h[j + _1, i] = other
 
 
 @compiled(fastmath=_FAST)
@@ -194,7 +185,7 @@ def _forward(scratch, x, index, first, count, layers, size):
 
     :return: where the outputs begin.
     """
-    widths, kinds, parameters, _ = layers
+    widths, kinds, parameters = layers
     _load(x, index, first, count, _layer(scratch, 0, widths[0], size), size)
     at = 0
     place = 0
@@ -221,7 +212,7 @@ def _backward(activations, scratch, layers, sums, last_layer, size):
     :param last_layer: 1: stop at the parameters of the first layer; 0: go on to the inputs.
     :return: where the gradient of that layer begins.
     """
-    widths, kinds, _, transposed = layers
+    widths, kinds, parameters = layers
     here = widths.sum() * size
     there = here + widths.max() * size
     at = here - widths[-1] * size
@@ -242,53 +233,10 @@ def _backward(activations, scratch, layers, sums, last_layer, size):
             size,
         )
         if layer > last_layer:
-            _multiply(
-                transposed[place:middle].reshape(columns, rows),
-                g,
-                _layer(scratch, there, columns, size),
-                size,
-            )
+            weights = parameters[place:middle].reshape(rows, columns)
+            _multiply(weights.T, g, _layer(scratch, there, columns, size), size)
             here, there = there, here
     return here
-
-
-@compiled
-def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations):
-    """Write the outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs) into ``out``.
-
-    It does so for the chunks from ``first_chunk`` to ``last_chunk`` of all ``chunks``.
-
-    :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each unit of
-        all layers, and twice for the widest layer's gradients.
-    :param layers: :class:`Layers`.
-    :param activations: (blocks, ``ROWS`` numbers for each unit), is written for :func:`pullback`;
-        or (0, any).
-    """
-    if are_few(len(index)):
-        _forward_blocks(
-            first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations, FEW
-        )
-    else:
-        _forward_blocks(
-            first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations, ROWS
-        )
-
-
-@compiled
-def _forward_blocks(
-    first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations, size
-):
-    n = len(index)
-    blocks = (n + size - 1) // size
-    for block in range(first_chunk * blocks // chunks, last_chunk * blocks // chunks):
-        first = block * size
-        count = min(size, n - first)
-        own = activations[block] if len(activations) else scratch
-        at = _forward(own, x, index, first, count, layers, size)
-        h = _layer(own, at, layers.widths[-1], size)
-        for i in range(count):
-            for j in range(out.shape[1]):
-                out[first + i, j] = h[j, i]
 
 
 @compiled
@@ -333,48 +281,60 @@ def gradient(
             _backward(scratch, scratch, layers, sums[chunk, :n_parameters], 1, size)
 
 
-@compiled
-def pullback(
-    first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
-    grad_inputs, sums,
-):  # fmt: skip
-    """Carry a gradient with respect to the outputs back to the inputs, and add the one with respect
-    to all parameters.
+def for_blocks(size):
+    """Return two compiled functions for blocks of ``size`` rows: ``forward`` and ``pullback``."""
 
-    Arguments are as for :func:`forward`, and:
+    @compiled
+    def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations):
+        """Write the outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs) into ``out``.
 
-    :param activations: what :func:`forward` has written for the same rows.
-    :param grad_outputs: (m, outputs).
-    :param grad_inputs: float32 (m, inputs), is written.
-    :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
-    """
-    if are_few(len(index)):
-        _pullback_blocks(
-            first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
-            grad_inputs, sums, FEW,
-        )  # fmt: skip
-    else:
-        _pullback_blocks(
-            first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
-            grad_inputs, sums, ROWS,
-        )  # fmt: skip
+        It does so for the chunks from ``first_chunk`` to ``last_chunk`` of all ``chunks``.
 
-
-@compiled
-def _pullback_blocks(
-    first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
-    grad_inputs, sums, size,
-):  # fmt: skip
-    blocks = (len(index) + size - 1) // size
-    behind = layers.widths.sum() * size
-    for chunk in range(first_chunk, last_chunk):
-        for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
+        :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each
+            unit of all layers, and twice for the widest layer's gradients.
+        :param layers: :class:`Layers`.
+        :param activations: (blocks, ``size`` numbers for each unit), is written for ``pullback``;
+            or (0, any).
+        """
+        n = len(index)
+        blocks = (n + size - 1) // size
+        for block in range(first_chunk * blocks // chunks, last_chunk * blocks // chunks):
             first = block * size
-            count = min(size, len(index) - first)
-            g = _layer(scratch, behind, layers.widths[-1], size)
-            _load(grad_outputs, index, first, count, g, size)
-            here = _backward(activations[block], scratch, layers, sums[chunk], 0, size)
-            g = _layer(scratch, here, layers.widths[0], size)
+            count = min(size, n - first)
+            own = activations[block] if len(activations) else scratch
+            at = _forward(own, x, index, first, count, layers, size)
+            h = _layer(own, at, layers.widths[-1], size)
             for i in range(count):
-                for k in range(grad_inputs.shape[1]):
-                    grad_inputs[index[first + i], k] = g[k, i]
+                for j in range(out.shape[1]):
+                    out[first + i, j] = h[j, i]
+
+    @compiled
+    def pullback(
+        first_chunk, last_chunk, chunks, scratch, layers, activations, index, grad_outputs,
+        grad_inputs, sums,
+    ):  # fmt: skip
+        """Carry a gradient with respect to the outputs back to the inputs, and add the one with
+        respect to all parameters.
+
+        Arguments are as for ``forward``, and:
+
+        :param activations: what ``forward`` has written for the same rows.
+        :param grad_outputs: (m, outputs).
+        :param grad_inputs: float32 (m, inputs), is written.
+        :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
+        """
+        blocks = (len(index) + size - 1) // size
+        behind = layers.widths.sum() * size
+        for chunk in range(first_chunk, last_chunk):
+            for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
+                first = block * size
+                count = min(size, len(index) - first)
+                g = _layer(scratch, behind, layers.widths[-1], size)
+                _load(grad_outputs, index, first, count, g, size)
+                here = _backward(activations[block], scratch, layers, sums[chunk], 0, size)
+                g = _layer(scratch, here, layers.widths[0], size)
+                for i in range(count):
+                    for k in range(grad_inputs.shape[1]):
+                        grad_inputs[index[first + i], k] = g[k, i]
+
+    return forward, pullback

@@ -10,7 +10,7 @@ A row for a critic holds V from when the rollout was flown, and the return.
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch as th
@@ -20,16 +20,18 @@ from torch.nn import functional as F
 from sb3_quad.simulation.compiled import compiled
 
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
-CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
+CLONING_LOSSES: tuple[CloningLoss, ...] = get_args(CloningLoss)
 MSE, NLL, HUBER, HUBER_MSE = range(4)
 CloningFilter = Literal["none", "agreement", "q"]
-BC_FILTERS: tuple[CloningFilter, ...] = ("none", "agreement", "q")
+BC_FILTERS: tuple[CloningFilter, ...] = get_args(CloningFilter)
 """Where to clone. ``"q"`` needs critics of actions, which SACBC alone has."""
 AGREEMENT = BC_FILTERS.index("agreement")
 # The range of an action is 2. "huber" grows linearly from this error on.
 HUBER_DELTA = 0.05
 # Weight of the squared error in "huber_mse".
 MSE_WEIGHT = 3.0
+# Weight of the squared error in MSE, NLL, HUBER and HUBER_MSE.
+_SQUARED = (1.0, 0.0, 0.0, MSE_WEIGHT)
 # "agreement" clones up to this root mean squared difference of actions.
 NEAR = 0.3
 CLONING, POLICY, KL, CLIPPED, TERMS = range(5)
@@ -61,15 +63,14 @@ class Loss(NamedTuple):
     advantage_scale: float = 1.0
 
 
-def weighted_sum(loss: Loss, terms: dict[str, float]) -> float:
-    """Return the loss that terms with logged names add up to."""
-    return (
-        loss.policy_coef * terms.get("policy_gradient_loss", 0.0)
-        + loss.bc_coef * terms.get("bc_loss", 0.0)
-        + loss.vf_coef * terms.get("value_loss", 0.0)
-        + loss.ent_coef * terms.get("entropy_loss", 0.0)
-        + loss.l2_coef * terms.get("l2_loss", 0.0)
-    )
+WEIGHTS = {
+    "policy_gradient_loss": "policy_coef",
+    "bc_loss": "bc_coef",
+    "value_loss": "vf_coef",
+    "entropy_loss": "ent_coef",
+    "l2_loss": "l2_coef",
+}
+"""The weight of each term, by the term's logged name."""
 
 
 def cloning_errors(
@@ -105,14 +106,10 @@ def cloning_error(kind, error, log_std):
     if kind == NLL:
         z = error * math.exp(-log_std)
         return 0.5 * z * z + log_std + _HALF_LOG_2PI, z * math.exp(-log_std), 1.0 - z * z
-    weight = 0.0
-    if kind == MSE:
-        weight = 1.0
-    elif kind == HUBER_MSE:
-        weight = MSE_WEIGHT
+    weight = _SQUARED[int(kind)]
     value = weight * error * error
     slope = 2.0 * weight * error
-    if kind in (HUBER, HUBER_MSE):
+    if kind != MSE:
         steep = error / HUBER_DELTA
         value += 0.5 * error * steep if abs(steep) <= 1.0 else abs(error) - 0.5 * HUBER_DELTA
         slope += min(max(steep, -1.0), 1.0)
@@ -183,12 +180,13 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
                 squares += (mean[k, i] - target[k]) ** 2
             if loss.bc_filter != AGREEMENT or squares / a < NEAR**2:
                 share = 1.0 if loss.bc_loss == NLL else float(a)
+                weight = loss.bc_coef / n
                 for k in range(a):
                     error = np.float64(mean[k, i]) - target[k]
                     value, slope, slope_log_std = cloning_error(loss.bc_loss, error, log_std[k])
                     terms[CLONING] += value / share
-                    g[k, i] += float32(loss.bc_coef / n * slope / share)
-                    g_log_std[k] += loss.bc_coef / n * slope_log_std
+                    g[k, i] += float32(weight * slope / share)
+                    g_log_std[k] += weight * slope_log_std
         if loss.policy_coef != 0.0:
             log_prob = 0.0
             for k in range(a):
@@ -198,15 +196,18 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
             ratio = math.exp(change)
             advantage = (target[flown + a + 1] - loss.advantage_shift) * loss.advantage_scale
             bounded = min(max(ratio, 1.0 - loss.clip_range), 1.0 + loss.clip_range)
-            terms[POLICY] -= min(advantage * ratio, advantage * bounded)
+            gain = advantage * ratio
+            least = min(gain, advantage * bounded)
+            terms[POLICY] -= least
             terms[KL] += ratio - 1.0 - change
             terms[CLIPPED] += abs(ratio - 1.0) > loss.clip_range
             # Written so that NaN passes, too.
-            if not advantage * ratio > advantage * bounded:
+            if not gain > least:
                 slope = -loss.policy_coef / n * advantage * ratio
                 for k in range(a):
-                    z = (np.float64(target[flown + k]) - mean[k, i]) * math.exp(-log_std[k])
-                    g[k, i] += float32(slope * z * math.exp(-log_std[k]))
+                    inverse = math.exp(-log_std[k])
+                    z = (np.float64(target[flown + k]) - mean[k, i]) * inverse
+                    g[k, i] += float32(slope * z * inverse)
                     g_log_std[k] += slope * (z * z - 1.0)
 
 
@@ -219,15 +220,14 @@ def critic_loss(value, index, first, count, targets, loss, g, terms):
         old = np.float64(target[0])
         goal = np.float64(target[1])
         now = np.float64(value[0, i])
-        bounded = old + min(max(now - old, -loss.clip_range_vf), loss.clip_range_vf)
         error = now - goal
-        clipped = bounded - goal
-        inside = 1.0 if abs(now - old) <= loss.clip_range_vf else 0.0
-        if loss.max_clipped_value and not clipped * clipped > error * error:
-            clipped = error
-            inside = 1.0
-        if not math.isfinite(loss.clip_range_vf):
-            clipped = error
-            inside = 1.0
-        terms[VALUE] += clipped * clipped
-        g[0, i] += float32(loss.vf_coef / n * 2.0 * clipped * inside)
+        slope = 1.0
+        if math.isfinite(loss.clip_range_vf):
+            change = now - old
+            bounded = min(max(change, -loss.clip_range_vf), loss.clip_range_vf)
+            clipped = old + bounded - goal
+            if not loss.max_clipped_value or clipped * clipped > error * error:
+                error = clipped
+                slope = 1.0 if bounded == change else 0.0
+        terms[VALUE] += error * error
+        g[0, i] += float32(loss.vf_coef / n * 2.0 * error * slope)

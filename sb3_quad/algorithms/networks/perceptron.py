@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -16,13 +16,11 @@ from sb3_quad.algorithms.networks.kernel import (
     ROWS,
     TANH,
     Layers,
-    are_few,
-    forward,
+    for_blocks,
     gradient,
-    pullback,
 )
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
-from sb3_quad.base.types import Float32Array, FloatArray, IntArray
+from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, IntArray
 
 # A mini-batch is cut into at most this many chunks. Their sums are added up in order, so that the
 # number of threads changes no bit.
@@ -34,10 +32,31 @@ PARTS = 4
 # Bytes; vectors that straddle two cache lines take a third longer.
 CACHE_LINE = 64
 _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
-# Types of the loss's fields; numba would compile again for an int where it had a float.
-_TYPES = tuple(Loss.__annotations__.values())
+# The passes of a call, by the rows of its blocks.
+_PASSES = {size: for_blocks(size) for size in (FEW, ROWS)}  # type: ignore[no-untyped-call]
 _NONE = np.empty(0)
 _NOT_KEPT = np.empty((0, 0), np.float32)
+
+
+class Batch(NamedTuple):
+    """A mini-batch as rows of arrays of length m, which are not copied.
+
+    :param rows: (b,).
+    :param observations: (m, ...).
+    :param targets: (m, columns), see :mod:`.losses`.
+    """
+
+    rows: IntArray
+    observations: AnyArray
+    targets: Float32Array
+
+    def tensors(self, device: th.device) -> tuple[th.Tensor, th.Tensor]:
+        """Return the observations (b, ...) and targets (b, columns)."""
+        # PyTorch gathers in a third of the time that NumPy's indexing and a copy take.
+        rows = th.from_numpy(self.rows)
+        observations = th.from_numpy(self.observations).index_select(0, rows)
+        targets = th.from_numpy(self.targets).index_select(0, rows)
+        return observations.to(device), targets.to(device)
 
 
 class Perceptron:
@@ -47,38 +66,28 @@ class Perceptron:
     """
 
     def __init__(self, modules: Sequence[nn.Module]) -> None:
-        self._layers: list[Any] = [*modules[::2]]
-        self._kinds = np.array([*(_ACTIVATIONS[type(layer)] for layer in modules[1::2]), LINEAR])
+        self._linear: list[Any] = [*modules[::2]]
+        kinds = np.array([*(_ACTIVATIONS[type(layer)] for layer in modules[1::2]), LINEAR])
         # Widths are padded to multiples of 4.
-        sizes = [self._layers[0].in_features, *(layer.out_features for layer in self._layers)]
-        self._widths = np.array([-(-size // 4) * 4 for size in sizes])
-        before = self._widths[:-1]
-        after = self._widths[1:]
-        self._size = int((after * (before + 1)).sum())
-        units = self._widths.sum() + 2 * self._widths.max()
-        self._scratch_size = int(units) * ROWS
-        # Parameters with the weights as they are, and with the weights transposed
-        self._packed = np.zeros((2, self._size), np.float32)
+        sizes = [self._linear[0].in_features, *(layer.out_features for layer in self._linear)]
+        widths = np.array([-(-size // 4) * 4 for size in sizes])
+        self._units = int(widths.sum())
+        self._scratch_size = (self._units + 2 * int(widths.max())) * ROWS
+        self._size = int((widths[1:] * (widths[:-1] + 1)).sum())
+        packed = np.zeros(self._size, np.float32)
+        self._layers = Layers(widths, kinds, packed)
         # Views of those and of PyTorch's memory, which :meth:`pack` copies into them
-        self._copies: list[tuple[Float32Array, Float32Array]] = []
         own = [parameter.detach().numpy() for parameter in self.parameters()]
-        for packed, transposed in zip(self._packed, (False, True), strict=True):
-            views = self._views(packed, transposed)
-            self._copies.extend(zip(views, own, strict=True))
+        self._copies = [*zip(self._views(packed), own, strict=True)]
 
-    def _views(self, packed: Float32Array, transposed: bool) -> list[Float32Array]:
-        """Return the views of :meth:`parameters` in an array of all layers' parameters.
-
-        :param transposed: whether each layer's weights lie there as (inputs, outputs).
-        """
+    def _views(self, packed: Float32Array) -> list[Float32Array]:
+        """Return the views of :meth:`parameters` in an array of all layers' parameters."""
         views: list[Float32Array] = []
         start = 0
-        for i, layer in enumerate(self._layers):
-            columns, rows = self._widths[i : i + 2].tolist()
+        for i, layer in enumerate(self._linear):
+            columns, rows = self._layers.widths[i : i + 2].tolist()
             middle = start + rows * columns
             weights = packed[start:middle].reshape(rows, columns)
-            if transposed:
-                weights = packed[start:middle].reshape(columns, rows).T
             views.append(weights[: layer.out_features, : layer.in_features])
             views.append(packed[middle : middle + layer.out_features])
             start = middle + rows
@@ -110,53 +119,51 @@ class Perceptron:
         for packed, parameter in self._copies:
             packed[...] = parameter
 
-    def __call__(self, x: Float32Array, activations: Float32Array = _NOT_KEPT) -> Float32Array:
-        """Return the outputs (n, outputs) for x (n, inputs).
+    def __call__(
+        self, observations: AnyArray, activations: Float32Array = _NOT_KEPT
+    ) -> Float32Array:
+        """Return the outputs (n, outputs) for observations (n, ...).
 
         :param activations: of :meth:`allocate`, is written for :meth:`pullback`. The parameters are
             then those of the last :meth:`pack`, else those of now.
         """
         if activations is _NOT_KEPT:
             self.pack()
-        out = np.empty((len(x), self._layers[-1].out_features), np.float32)
-        self._compute(forward, len(x), x, np.arange(len(x)), out, activations)
+        n = len(observations)
+        out = np.empty((n, self._linear[-1].out_features), np.float32)
+        forward, _ = _PASSES[_block_rows(n)]
+        self._compute(forward, n, _flat(observations), np.arange(n), out, activations)
         return out
 
-    def gradient(
-        self,
-        x: Float32Array,
-        index: IntArray,
-        targets: Float32Array,
-        loss: Loss,
-        log_std: th.Tensor | None = None,
-    ) -> FloatArray:
+    def gradient(self, batch: Batch, loss: Loss, log_std: th.Tensor | None = None) -> FloatArray:
         """Set ``.grad`` of all parameters to the gradient of a loss.
 
-        :param index: the rows of x and ``targets`` that the loss is of.
         :param log_std: of an actor, (a,); its gradient is set, too.
-        :return: the terms of the loss, sums over the rows.
+        :return: the terms of the loss, means over the rows.
         """
         self.pack()
+        rows = batch.rows
         stds = _NONE if log_std is None else log_std.detach().double().numpy()
-        chunks = _chunks(len(index))
+        chunks = _chunks(len(rows))
         sums = np.empty((chunks, self._size + len(stds)), np.float32)
         terms = np.empty((chunks, TERMS))
-        typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
-        self._compute(gradient, len(index), x, index, targets, typed, stds, sums, terms)
+        # Numba would compile again for an int where it had a float.
+        loss = Loss._make(map(float, loss))
+        x = _flat(batch.observations)
+        self._compute(gradient, len(rows), x, rows, batch.targets, loss, stds, sums, terms)
         total = self.set_gradients(sums)
         if log_std is not None:
             log_std.grad = total[self._size :]
-        result: FloatArray = terms.sum(axis=0)
-        return result
+        return np.asarray(terms.sum(axis=0) / len(rows))
 
     def allocate(self, calls: int, n: int) -> tuple[Float32Array, Float32Array]:
         """Return memory for what :meth:`pullback` needs of some calls with n rows each.
 
         :return: for what the layers give, (calls, ...), and for the sums of all calls.
         """
-        rows = FEW if are_few(n) else ROWS
+        rows = _block_rows(n)
         blocks = -(-n // rows)
-        size = int(self._widths.sum()) * rows
+        size = self._units * rows
         activations = _aligned(calls * blocks * size).reshape(calls, blocks, size)
         return activations, np.empty((_chunks(n), self._size), np.float32)
 
@@ -170,27 +177,27 @@ class Perceptron:
         :return: the gradient with respect to the inputs, (n, inputs).
         """
         n = len(grad_outputs)
-        grad_inputs = np.empty((n, self._layers[0].in_features), np.float32)
+        grad_inputs = np.empty((n, self._linear[0].in_features), np.float32)
+        _, pullback = _PASSES[_block_rows(n)]
         self._compute(pullback, n, activations, np.arange(n), grad_outputs, grad_inputs, sums)
         return grad_inputs
 
     def set_gradients(self, sums: Float32Array) -> th.Tensor:
         """Set ``.grad`` of all parameters, given sums (chunks, size); return their sum."""
         total = sums.sum(axis=0)
-        for parameter, view in zip(self.parameters(), self._views(total, False), strict=True):
+        for parameter, view in zip(self.parameters(), self._views(total), strict=True):
             parameter.grad = th.from_numpy(view).contiguous()
         return th.from_numpy(total)
 
     def parameters(self) -> list[nn.Parameter]:
         """Return PyTorch's parameters, by layers."""
-        return [parameter for layer in self._layers for parameter in (layer.weight, layer.bias)]
+        return [parameter for layer in self._linear for parameter in (layer.weight, layer.bias)]
 
     def _compute(self, function: Callable[..., None], n: int, *arguments: Any) -> None:
         """Call a function of :mod:`.kernel` for all chunks of n rows.
 
         Where that is worthwhile, several threads share them.
         """
-        layers = Layers(self._widths, self._kinds, *self._packed)
         chunks = _chunks(n)
         threads = _threads if n > (WORTHWHILE - 1) * ROWS else 1
         size = -(-chunks // (PARTS * threads)) if threads > 1 else chunks
@@ -200,7 +207,9 @@ class Perceptron:
         def work() -> None:
             scratch = _aligned(self._scratch_size)
             for first in firsts:
-                function(first, min(first + size, chunks), chunks, scratch, layers, *arguments)
+                function(
+                    first, min(first + size, chunks), chunks, scratch, self._layers, *arguments
+                )
 
         helpers = [_pool.submit(work) for _ in range(threads - 1)]
         work()
@@ -208,6 +217,14 @@ class Perceptron:
             # Do not wait for one that has not begun: its core is busy with something else.
             if not helper.cancel():
                 helper.result()
+
+
+def _flat(observations: AnyArray) -> Float32Array:
+    return np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)
+
+
+def _block_rows(n: int) -> int:
+    return FEW if n <= FEW else ROWS
 
 
 def _chunks(n: int) -> int:
@@ -256,6 +273,7 @@ def one_torch_thread(compiled: bool) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(torch_threads)
+        # A process that is forked later does not have these threads.
         if _pool is not pool:
             _pool.shutdown()
         _threads = threads
