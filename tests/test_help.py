@@ -93,19 +93,16 @@ def test_a_misspelt_name_or_a_part_of_names_is_guessed_and_nothing_else(given, v
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("train --n-timestep 5", "option '--n-timestep': did you mean '--n-timesteps'?"),
+        ("train --n-timestep 5", "argument '--n-timestep': did you mean '--n-timesteps'?"),
         (
             "train --learning-rate 1e-3",
-            "'--learning-rate': a hyperparameter is given as --hyperparams learning_rate:VALUE,",
+            "hyperparameters are given as --hyperparams KEY:VALUE, keywords of the environment as",
         ),
-        (
-            "tune --gamma=0.9 -n 5",
-            "--hyperparams gamma:VALUE, a keyword of the environment as --env-kwargs gamma:VALUE",
-        ),
-        ("train -optimize", "option '-optimize': the command sb3-quad tune does that"),
+        ("tune --gamma=0.9 -n 5", "argument '--gamma': hyperparameters are given as"),
+        ("train -optimize", "argument '-optimize': the command sb3-quad tune does that"),
         ("train --optimize-hyperparameters", "the command sb3-quad tune does that"),
-        ("train --sampler tpe", "option '--sampler': it belongs to sb3-quad tune"),
-        ("report folder --nothing", "option '--nothing': see --help, and docs/zoo.md"),
+        ("train --sampler tpe", "argument '--sampler': it belongs to sb3-quad tune"),
+        ("report folder --nothing", "argument '--nothing': see --help, and docs/zoo.md"),
         ("train 5", "argument '5': see --help"),
         ("train --algo a2c", "algorithm 'a2c': (valid: apg, dagger,"),
         (

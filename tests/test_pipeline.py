@@ -167,12 +167,12 @@ def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, messa
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["-n", "100"], "--n-timesteps goes with a single run"),
-        (["--conf-file", "two_stage.yml", "--algo", "dagger"], "--algo goes with a single run"),
-        (["--thesis", "--conf-file", "two_stage.yml"], "--thesis is --conf-file"),
+        (["-n", "100"], "n_timesteps goes with a single run"),
+        (["--conf-file", "two_stage.yml", "--algo", "dagger"], "algo goes with a single run"),
+        (["--thesis", "--conf-file", "two_stage.yml"], "not allowed with argument --thesis"),
         (
             ["--algo", "dagger", "--env-kwargs", "noise:0", "--env-kwargs", "noise:1"],
-            "noise is given twice",
+            "'noise:1': must be key:value, such as n_steps:500, each key once",
         ),
     ],
 )

@@ -358,7 +358,7 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
         (["--exp-id", "7"], "QuadStateRecovery-v0_1"),
         (["--load-last-checkpoint"], "--save-freq"),
         (["--load-checkpoint", "500"], "best_model.zip"),
-        (["--algo", "ppoo"], "did you mean 'ppo'"),
+        (["--algo", "ppoo"], "ppoo: there is no run"),
     ):
         capsys.readouterr()
         assert main([*asked, *wrong]) == 2

@@ -247,7 +247,7 @@ def test_a_training_behind_wrappers_ends_well_and_its_agent_is_not_flown_without
     assert main([*words, "-f", "logs", "--eval-episodes", "2", "--no-progress"]) == 0
     out = capsys.readouterr().out
     folder = Path("logs", algo, f"{ENV}_1")
-    assert f"saved in {folder}: " in out and "no table: " in out and "mean reward" in out
+    assert f"saved in {folder}" in out and "no table: " in out and "mean reward" in out
     for command in (
         ["evaluate", str(folder), "--suite", "quick", "-o", "out"],
         ["export", str(folder), "--format", "torchscript"],

@@ -96,9 +96,9 @@ def test_a_search_leaves_settings_that_train_takes_and_resumes(command, capsys):
     assert main([*command, "--n-trials", "2", "--seed", "3"]) == 0
     output = capsys.readouterr().out
     assert (
-        "2 finished" in output
+        "trial 1 finished" in output
         and "fresh episodes" in output
-        and str(folder() / "best.yml") in output
+        and f"saved in {folder()}" in output
     )
     files = {path.name for path in folder().iterdir()}
     assert files == {"best.yml", "trials.csv", "study.log", "dagger"}
@@ -226,7 +226,6 @@ def test_a_trial_that_fails_is_reported_and_the_others_continue(command, capsys)
     assert (
         f"ConfigError: trial {failed[0]['number']}: batch_size is 0, must be at least 1" in output
     )
-    assert f"{len(failed)} failed" in output
 
 
 class InterruptSecond(BaseCallback):
@@ -250,7 +249,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_rest_is_tried_again(command, caps
     Path("small.yml").write_text(yaml.safe_dump({ENV: settings}))
     InterruptSecond.made = 0
     assert main([*command, "--n-trials", "9"]) == 130
-    assert "1 finished, 1 failed" in capsys.readouterr().out
+    assert "trial 1 failed: interrupted" in capsys.readouterr().out
     assert [(row["state"], row["error"]) for row in trials()] == [
         ("COMPLETE", ""),
         ("FAIL", "interrupted"),
@@ -315,7 +314,7 @@ def test_studies_of_others_are_refused_and_one_that_was_left_at_its_birth_is_beg
         (["--storage", "broken.log"], "storage broken.log: cannot be used"),
         (
             ["--storage", "cut.log"],
-            "storage cut.log: cannot be used (ConfigError: the last line is cut",
+            "storage cut.log: cannot be used (ValueError: the last line is cut",
         ),
         (["--storage", "mysql+nothing://x/y"], "storage mysql+nothing://x/y: cannot be used"),
         (["--search-space", "nowhere.yml"], "nowhere.yml"),

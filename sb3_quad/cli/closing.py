@@ -54,7 +54,7 @@ def print_agent(job: TrainingJob, model: Any) -> None:
     try:
         console().print(agent_and_expert(job, model))
     except SB3QuadError as error:
-        print(f"no table: {error}")
+        print("no table:", error)
 
 
 def close_run(result: TrainingResult) -> int:
@@ -63,16 +63,33 @@ def close_run(result: TrainingResult) -> int:
         return result.exit_code
     if result.job.config.task:
         print_agent(result.job, result.model)
-    # A complete run without evaluations does not know how long it took.
-    if result.seconds:
-        print(f"trained in {result.seconds:.1f} s")
-    names = sorted(entry.name for entry in result.run.path.iterdir())
-    print(f"saved in {result.run.path}: {', '.join(names)}")
+    print("saved in", result.run.path)
     _print_next(result.run)
     return 0
 
 
-def print_stages(job: TrainingJob, agents: dict[str, str]) -> None:
+def close_pipeline(result: PipelineResult) -> int:
+    """Print tables of all stages' agents or why there are none, and where everything is. Returns
+    the exit code.
+    """
+    if result.exit_code != 0:
+        return result.exit_code
+    agents = {name: stage.agent for name, stage in result.stages.items()}
+    # Training writes this into all agents that fly without wrappers.
+    flown = {name: agent for name, agent in agents.items() if KEY in saved_data(agent)}
+    if flown:
+        _print_stages(result.job, flown)
+    else:
+        print("no tables: their flights have no wrappers; the evaluations above have them")
+    for name, agent in agents.items():
+        print(f"{name}: {agent}")
+    print("saved in", result.folder)
+    *_, last = result.stages.values()
+    _print_next(open_run(last.run))
+    return 0
+
+
+def _print_stages(job: TrainingJob, agents: dict[str, str]) -> None:
     """Print tables of the stages' agents, each as it was trained, and of the expert of ``job``; or
     why there are none.
     """
@@ -85,30 +102,7 @@ def print_stages(job: TrainingJob, agents: dict[str, str]) -> None:
         )
         console().print(tables)
     except SB3QuadError as error:
-        print(f"no tables: {error}")
-
-
-def close_pipeline(result: PipelineResult, seconds: float) -> int:
-    """Print tables of all stages' agents and where everything is. Returns the exit code.
-
-    :param seconds: that the pipeline took.
-    """
-    if result.exit_code != 0:
-        return result.exit_code
-    # Training writes this into all agents that fly without wrappers.
-    agents = {
-        name: stage.agent for name, stage in result.stages.items() if KEY in saved_data(stage.agent)
-    }
-    if agents:
-        print_stages(result.job, agents)
-    else:
-        print("no tables: their flights have wrappers; the evaluations above have them")
-    for name, stage in result.stages.items():
-        print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
-    print(f"saved in {result.folder}, {seconds:.0f} s in all")
-    # The last stage is the one that was named last.
-    _print_next(open_run(stage.run))
-    return 0
+        print("no tables:", error)
 
 
 def _print_next(run: RunFolder) -> None:

@@ -27,7 +27,7 @@ def console() -> Console:
 def warn(line: str) -> None:
     """Print a warning on stderr, unless it is empty."""
     if line:
-        print(f"warning: {line}", file=sys.stderr)
+        print("warning:", line, file=sys.stderr)
 
 
 def shows_progress(wanted: bool | None) -> bool:

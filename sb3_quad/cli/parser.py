@@ -11,7 +11,7 @@ from argparse import (
     Namespace,
     RawDescriptionHelpFormatter,
 )
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Mapping
 from typing import Any, ClassVar, NoReturn, TypeAlias
 
 from pydantic import BaseModel
@@ -61,8 +61,7 @@ class Parser(ArgumentParser):
         options, rest = super().parse_known_args(args, namespace)
         if rest:
             option = rest[0].partition("=")[0]
-            kind = "option" if option.startswith("-") else "argument"
-            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option)}")
+            raise ConfigError(f"unknown argument {option!r}: {self._advice(option)}")
         return options, rest
 
     def _advice(self, option: str) -> str:
@@ -72,15 +71,14 @@ class Parser(ArgumentParser):
             return "the command sb3-quad tune does that"
         guess = did_you_mean(option, valid)
         if guess:
-            return guess.strip()
-        commands = [name for name, options in self.siblings.items() if option in options]
+            return guess
+        commands = [f"sb3-quad {name}" for name, known in self.siblings.items() if option in known]
         if commands:
-            return "it belongs to " + " and ".join(f"sb3-quad {name}" for name in commands)
+            return f"it belongs to {' and '.join(commands)}"
         if "--hyperparams" in valid and option.startswith("--"):
-            pair = f"{option.strip('-').replace('-', '_')}:VALUE"
             return (
-                f"a hyperparameter is given as --hyperparams {pair}, "
-                f"a keyword of the environment as --env-kwargs {pair}"
+                "hyperparameters are given as --hyperparams KEY:VALUE, "
+                "keywords of the environment as --env-kwargs KEY:VALUE"
             )
         return "see --help, and docs/zoo.md for flags of rl_zoo3"
 
@@ -99,10 +97,10 @@ class Pairs(Action):
         for entry in values:
             key, colon, value = entry.partition(":")
             name = key.strip()
-            if not colon or not key:
-                raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
-            if name in pairs:
-                raise ConfigError(f"{option} {entry!r}: {name} is given twice")
+            if not colon or not name or name in pairs:
+                raise ConfigError(
+                    f"{option} {entry!r}: must be key:value, such as n_steps:500, each key once"
+                )
             pairs[name] = parse_value(value)
         setattr(namespace, self.dest, pairs)
 
@@ -188,10 +186,11 @@ def field_flags(model: type[BaseModel], *names: str) -> StrDict:
     flags = {}
     for name in names or model.model_fields:
         field = model.model_fields[name]
-        # The alternatives of a union such as `int | None`, or the type itself.
-        alternatives = (field.annotation, *typing.get_args(field.annotation))
-        kinds = (kind for of, kind in KINDS.items() if of in alternatives)
-        kind = OWN_KINDS.get(name) or next(kinds, whole)
+        kind: Any = whole
+        # The type itself, and the alternatives of a union such as `int | None`.
+        for part in (field.annotation, *typing.get_args(field.annotation)):
+            kind = KINDS.get(part, kind)
+        kind = OWN_KINDS.get(name, kind)
         text = str(field.description)
         if field.default not in (None, False):
             text += f" ({field.default})"
@@ -229,10 +228,11 @@ def given(options: Namespace, *names: str) -> StrDict:
     return {name: values[name] for name in names if values.get(name) is not None}
 
 
-def refuse(options: Namespace, names: Iterable[str], message: str) -> None:
-    """Refuse flags of these names; ``{}`` in the message stands for the flag.
+def refuse_with_resume(options: Namespace, *names: str) -> None:
+    """Refuse settings next to ``--resume``.
 
     :raises ConfigError: one of them is given.
     """
     for name in given(options, *names):
-        raise ConfigError(message.format(f"--{name.replace('_', '-')}"))
+        flag = name.replace("_", "-")
+        raise ConfigError(f"--resume keeps the settings of what it resumes; remove --{flag}")

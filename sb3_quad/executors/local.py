@@ -30,7 +30,6 @@ class LocalExecutor:
     """
 
     def __init__(self, workers: int) -> None:
-        self.workers = workers
         self._threads = ThreadPoolExecutor(workers)
         # The pool and the process id of each thread's worker.
         self._worker = threading.local()

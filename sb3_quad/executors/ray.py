@@ -44,35 +44,36 @@ class RayExecutor:
                 TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0"),
             }
         }
-        options: StrDict = {
-            "runtime_env": environment,
-            "log_to_driver": False,
-            "logging_level": "ERROR",
-        }
-        # Ray raises exceptions of many kinds.
-        with raised_as(ConfigError, f"Ray cluster {address or 'on this machine'}: cannot be used"):
+        options: StrDict = {}
+        where = (
+            f"Ray cluster {address or 'on this machine'}: cannot be used; an address is auto, "
+            "host:port or ray://host:port, and ray start --head --port 6379 starts a cluster"
+        )
+        # Ray raises exceptions of many kinds, and uploads the package during init.
+        with raised_as(ConfigError, where), tempfile.TemporaryDirectory() as folder:
             if address is None:
                 # Ray warns about a variable that this package does not use.
                 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
                 # With Ray's niceness of 15, workers get no time next to other work.
                 os.environ.setdefault("RAY_worker_niceness", "0")
-                options |= {"num_cpus": workers * num_cpus, "include_dashboard": False}
-                self._ray.init(address="local", **options)
+                options = {"num_cpus": workers * num_cpus, "include_dashboard": False}
             else:
-                _check_address(address)
-                # Ray uploads the package during init.
-                with tempfile.TemporaryDirectory() as folder:
-                    environment["py_modules"] = [str(_copy_package(Path(folder)))]
-                    self._ray.init(address=address, **options)
-            total = self._ray.cluster_resources()
-        self.workers = workers
-        if num_cpus:
-            self.workers = max(1, int(total.get("CPU", 0) // num_cpus))
+                # Ray would wait for minutes and then end the process. For auto it searches this
+                # machine, and raises at once if it finds nothing.
+                if address != "auto":
+                    host, _, port = address.removeprefix("ray://").rpartition(":")
+                    socket.create_connection((host.strip("[]"), int(port)), timeout=4.0).close()
+                environment["py_modules"] = [str(_copy_package(Path(folder)))]
+            self._ray.init(
+                address or "local",
+                runtime_env=environment,
+                log_to_driver=False,
+                logging_level="ERROR",
+                **options,
+            )
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        call = self._ray.remote(_call).options(
-            name=getattr(function, "__name__", "call"), **self._options
-        )
+        call = self._ray.remote(**self._options)(_call)
         reference = call.remote(sys.argv, os.getcwd(), function, *arguments)
         self._references.append(reference)
         future = Future[Any]()
@@ -86,10 +87,7 @@ class RayExecutor:
                 future.set_exception(error.cause)
             else:
                 future.set_exception(
-                    WorkerDied(
-                        f"its worker on the cluster ended, and {RETRIES} more after it "
-                        f"({one_line(error)[:120]})"
-                    )
+                    WorkerDied(f"its workers on the cluster ended ({one_line(error)})")
                 )
 
         reference.future().add_done_callback(hand_over)
@@ -110,25 +108,6 @@ class RayExecutor:
         for reference in self._references:
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
-
-
-def _check_address(address: str) -> None:
-    """Check that something answers at an address. Ray itself waits for minutes and then ends the
-    process.
-
-    :raises ConfigError: Nothing answers, or the address has another form.
-    """
-    # Ray searches this machine for a cluster, and raises at once if it finds nothing.
-    if address == "auto":
-        return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=4.0).close()
-    except (ValueError, OSError, OverflowError):
-        raise ConfigError(
-            f"address {address}: no Ray cluster answers; must be auto, host:port or "
-            "ray://host:port; start one with: ray start --head --port 6379"
-        ) from None
 
 
 def _copy_package(folder: Path) -> Path:

@@ -34,7 +34,7 @@ class RunResult(Frozen):
     model_config = ConfigDict(allow_inf_nan=True)
 
     name: str
-    state: Literal["finished", "failed", "interrupted"]
+    state: Literal["finished", "failed"]
     message: str = ""
     """why it failed, in one line"""
     agent: str = ""

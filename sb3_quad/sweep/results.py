@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from pydantic import computed_field
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
@@ -23,7 +22,7 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation import metric_tables
-from sb3_quad.evaluation.learning_curves import read_curve
+from sb3_quad.evaluation.learning_curves import Curve, read_curve
 from sb3_quad.evaluation.metric_tables import estimate_cell
 from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
@@ -41,7 +40,7 @@ ROWS = {
     "time": Row("mean time until there, or stable", "s"),
 }
 COMPARED = ("success", "reward")
-CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
+CAPTION = "means over n seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
 PAIRED = "paired bootstrap over the seeds and episodes that both have"
 # The levels that tell apart the rows of a table of episodes.
 LEVELS = ("configuration", "seed", "scenario", "episode")
@@ -58,9 +57,10 @@ class SweepResults(Frozen):
     sweep: str | None
     package_version: str = __version__
     runs: int
-    failed: dict[str, str] = {}
+    finished: int
+    failed: dict[str, str]
     """by the name of a run, why it failed"""
-    configurations: dict[str, list[int]] = {}
+    configurations: dict[str, list[int]]
     """by the name of a configuration, the seeds of its finished runs, if it has any"""
     estimates: list[StrDict] = []
     """means over the finished runs of a configuration, by scenario and measure: fields of Estimate
@@ -69,12 +69,6 @@ class SweepResults(Frozen):
     """differences of two configurations, the first less the second: fields of Estimate, and as
     verdict whether the first is better or worse
     """
-
-    @computed_field  # type: ignore[prop-decorator]
-    @property
-    def finished(self) -> int:
-        """Number of finished runs."""
-        return sum(map(len, self.configurations.values()))
 
 
 def write_results(
@@ -88,7 +82,9 @@ def write_results(
     """
     lines = []
     parts = {}
-    summary = SweepResults(sweep=sweep.spec.name, runs=len(sweep.runs))
+    failed = {}
+    configurations: dict[str, list[int]] = {}
+    curves: dict[str, list[Curve]] = {}
     # In the order of the plan, not in that in which runs ended.
     for run in sweep.runs:
         if run.name not in results:
@@ -97,32 +93,36 @@ def write_results(
         line = {"run": run.name, **dict(run), **dict(result)}
         # The table holds every run that ended, also those that failed.
         if result.state == "failed":
-            summary.failed[run.name] = result.message
+            failed[run.name] = result.message
             lines.append(line)
             continue
-        summary.configurations.setdefault(run.configuration, []).append(run.seed)
+        configurations.setdefault(run.configuration, []).append(run.seed)
+        # A run without evaluations has no curve.
+        stage = (folder / "runs" / run.name / result.agent).parent
+        if (stage / "evaluations.npz").is_file():
+            curves.setdefault(run.configuration, []).append(read_curve(stage))
         for scenario, measures in result.flights.items():
             # A row for each episode, NaN where there is no number.
             part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
             parts[run.configuration, run.seed, scenario] = part
+            line |= {"scenario": scenario, "episodes": len(part), **part.mean()}
             # All are means but for the final error, which is a median.
-            lines.append(
-                {
-                    **line,
-                    "scenario": scenario,
-                    "episodes": len(part),
-                    **part.mean(),
-                    "final_error": part["final_error"].quantile(),
-                }
-            )
+            lines.append({**line, "final_error": part["final_error"].quantile()})
     write_text(
         folder / "results.csv",
         pd.DataFrame(lines, columns=COLUMNS).to_csv(index=False, float_format="%.9g"),
     )
+    summary = SweepResults(
+        sweep=sweep.spec.name,
+        runs=len(sweep.runs),
+        finished=sum(map(len, configurations.values())),
+        failed=failed,
+        configurations=configurations,
+    )
     tables = []
     if parts:
         tables = _compare(summary, pd.concat(parts, names=LEVELS))
-        _write_report(folder, summary, tables)
+        _write_report(folder, summary, tables, curves)
     write_text(folder / "results.json", summary.model_dump_json(indent=1) + "\n")
     return summary, tables
 
@@ -134,10 +134,9 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
     :return: for each scenario a table with a column for each configuration, and a last one that
         compares them.
     """
-    columns = []
-    for name, seeds in summary.configurations.items():
-        noun = "seed" if len(seeds) == 1 else "seeds"
-        columns.append(Column(f"{name} ({len(seeds)} {noun})"))
+    columns = [
+        Column(f"{name} (n = {len(seeds)})") for name, seeds in summary.configurations.items()
+    ]
     tables = []
     comparisons = []
     for scenario, group in flights.groupby(level="scenario", sort=False):
@@ -145,23 +144,25 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
         for measure, row in ROWS.items():
             key = {"scenario": scenario, "measure": measure}
             statistic = np.nanmedian if measure == "final_error" else np.nanmean
-            # Of each configuration a row for each run, a column for each episode.
             values = group[measure].unstack()
-            runs = {name: values.query("configuration == @name") for name in summary.configurations}
-            means = {name: over_seeds(runs[name].to_numpy(), statistic) for name in runs}
-            for name, mean in means.items():
+            runs = {}
+            cells = []
+            for name in summary.configurations:
+                # A row for each run, a column for each episode.
+                runs[name] = values.query("configuration == @name").droplevel(0)
+                mean = over_seeds(runs[name].to_numpy(), statistic)
+                cells.append(estimate_cell(row, mean))
                 if mean is not None:
                     summary.estimates.append({**dict(mean), **key, "configuration": name})
             # No row for what the environment does not report.
-            if any(means.values()):
-                cells = [estimate_cell(row, mean) for mean in means.values()]
+            if any(cell.ends for cell in cells):
                 rows.append(row._replace(cells=cells))
             if measure not in COMPARED:
                 continue
             for first, second in combinations(runs, 2):
                 # Differences are paired: only the seeds that both have, and the same episodes.
-                paired = runs[first].droplevel(0) - runs[second].droplevel(0)
-                difference = over_seeds(paired.dropna(how="all").to_numpy())
+                paired = (runs[first] - runs[second]).dropna(how="all")
+                difference = over_seeds(paired.to_numpy())
                 if difference is not None:
                     key |= {"first": first, "second": second, "verdict": verdict(difference)}
                     summary.comparisons.append({**dict(difference), **key})
@@ -217,48 +218,26 @@ def verdict(difference: Estimate) -> str:
     return "cannot tell"
 
 
-def _write_report(folder: Path, summary: SweepResults, tables: Sequence[Table]) -> None:
+def _write_report(
+    folder: Path,
+    summary: SweepResults,
+    tables: Sequence[Table],
+    curves: Mapping[str, Sequence[Curve]],
+) -> None:
     """Write the report of the finished runs: a section for each table, and the learning curves."""
-    parts = [
+    sections = [
         Section(f"table-{number}", table.title, tables=[table], facts=table.caption)
         for number, table in enumerate(tables)
     ]
-    plots = _curves(folder, summary)
-    if plots:
-        parts.append(
-            Section("curves", "Learning curves", "Mean over seeds, with their range.", plots=plots)
-        )
+    if curves:
+        caption = "Mean over seeds, with their range; of pipelines, that of the last stage."
+        # An environment of others may report neither success nor reward.
+        with suppress(ConfigError):
+            plots = [Plot("curves", caption, plot_curves(curves, {}))]
+            sections.append(Section("curves", "Learning curves", plots=plots))
     write_page(
         folder,
         f"Sweep: {summary.sweep}",
         f"{summary.finished} of {summary.runs} runs are finished.",
-        parts,
+        sections,
     )
-
-
-def _curves(folder: Path, summary: SweepResults) -> list[Plot]:
-    """Plot the evaluations along the way; of pipelines, one plot for each algorithm and environment
-    of a stage.
-    """
-    curves: StrDict = {}
-    for name, seeds in summary.configurations.items():
-        for seed in seeds:
-            # Below it, a run folder is <algo>/<Env>_<number>; its stages have their own.
-            place = folder / "runs" / name / f"seed_{seed}"
-            for path in sorted(place.glob("*/*/evaluations.npz")):
-                *_, algo, run, _ = path.parts
-                kind = f"{algo} {run.rpartition('_')[0]}"
-                runs = curves.setdefault(kind, {}).setdefault(name, [])
-                runs.append(read_curve(path.parent))
-    plots: list[Plot] = []
-    for kind, groups in curves.items():
-        # An environment of others may report neither success nor reward.
-        with suppress(ConfigError):
-            plots.append(
-                Plot(
-                    f"curves_{len(plots)}",
-                    f"{kind}: success and reward along the training.",
-                    plot_curves(groups, {}, kind),
-                )
-            )
-    return plots

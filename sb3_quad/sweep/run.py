@@ -3,6 +3,7 @@ agent.
 """
 
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +14,17 @@ from sb3_quad.base.errors import ConfigError, WorkerDied
 from sb3_quad.base.files import kind_and_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
-from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
 from sb3_quad.controllers.agent_settings import env_kwargs
 from sb3_quad.controllers.statistics import STATISTICS, share_statistics
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import Progress, fly_scenario
-from sb3_quad.evaluation.flights import Flights, fly_settings
+from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
-from sb3_quad.simulation.settings import KEY, FlightSettings
+from sb3_quad.simulation.settings import KEY
 from sb3_quad.sweep.folder import RunResult, Sweep, read_results, write_result
 from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import Evaluation, SweepSpec
@@ -59,20 +60,17 @@ def execute(
     :return: the results of all runs that ended, those of earlier calls included, by name.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    results = read_results(folder)
+    # Finished runs stay as they are; failed ones are tried again.
+    results = {
+        name: result for name, result in read_results(folder).items() if result.state == "finished"
+    }
     calls = {}
     # All runs are submitted at once; the executor starts as many as it has workers.
     for run in sweep.runs:
-        # Files in the folder of a run name others, which must be found from anywhere.
-        place = folder.absolute() / "runs" / run.name
-        if run.name in results:
-            # Finished runs stay as they are; failed ones are tried again.
-            if results[run.name].state == "finished":
-                continue
-            report(f"{run.name}: failed before ({results.pop(run.name).message}); is tried again")
-        elif pipeline_folder(place) is not None:
-            report(f"{run.name}: resumes where it stopped")
-        calls[executor.submit(work, run, place, sweep.spec, sweep.suite)] = run
+        if run.name not in results:
+            # Files in the folder of a run name others, which must be found from anywhere.
+            place = folder.absolute() / "runs" / run.name
+            calls[executor.submit(work, run, place, sweep.spec, sweep.suite)] = run
     show(len(results), len(sweep.runs), "runs")
     for run, future in as_they_end(executor, calls, signals, report):
         try:
@@ -82,32 +80,31 @@ def execute(
             if signals.received is not None:
                 continue
             result = RunResult(name=run.name, state="failed", message=str(died))
-        if result.state == "interrupted":
-            report(f"{run.name}: interrupted; continues with --resume")
+        if result is None:
             continue
         write_result(folder, result)
         results[run.name] = result
-        end = result.message or f"{result.seconds:.1f} s"
-        report(f"{run.name}: {result.state}, {end} ({len(results)} of {len(sweep.runs)})")
+        report(f"{run.name}: {result.state} {result.message}".rstrip())
         show(len(results), len(sweep.runs), "runs")
     return results
 
 
-def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResult:
-    """Train a run in its folder, or the rest of it, and fly its agent. The result of a run that
-    fails says why.
+def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResult | None:
+    """Train a run in its folder, or the rest of it, and fly its agent.
 
     :param suite: the scenarios of the agent; None: fresh episodes of both tasks, as many as
         ``spec.evaluation`` says.
+    :return: the result, which of a run that fails says why; None: it was interrupted.
     """
     # One core for each run: so the same weights come out on any machine.
     use_cpus(1)
     try:
         place.mkdir(parents=True, exist_ok=True)
         import_packages(spec.gym_packages, "gym_packages:")
-        trained = _train(run, place)
+        with (place / LOG).open("a", buffering=1, encoding="utf-8") as log:
+            trained = _train(run, place, partial(print, file=log))
         if trained.exit_code != 0:
-            raise KeyboardInterrupt
+            return None
         stages = [*trained.stages.values()]
         agent = Path(stages[-1].agent)
         return RunResult(
@@ -119,26 +116,16 @@ def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResu
             flights=_fly(agent, trained.job, suite, spec.evaluation),
         )
     except KeyboardInterrupt:
-        return RunResult(name=run.name, state="interrupted")
+        return None
     # Also the errors of a user's callback or environment: the other runs continue.
     except (Exception, SystemExit) as error:
         return RunResult(name=run.name, state="failed", message=kind_and_line(error))
 
 
-def pipeline_folder(place: Path) -> Path | None:
-    """The folder of a run's training, if it has begun."""
-    status = min(place.glob(f"*/*/{STATUS_FILE}"), default=None)
-    return status and status.parent
-
-
-def _train(run: Run, place: Path) -> PipelineResult:
-    def report(line: str) -> None:
-        with (place / LOG).open("a", encoding="utf-8") as file:
-            file.write(f"{line}\n")
-
-    begun = pipeline_folder(place)
+def _train(run: Run, place: Path, report: Report) -> PipelineResult:
+    begun = next(place.glob(f"*/*/{STATUS_FILE}"), None)
     if begun is not None:
-        return resume_pipeline(begun, report)
+        return resume_pipeline(begun.parent, report)
     stages = []
     for number, stage in enumerate(run.stages):
         # The settings get a file here, because one of the user's may have changed since.
@@ -162,7 +149,7 @@ def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluat
         # An environment of others has rewards, and no scenarios; so it is behind wrappers.
         if suite is not None:
             raise ConfigError(
-                "evaluation: suites are for this package's environments, "
+                "evaluation: suites are for this package's environments without wrappers, "
                 f"not for {job.config.env_id}"
             )
         config = job.for_evaluation()
@@ -171,16 +158,15 @@ def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluat
             rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
         return {config.env_id: {"reward": np.ravel(rewards).tolist()}}
     flights = {}
-    # Without a suite, the episodes are those of the closing table of train.
-    if suite is None:
-        for task in TASKS:
-            settings = FlightSettings(task=task, **env_kwargs(model))
-            flights[task] = _numbers(fly_settings(model, settings, row_seeds(seed, episodes)))
+    if suite is not None:
+        spec = ControllerSpec("agent", str(agent))
+        for scenario in suite.scenarios:
+            flown = scenario.flown_by(spec.own and spec.own.vehicle)
+            flights[scenario.name] = _numbers(fly_scenario(model, flown, own=spec.observed)[0])
         return flights
-    spec = ControllerSpec("agent", str(agent))
-    for scenario in suite.scenarios:
-        flown = scenario.flown_by(spec.own and spec.own.vehicle)
-        flights[scenario.name] = _numbers(fly_scenario(model, flown, own=spec.observed)[0])
+    # Without a suite, the episodes are those of the closing table of train.
+    for task in TASKS:
+        flights[task] = _numbers(fly(model, task, episodes, seed, **env_kwargs(model)))
     return flights
 
 

@@ -14,23 +14,8 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import Configuration, SweepSpec
-from sb3_quad.training.config import as_agent
-from sb3_quad.training.options import (
-    DEFAULT_ALGO,
-    DEFAULT_ENV,
-    DEFAULT_PIPELINE,
-    KEPT_BY_STAGES,
-    RunOptions,
-    SettingsOptions,
-)
-from sb3_quad.training.pipeline import (
-    Pipeline,
-    Stage,
-    is_pipeline,
-    load_pipeline,
-    stage_jobs,
-    with_settings,
-)
+from sb3_quad.training.options import RunOptions, SettingsOptions
+from sb3_quad.training.pipeline import Pipeline, Stage, plan_training, stage_jobs
 from sb3_quad.vehicles.vehicle import first_vehicle
 
 NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # whose value says enough
@@ -59,30 +44,21 @@ def make_runs(spec: SweepSpec) -> list[Run]:
     # Every configuration is checked before the first run starts.
     runs = {}
     for label, data in _cells(spec):
-        configuration = validate(
-            Configuration, data, f"configuration {label!r}" if label else "sweep"
-        )
-        words = [configuration.algo, Path(configuration.conf_file or "").stem]
-        label = label or "-".join(filter(None, words))
+        where = f"configuration {label!r}"
+        configuration = validate(Configuration, data, where)
         name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,")[:LONGEST] or "run"
         try:
             job, stages = _stages(configuration)
         except ConfigError as error:
-            raise ConfigError(f"configuration {name!r}: {error}") from None
+            raise ConfigError(f"{where}: {error}") from None
         for seed in spec.seed:
-            run = Run(
-                name=f"{name}/seed_{seed}",
-                configuration=name,
-                seed=seed,
-                job=job,
-                stages=stages,
-            )
-            if run.name in runs:
+            path = f"{name}/seed_{seed}"
+            if path in runs:
                 raise ConfigError(
-                    f"two runs are called {run.name!r}; "
+                    f"two runs are called {path!r}; "
                     "give configurations names, or values and seeds that differ"
                 )
-            runs[run.name] = run
+            runs[path] = Run(name=path, configuration=name, seed=seed, job=job, stages=stages)
     return [*runs.values()]
 
 
@@ -117,7 +93,9 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[str, StrDict]]:
                 put_key(data, key, value, f"grid: {key}")
             # A named configuration keeps its name in each cell of the grid.
             label = [str(own.get("name") or _in_words(own)), _in_words(cell)]
-            yield ",".join(filter(None, label)), data
+            # Where nothing differs, the file or the algorithm says what is trained.
+            alone = data.get("conf_file") or data.get("algo") or "run"
+            yield ",".join(filter(None, label)) or str(alone), data
 
 
 def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
@@ -128,8 +106,13 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
         job["trained_agent"] = agent_path(configuration.trained_agent)
         if not Path(job["trained_agent"]).is_file():
             raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
+    changes = configuration.hyperparams | configuration.given(SettingsOptions)
+    if configuration.vehicle is not None:
+        put_key(changes, "env_kwargs.vehicle", configuration.vehicle, "vehicle")
+    plan = plan_training(configuration.given(Configuration), changes)
+    # A single run is a pipeline of one stage.
+    pipeline = Pipeline(stages=[plan]) if isinstance(plan, Stage) else plan
     # Resolve all settings now, so that later changes of files do not matter.
-    pipeline = _pipeline(configuration)
     stages = []
     for stage, planned in zip(pipeline.stages, stage_jobs(pipeline, job), strict=True):
         if planned.config.task is not None:
@@ -141,42 +124,11 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     return job, stages
 
 
-def _pipeline(configuration: Configuration) -> Pipeline:
-    """Return the pipeline of a configuration; a single run is one of one stage."""
-    given = configuration.given(Configuration)
-    settings = configuration.hyperparams | configuration.given(SettingsOptions)
-    # A vehicle is a keyword of the environment.
-    if configuration.vehicle is not None:
-        settings["env_kwargs"] = {**given.get("env_kwargs", {}), "vehicle": configuration.vehicle}
-    file = configuration.conf_file
-    # As train does without any of these.
-    if not given.keys() & {"algo", "env", "conf_file"}:
-        file = DEFAULT_PIPELINE
-    if file is not None and is_pipeline(file):
-        for key in KEPT_BY_STAGES:
-            if key in given:
-                raise ConfigError(
-                    f"{key} goes with a single run; "
-                    f"the stages of a pipeline have their own in {file}"
-                )
-        return with_settings(load_pipeline(file), settings)
-    algo = configuration.algo or DEFAULT_ALGO
-    env = configuration.env or DEFAULT_ENV
-    if configuration.trained_agent is not None and file is None:
-        settings = as_agent(agent_path(configuration.trained_agent), algo, env, settings)
-    return Pipeline(
-        stages=[Stage(name=algo, algo=algo, env=env, conf_file=file, settings=settings)]
-    )
-
-
 def _in_words(varied: StrMapping) -> str:
     """Return the keys in which a configuration differs as words: ``pid,learning_rate=0.001``."""
-    # Some values say enough without their key.
     words = []
     for key, value in varied.items():
         word = str(value)
-        if key == "conf_file":
-            word = Path(word).with_suffix("").as_posix()
         if key not in NAMED_ALONE:
             word = f"{key.rpartition('.')[2]}={word}"
         words.append(word)

@@ -19,16 +19,25 @@ from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.config import (
     SETTINGS,
+    TrainingConfig,
     TrainingJob,
+    as_agent,
     describe,
     load_config,
     merged,
     with_absolute_paths,
+)
+from sb3_quad.training.options import (
+    DEFAULT_ALGO,
+    DEFAULT_ENV,
+    DEFAULT_PIPELINE,
+    KEPT_BY_STAGES,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train, trained_seconds
@@ -67,6 +76,13 @@ class Stage(Frozen):
     """timesteps between evaluations of this stage"""
     eval_episodes: PositiveInt | None = None
     """episodes in each"""
+
+    def load(self) -> TrainingConfig:
+        """Return its checked settings.
+
+        :raises ConfigError: see :func:`~sb3_quad.training.config.load_config`.
+        """
+        return load_config(self.algo, self.env, self.conf_file, self.settings)
 
 
 class Pipeline(Frozen):
@@ -151,6 +167,34 @@ def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
     return pipeline.model_copy(update={"stages": stages})
 
 
+def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
+    """Return what the options of ``train`` ask for: a pipeline, or the only stage of a single run.
+
+    :param options: those that were given, ``conf_file`` and those of ``KEPT_BY_STAGES`` among them.
+    :param changes: to the settings, of every stage.
+    :raises ConfigError: an option that a pipeline's stages have themselves, or an agent that does
+        not fit.
+    """
+    file = options.get("conf_file")
+    # Without any of these, the default is a pipeline rather than a single run.
+    if not options.keys() & {"algo", "env", "conf_file"}:
+        file = DEFAULT_PIPELINE
+    if file is not None and is_pipeline(file):
+        for key in KEPT_BY_STAGES:
+            if key in options:
+                raise ConfigError(
+                    f"{key} goes with a single run (algo, env); "
+                    f"the stages of a pipeline have their own in {file}"
+                )
+        return with_settings(load_pipeline(file), changes)
+    algo = options.get("algo") or DEFAULT_ALGO
+    env = options.get("env") or DEFAULT_ENV
+    # A file of settings takes precedence over those of the agent.
+    if file is None and "trained_agent" in options:
+        changes = as_agent(agent_path(options["trained_agent"]), algo, env, changes)
+    return Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes)
+
+
 def run_pipeline(
     pipeline: Pipeline, job: StrMapping, name: str, report: Report = print
 ) -> PipelineResult:
@@ -184,7 +228,7 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     for stage in pipeline.stages:
         where = f"stage {stage.name!r}"
         try:
-            config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
+            config = stage.load()
             if stage.correct_offset:
                 if not config.task:
                     raise ConfigError(

@@ -1,6 +1,5 @@
 """The files of a search: the best settings as YAML, all trials as CSV."""
 
-from collections import Counter
 from pathlib import Path
 
 import yaml
@@ -35,8 +34,8 @@ def write_results(search: Search) -> None:
             "state": trial.state.name,
             "evaluations": len(trial.intermediate_values),
         }
-        if trial.duration is not None:
-            row["seconds"] = round(trial.duration.total_seconds(), 2)
+        assert trial.duration is not None
+        row["seconds"] = round(trial.duration.total_seconds(), 2)
         if trial.state == TrialState.COMPLETE:
             row["value"] = trial.value
         if trial.state == TrialState.FAIL:
@@ -51,50 +50,21 @@ def write_results(search: Search) -> None:
         return
     config = search.config(best)
     settings = yaml.safe_dump({config.env_id: config.settings}, sort_keys=False)
-    # The best settings say where they come from, in comments that train skips.
-    write_text(
-        folder / BEST,
-        f"# Found by sb3-quad tune: trial {best.number} of study {search.name}, "
-        f"{in_words(search, best)}.\n# {train_command(search)}\n{settings}",
-    )
-
-
-def in_words(search: Search, trial: FrozenTrial) -> str:
-    """The metrics of a trial's last evaluation."""
-    reward = f"mean reward {trial.user_attrs[REWARD]:.2f}"
-    if search.job.config.task is None:
-        return reward
-    return f"success {100 * trial.user_attrs[SUCCESS]:.1f} %, {reward}"
+    # The best settings say where they come from, in a comment that train skips.
+    write_text(folder / BEST, f"# {trial_line(search, best)} of study {search.name}\n{settings}")
 
 
 def trial_line(search: Search, trial: FrozenTrial) -> str:
-    """One line about the end of a trial."""
+    """One line about the end of a trial, with the metrics of its last evaluation."""
+    known = trial.user_attrs
+    end = STATES[trial.state]
     if trial.state == TrialState.FAIL:
-        end = f"failed: {trial.user_attrs.get(ERROR, INTERRUPTED)}"
+        end += f": {known[ERROR]}"
     else:
-        end = f"{STATES[trial.state]}, {in_words(search, trial)}"
-    if search.best is not None and search.best.number == trial.number:
-        end += " (best so far)"
+        if search.job.config.task is not None:
+            end += f", success {100 * known[SUCCESS]:.1f} %"
+        end += f", mean reward {known[REWARD]:.2f}"
     values = " ".join(
         f"{name}:{value}" for name, value in search.space.values(trial.params).items()
     )
     return f"trial {trial.number} {end} ({values})"
-
-
-def count_trials(search: Search) -> str:
-    """The numbers of trials of the study that finished, were pruned and failed."""
-    counts = Counter(trial.state for trial in search.trials())
-    words = [f"{counts[state]} {word}" for state, word in STATES.items() if counts[state]]
-    return ", ".join(words) or "no trial yet"
-
-
-def train_command(search: Search) -> str:
-    """The command that trains with the best settings, as the trials did."""
-    config = search.job.config
-    command = (
-        f"sb3-quad train --algo {config.algo} --env {config.env_id} "
-        f"--conf-file {Path(search.job.log_folder, BEST)}"
-    )
-    if search.job.trained_agent:
-        command += f" -i {search.job.trained_agent}"
-    return command

@@ -25,7 +25,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
+from sb3_quad.base.errors import ConfigError, TrainingError, raised_as, refuse_unknown
 from sb3_quad.base.files import kind_and_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import has_ended
@@ -171,7 +171,8 @@ class Search:
         """
         try:
             value = self._value(trial)
-        except Exception as error:
+        # Also what a user's callback or environment raises.
+        except (Exception, SystemExit) as error:
             trial.set_user_attr(ERROR, kind_and_line(error))
             return None, TrialState.FAIL
         except KeyboardInterrupt:
@@ -270,13 +271,13 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
     """
     require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
     backend: Any = str(storage)
-    try:
+    with raised_as(ConfigError, f"storage {storage}: cannot be used"):
         if "://" not in backend:
             path = Path(storage)
             path.parent.mkdir(parents=True, exist_ok=True)
             # Optuna would ignore a cut line, and append the next one to it.
             if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):
-                raise ConfigError(
+                raise ValueError(
                     "the last line is cut, as by a full disk, or it is no journal; remove that line"
                 )
             # Optuna's other lock needs symbolic links, which Windows reserves for administrators.
@@ -284,8 +285,6 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
         return optuna.create_study(
             study_name=name, storage=backend, direction="maximize", load_if_exists=True
         )
-    except Exception as error:  # databases and damaged journals raise anything
-        raise ConfigError(f"storage {storage}: cannot be used ({kind_and_line(error)})") from None
 
 
 def retry_dead_trials(study: optuna.Study) -> None:

@@ -20,7 +20,7 @@ from optuna.distributions import (
 from optuna.trial import create_trial
 from pydantic import Field
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, raised_as, unknown
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
@@ -102,8 +102,10 @@ class SearchSpace(NamedTuple):
         start = {}
         for name, dimension in self.dimensions.items():
             value = _current(self.config, name)
-            is_list = isinstance(dimension, CategoricalDistribution)
-            start[name] = _label(value) if is_list else _number_of(value)
+            if isinstance(dimension, CategoricalDistribution):
+                start[name] = _label(value)
+            else:
+                start[name] = _number_of(value)
         try:
             # Optuna checks that the list holds the value, or that the range includes it.
             create_trial(value=0.0, params=start, distributions=self.dimensions)
@@ -127,20 +129,16 @@ def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchS
     valid = [*constructor_parameters(config.algorithm), *JOB_SETTINGS]
     if {"n_steps", "batch_size"} <= {*valid} and not config.is_off_policy:
         valid.append(MINIBATCHES)
-    # Of mappings, any entry may vary.
-    for name in content:
+    dimensions = {}
+    for name, values in content.items():
+        # Of mappings, any entry may vary.
         outer, _, inner = str(name).partition(".")
         if name not in valid and not (inner and outer in MAPPINGS):
             raise ConfigError(f"{where}: {unknown(f'setting of {config.algo}', name, valid)}")
+        dimensions[name] = _dimension(config, name, values, f"{where}: {name}")
     if MINIBATCHES in content and "batch_size" in content:
         raise ConfigError(f"{where}: {MINIBATCHES} sets batch_size; remove one of them")
-    return SearchSpace(
-        config,
-        {
-            name: _dimension(config, name, values, f"{where}: {name}")
-            for name, values in content.items()
-        },
-    )
+    return SearchSpace(config, dimensions)
 
 
 def _current(config: TrainingConfig, name: str) -> Any:
@@ -186,10 +184,8 @@ def _dimension(config: TrainingConfig, name: str, values: Any, where: str) -> Ba
         values = {"low": low, "high": high, "log": True}
     # The fields of an interval are the arguments of Optuna's distributions.
     interval = validate(WholeInterval if whole else Interval, values, where)
-    try:
+    with raised_as(ConfigError, where):
         return (IntDistribution if whole else FloatDistribution)(**dict(interval))
-    except ValueError as error:
-        raise ConfigError(f"{where}: {error}") from None
 
 
 def _entries(value: Any) -> StrDict:
@@ -208,6 +204,5 @@ def _label(value: Any) -> Any:
 
 def _number_of(value: Any) -> float | None:
     """Return a number, also that of ``lin_x``; None for anything else."""
-    number = parse_number(value.removeprefix(LINEAR) if isinstance(value, str) else value)
-    # True and False are numbers to Python.
-    return number if type(number) in (int, float) else None
+    number = parse_number(str(value).removeprefix(LINEAR))
+    return None if isinstance(number, str) else number

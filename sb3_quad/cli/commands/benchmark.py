@@ -21,7 +21,6 @@ examples:
 import itertools
 from argparse import Namespace
 from collections.abc import Callable
-from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from time import process_time
 from timeit import Timer
@@ -56,6 +55,7 @@ class Subject(NamedTuple):
     rows: int
     steps: int
     call: Callable[[], Any]
+    env: Any
 
 
 FLAGS: Flags = {
@@ -72,7 +72,7 @@ FLAGS: Flags = {
         "algorithms of the training loops (dagger ppo_bc apg)",
     ),
     "-conf --conf-file FILE": "settings of the training loops (ALGO.yml)",
-    "--training": (YES_OR_NO, None, "measure only, or no, training loops (both)"),
+    "--training": (YES_OR_NO, "measure only, or no, training loops (both)"),
 }
 
 
@@ -83,32 +83,23 @@ def run(options: Namespace) -> int:
     from sb3_quad.cli.output import console
     from sb3_quad.evaluation.tables import text_table
 
-    screen = console()
-    with ExitStack() as stack, screen.status("measuring"):
-        subjects: list[Subject] = []
-        if options.training is not True:
-            subjects += _environments(stack, options.sizes, options.n_envs)
-        if options.training is not False:
-            for algo in options.algo:
-                subjects.append(_training_loop(stack, algo, options.conf_file))
-        rates = np.median(_measure(subjects, options.seconds), axis=0)
+    subjects: list[Subject] = []
+    if options.training is not True:
+        subjects += _environments(options.sizes, options.n_envs)
+    if options.training is not False:
+        for algo in options.algo:
+            subjects.append(_training_loop(algo, options.conf_file))
+    rates = np.median(_measure(subjects, options.seconds), axis=0)
     lines = []
     for subject, rate in zip(subjects, rates, strict=True):
-        lines.append(
-            (
-                subject.name,
-                f"{subject.rows:,}",
-                f"{rate:,.0f}",
-                f"{rate / rates[0]:,.1f} x",
-            )
-        )
-    title = f"control steps per second (median of {REPETITIONS})"
-    screen.print(text_table(title, ("", "rows", "steps/s", "to the first line"), lines))
+        lines.append((subject.name, f"{subject.rows:,}", f"{rate:,.0f}"))
+    console().print(text_table("control steps per second", ("", "rows", "steps/s"), lines))
     for subject in subjects:
         if subject[:2] == REFERENCE:
             count, seconds = Timer(subject.call, timer=process_time).autorange()
             speed = subject.steps * count / seconds / REFERENCE_RATE
-            screen.print(f"this machine: {speed:.2f} times the reference, core by core")
+            print(f"this machine: {speed:.2f} times the reference, core by core")
+        subject.env.close()
     return 0
 
 
@@ -134,9 +125,9 @@ def _measure(subjects: list[Subject], seconds: float) -> list[list[float]]:
     ]
 
 
-def _environments(stack: ExitStack, sizes: list[int], n_envs: int) -> list[Subject]:
+def _environments(sizes: list[int], n_envs: int) -> list[Subject]:
     """Return the environments, which fly random actions, including noise, rewards, resets and
-    infos. ``stack`` closes them.
+    infos.
     """
     import gymnasium
     import numpy as np
@@ -148,10 +139,10 @@ def _environments(stack: ExitStack, sizes: list[int], n_envs: int) -> list[Subje
     subjects = []
 
     def add(name: str, rows: int, env: Any, *shape: int) -> None:
-        stack.enter_context(closing(env)).reset()
+        env.reset()
         random = np.random.default_rng(0)
         actions = itertools.cycle(random.uniform(-1, 1, (16, *shape, 4)).astype(np.float32))
-        subjects.append(Subject(name, rows, rows, lambda: env.step(next(actions))))
+        subjects.append(Subject(name, rows, rows, lambda: env.step(next(actions)), env))
 
     def add_vectorised(name: str, kind: str, rows: int, **env_kwargs: Any) -> None:
         settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": env_kwargs}
@@ -169,7 +160,7 @@ def _environments(stack: ExitStack, sizes: list[int], n_envs: int) -> list[Subje
     return subjects
 
 
-def _training_loop(stack: ExitStack, algo: str, conf_file: str | None) -> Subject:
+def _training_loop(algo: str, conf_file: str | None) -> Subject:
     """Return a training with the sizes of the settings, of one rollout and update in each call."""
     from sb3_quad.training.config import TrainingJob, load_config
     from sb3_quad.training.environments import make_environments
@@ -178,7 +169,7 @@ def _training_loop(stack: ExitStack, algo: str, conf_file: str | None) -> Subjec
     config = load_config(algo, TRAINED, conf_file)
     if config.is_off_policy:
         raise ConfigError(f"{algo}: only loops of on-policy algorithms are measured")
-    env = stack.enter_context(closing(make_environments(config, config.n_envs, 0)))
+    env = make_environments(config, config.n_envs, 0)
     model = build_model(TrainingJob(config=config), env)
     steps = config.rollout
-    return Subject(f"{algo}, whole loop", config.n_envs, steps, lambda: model.learn(steps))
+    return Subject(f"{algo}, whole loop", config.n_envs, steps, lambda: model.learn(steps), env)

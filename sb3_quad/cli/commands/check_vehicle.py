@@ -30,16 +30,8 @@ from sb3_quad.cli.parser import (
 if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import Vehicle
 
-# Below this thrust-to-weight ratio, little is left to turn and brake with.
-SLIM_THRUST = 1.2
 # Rotor speed, rpm. Above it a unit must be wrong.
 FASTEST_HOVER = 95_000.0
-# Time constants of motors, s. Beyond these a unit must be wrong, or the gain is the time itself.
-QUICKEST_MOTOR = 0.004
-SLOWEST_MOTOR = 0.3
-# kM / kF by the rotors' distance from the centre. It is about a tenth of a propeller's diameter.
-LEAST_RATIO = 0.02
-GREATEST_RATIO = 2.0
 # rpm per rad/s.
 RPM = 60.0 / (2.0 * math.pi)
 
@@ -51,9 +43,7 @@ FLAGS: Flags = {
         "episodes of each task and expert, with the true state (480)",
     ),
     "--flights FOLDER": (
-        str,
-        None,
-        "fly the motor commands of these logs instead (CSV; columns: docs/vehicles.md)",
+        "fly the motor commands of these logs instead (CSV; columns: docs/vehicles.md)"
     ),
     "--seed N": (natural, 0, "seed of the episodes, which no search or training uses (0)"),
 }
@@ -79,32 +69,26 @@ def run(options: Namespace) -> int:
                 "that hover needs; is the mass in kg, and thrust_coefficient in N s²?"
             )
     except CannotHover as error:
-        print(f"cannot hover: {error}", file=sys.stderr)
+        print("cannot hover:", error, file=sys.stderr)
         return 1
     console().print(text_table(vehicle.name, ("", ""), _parameters(vehicle), align="left"))
     for warning in warnings(vehicle):
-        print(f"unusual: {warning}")
+        print("unusual:", warning)
     if options.flights is not None:
         from sb3_quad.evaluation.real_flights import error_table, read_logs
 
-        logs = read_logs(options.flights, vehicle.control_step)
-        console().print(error_table(logs, vehicle))
+        console().print(error_table(read_logs(options.flights, vehicle.control_step), vehicle))
     elif options.episodes:
-        derived = vehicle.geometric_gains is None
-        gains = "derived from the parameters" if derived else "of its file"
-        controllers = {
-            "PID": PIDExpert(vehicle),
-            f"geometric, gains {gains}": GeometricExpert(vehicle),
-        }
-        seed = seed_for("expert", options.seed)
+        controllers = {"PID": PIDExpert(vehicle), "geometric": GeometricExpert(vehicle)}
         console().print(
-            compare(controllers, n_flights=options.episodes, seed=seed, vehicle=vehicle, noise=0.0)
-        )
-        if derived:
-            print(
-                "to search for gains, which are mostly better: "
-                f"python examples/tune_expert.py {options.vehicle}"
+            compare(
+                controllers,
+                n_flights=options.episodes,
+                seed=seed_for("expert", options.seed),
+                vehicle=vehicle,
+                noise=0.0,
             )
+        )
     return 0
 
 
@@ -113,41 +97,66 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     from sb3_quad.base.templates import render
     from sb3_quad.experts.geometric_gains import command_lag
 
-    lag = 1000.0 * command_lag(vehicle.parameters(), vehicle.control_step)
-    text = render("sb3_quad.cli.commands", "check_vehicle.j2", v=vehicle, rpm=RPM, lag=lag)
-    return [line.split(" | ") for line in text.splitlines()]
+    lines = render(
+        "sb3_quad.cli.commands",
+        "check_vehicle.j2",
+        v=vehicle,
+        rpm=RPM,
+        lag=1000.0 * command_lag(vehicle.parameters(), vehicle.control_step),
+    )
+    return [line.split(" | ") for line in lines.splitlines()]
 
 
 def warnings(vehicle: "Vehicle") -> list[str]:
     """Return a line for each value that is possible but unlikely, mostly due to a wrong unit."""
+    gains = (vehicle.motor_gain_up, vehicle.motor_gain_down)
+    arm = vehicle.arm_length
+    # The key, what is measured, its values, the least and the greatest that are likely, and advice.
+    measured = (
+        (
+            "inertia",
+            "radii of gyration by the rotors' distance from the centre",
+            vehicle.gyration_ratios,
+            (0.05, 1.0),
+            "is it in kg m², the mass in kg, and are the rotor positions in m?",
+        ),
+        (
+            "motor_gain",
+            "time constants in s",
+            [1.0 / max(gains), 1.0 / min(gains)],
+            (0.004, 0.3),
+            "is it in 1/s, one by the time constant?",
+        ),
+        # It is about a tenth of a propeller's diameter.
+        (
+            "moment_thrust_ratio",
+            "kM / kF by the rotors' distance from the centre",
+            [vehicle.moment_thrust_ratio / arm],
+            (0.02, 2.0),
+            "is it in m?",
+        ),
+        (
+            "thrust",
+            "thrust-to-weight ratio",
+            [vehicle.thrust_limits[1]],
+            (1.2, math.inf),
+            "less leaves little to turn and brake with",
+        ),
+        (
+            "collision_radius",
+            "by the rotors' distance from the centre",
+            [vehicle.collision_radius / arm],
+            (0.0, 2.0),
+            "is it in m?",
+        ),
+    )
     lines = []
-    ratios = vehicle.gyration_ratios
-    if ratios.max() > 1.0 or ratios.min() < 0.05:
-        lines.append(
-            f"inertia: radii of gyration of {ratios.min():.3g} to {ratios.max():.3g} "
-            "of the rotors' distance are unusual (0.2 to 0.6 is common); "
-            "is it in kg m², the mass in kg, and are the rotor positions in m?"
-        )
-    quickest = 1.0 / max(vehicle.motor_gain_up, vehicle.motor_gain_down)
-    slowest = 1.0 / min(vehicle.motor_gain_up, vehicle.motor_gain_down)
-    if quickest < QUICKEST_MOTOR or slowest > SLOWEST_MOTOR:
-        lines.append(
-            f"motor_gain: time constants of {1000 * quickest:.3g} to {1000 * slowest:.3g} ms "
-            "are unusual (20 to 150 ms is common); is it in 1/s, one by the time constant?"
-        )
-    by_arm = vehicle.moment_thrust_ratio / vehicle.arm_length
-    if not LEAST_RATIO < by_arm < GREATEST_RATIO:
-        lines.append(
-            f"moment_thrust_ratio: {by_arm:.3g} times the rotors' distance from the centre is "
-            "unusual (0.05 to 0.5 is common); is it in m?"
-        )
-    most = vehicle.thrust_limits[1]
-    if most < SLIM_THRUST:
-        lines.append(
-            f"thrust: a thrust-to-weight ratio of {most:.2f} leaves little to turn and brake with"
-        )
-    if vehicle.collision_radius > 2.0 * vehicle.arm_length:
-        lines.append(
-            "collision_radius: is more than twice the rotors' distance from the centre; is it in m?"
-        )
+    for key, what, values, (least, greatest), advice in measured:
+        low = min(values)
+        high = max(values)
+        if low < least or high > greatest:
+            lines.append(
+                f"{key}: {what}: {low:.3g} to {high:.3g}, where {least:g} to {greatest:g} is "
+                f"likely; {advice}"
+            )
     return lines

@@ -26,9 +26,9 @@ agent (vehicle, task and observation) hold for all, unless you give --env,
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-import sys
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -45,16 +45,15 @@ from sb3_quad.cli.parser import (
     TRUST,
     Flags,
     above_zero,
+    given,
     natural,
     positive,
     whole,
 )
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.training.options import DEFAULT_ENV
 
-DEFAULT_ENV = "QuadTargetTracking-v0"
-# Width and height of the only panel, and of one of several, pixels.
-SINGLE = (640, 480)
-PANEL = (480, 480)
+PICTURE = ".png"
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -114,7 +113,7 @@ FLAGS: Flags = {
         [],
         "write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
     ),
-    "--size WxH": (_size, "size of one controller's panel, pixels"),
+    "--size WxH": (_size, (640, 480), "size of one controller's panel, pixels (640x480)"),
     "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
     **TRUST,
     **OVERWRITE,
@@ -125,7 +124,6 @@ FLAGS: Flags = {
 def run(options: Namespace) -> int:
     """Fly, print the results, show the flights. Returns the exit code."""
     from PIL import Image
-    from rich.console import Console
 
     from sb3_quad.show.episodes import fly_all
     from sb3_quad.show.film import show_in_window
@@ -134,36 +132,32 @@ def run(options: Namespace) -> int:
     window = not (options.no_render or options.output)
     _check(options, window)
     setting, controllers = _setting(options)
-    with Console(file=sys.stderr).status("flying"):
-        episodes = list(
-            fly_all(
-                controllers,
-                setting,
-                options.seed,
-                options.n_timesteps,
-                not options.stochastic,
-                options.n_envs,
-            )
+    episodes = list(
+        fly_all(
+            controllers,
+            setting,
+            options.seed,
+            options.n_timesteps,
+            not options.stochastic,
+            options.n_envs,
         )
-    for number, episode in enumerate(episodes, 1):
+    )
+    for episode in episodes:
         for flight in episode:
-            prefix = f"episode {number}, " if len(episodes) > 1 else ""
             end = flight.lost or f"{flight.state.distance[-1]:.3f} m from its target"
             print(
-                f"{prefix}{flight.name}: {end} after {flight.times[-1]:.2f} s, "
-                f"reward {flight.reward:.2f}"
+                f"{flight.name}: {end} after {flight.times[-1]:.2f} s, reward {flight.reward:.2f}"
             )
-    size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
+    width, height = options.size
     for file in options.output:
-        if _is_picture(file):
-            picture = Image.fromarray(sequence(episodes[0], *size))
+        if file.lower().endswith(PICTURE):
+            picture = Image.fromarray(sequence(episodes[0], width, height))
             with replacing(file) as stream:
                 picture.save(stream, format="png", optimize=True)
-            print(f"saved {file}")
         else:
-            _write_film(file, episodes, size, options)
+            _write_film(file, episodes, options)
+        print("saved", file)
     if window:
-        width, height = options.size or SINGLE
         show_in_window(episodes, width, height, options.speed)
     return 0
 
@@ -186,10 +180,9 @@ def _check(options: Namespace, window: bool) -> None:
         raise ConfigError(
             f"{unknown('environment', env_id, ENVIRONMENTS)}; rl_zoo3.enjoy shows others"
         )
-    if options.size:
-        check_size(*options.size)
+    check_size(*options.size)
     for file in options.output:
-        if not _is_picture(file):
+        if not file.lower().endswith(PICTURE):
             check_film(Path(file))
         refuse_existing(file, options.overwrite)
     if window and not has_display():
@@ -197,10 +190,6 @@ def _check(options: Namespace, window: bool) -> None:
             "no display to open a window on (DISPLAY is not set); "
             "-o flight.mp4 makes a film instead"
         )
-
-
-def _is_picture(file: str) -> bool:
-    return file.lower().endswith(".png")
 
 
 def _setting(options: Namespace) -> tuple[Any, StrDict]:
@@ -214,7 +203,7 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     specs = parse_controllers(options.controllers)
     if options.algo:
         specs.insert(0, ControllerSpec(*_agent_of_run(options)))
-        print(f"agent: {specs[0].spec}")
+        print("agent:", specs[0].spec)
     # The settings of the first agent hold for all.
     first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
@@ -247,16 +236,12 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
 
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)
-    changes = {}
+    changes = given(options, "vehicle", "reference")
     # With --algo, --env names the environment of the run rather than the task.
     task = options.task or (options.env and not options.algo and env_task)
     if task and task != settings.task:
         # The agent's changes to its own task do not fit another one.
-        changes = {"task": task, "task_kwargs": None}
-    if options.vehicle:
-        changes["vehicle"] = options.vehicle
-    if options.reference:
-        changes["reference"] = options.reference
+        changes |= {"task": task, "task_kwargs": None}
     return settings.with_changes(**changes | options.env_kwargs)
 
 
@@ -266,12 +251,8 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
 
     :raises ConfigError: No such run or file.
     """
-    from sb3_quad.training.algorithms import get_algorithm
     from sb3_quad.training.runs import find_run
 
-    if not (Path(options.folder) / options.algo).is_dir():
-        # Raises if there is no such algorithm.
-        get_algorithm(options.algo)
     run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
     if options.load_last_checkpoint:
         path = run.latest_checkpoint()
@@ -287,22 +268,20 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     return f"{options.algo} {path.name}", str(path)
 
 
-def _write_film(
-    file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: Namespace
-) -> None:
+def _write_film(file: str, episodes: Sequence[Sequence[Any]], options: Namespace) -> None:
     from sb3_quad.cli.output import progress_bar
-    from sb3_quad.show.film import FPS, film_frames, frame_times, write_film
+    from sb3_quad.show.film import film_frames, frame_times, write_film
 
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
+    width, height = options.size
+    images = chain.from_iterable(
+        film_frames(episode, width, height, options.speed) for episode in episodes
+    )
 
     def frames() -> Iterator[Any]:
-        done = 0
-        for episode in episodes:
-            for frame in film_frames(episode, *size, options.speed):
-                yield frame
-                done += 1
-                show(done, total, "frames")
+        for done, image in enumerate(images, 1):
+            yield image
+            show(done, total, "frames")
 
     with progress_bar(options.progress) as show:
         write_film(Path(file), frames())
-    print(f"saved {file}, {total / FPS:.1f} s")

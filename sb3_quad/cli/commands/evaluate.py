@@ -38,7 +38,6 @@ the same command continues where it stopped.
 """
 
 import sys
-import time
 from argparse import Namespace
 
 from sb3_quad.cli.parser import (
@@ -53,9 +52,6 @@ from sb3_quad.cli.parser import (
     whole,
 )
 
-DEFAULT_FOLDER = "evaluations"
-
-
 FLAGS: Flags = {
     "controllers CONTROLLER": (SEVERAL, "controllers to fly, as listed above"),
     "--suite": (
@@ -64,7 +60,7 @@ FLAGS: Flags = {
         "suite of scenarios: thesis (default), robustness, wind, quadcopters, trajectories, quick "
         "or a file",
     ),
-    "-o --output FOLDER": f"folder for the results ({DEFAULT_FOLDER}/SUITE)",
+    "-o --output FOLDER": "folder for the results (evaluations/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
     "--episodes N": (whole, "episodes of each scenario (the suite's number)"),
     "--seed N": (whole, "seed of each scenario (the suite's seed)"),
@@ -84,7 +80,6 @@ FLAGS: Flags = {
 
 def run(options: Namespace) -> int:
     """Fly, print the table and the failures. Returns the exit code."""
-    from sb3_quad.cli.commands.report import report
     from sb3_quad.cli.output import console, progress_bar, warn
     from sb3_quad.evaluation.controllers import parse_controllers
     from sb3_quad.evaluation.evaluate import evaluate
@@ -94,38 +89,29 @@ def run(options: Namespace) -> int:
     suite = load_suite(options.suite).with_changes(
         options.scenario, options.episodes, options.seed, options.vehicle
     )
-    controllers = parse_controllers(options.controllers)
-    folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
-    start = time.perf_counter()
+    folder = options.output or f"evaluations/{suite.name}"
     with progress_bar(options.progress) as show:
-        show(0, None, "loading")
         results = evaluate(
             suite,
-            controllers,
+            parse_controllers(options.controllers),
             folder,
             progress=show,
             report=warn,
             **given(options, "backend", "workers", "overwrite", "executor", "address", "reward"),
         )
-    # The folder may hold the results of further controllers, from an earlier command.
-    flown = {entry.controller for entry in results.entries}
-    labels = [spec.label for spec in controllers]
-    columns = [label for label in labels if label in flown]
-    if columns:
-        console().print(
-            overview(results.model_copy(update={"scenarios": suite.scenarios}), columns)
-        )
+    # Each controller once, in the order of the command line.
+    flown = list(dict.fromkeys(entry.controller for entry in results.entries))
     if flown:
+        console().print(overview(results, flown))
+        print(f"results in {folder}: results.json, episodes.csv, flights/")
+        if options.report:
+            from sb3_quad.report.results_page import write_report
+
+            print("saved", write_report(folder, overwrite=True))
+    for failure in results.failures:
         print(
-            f"{time.perf_counter() - start:.1f} s; "
-            f"results in {folder}: results.json, episodes.csv, flights/"
+            f"failed: {failure.controller}, {failure.scenario or 'every scenario'}: "
+            f"{failure.message}",
+            file=sys.stderr,
         )
-    if flown and options.report:
-        report(folder, overwrite=True)
-    failures = [failure for failure in results.failures if failure.controller in labels]
-    for failure in failures:
-        where = failure.controller
-        if failure.scenario:
-            where += f", scenario {failure.scenario}"
-        print(f"failed: {where}: {failure.message}", file=sys.stderr)
-    return int(bool(failures))
+    return int(bool(results.failures))

@@ -41,25 +41,6 @@ from sb3_quad.cli.parser import (
 )
 from sb3_quad.controllers.pretrained import agent_path
 
-# Facts about an exported policy that are printed, in this order.
-FACTS = (
-    "vehicle",
-    "scaling",
-    "network",
-    "observation",
-    "state",
-    "result",
-    "rotors",
-    "motors",
-    "parameters",
-    "app",
-    "cost",
-    "check",
-)
-# Suffixes that mean something, and no format's own.
-OTHER_FILES = (".tflite", ".zip")
-
-
 FLAGS: Flags = {
     "model MODEL": (
         agent_path,
@@ -95,17 +76,14 @@ def run(options: Namespace) -> int:
     refuse_unknown("format", [options.format], FORMATS)
     model = Path(options.model)
     is_app = options.format in FOLDERS
+    ending = FORMATS[options.format]
     file = Path(options.file or "")
     # Without a suffix it is a folder; without -o, this one. An app is a folder itself.
     if not options.file or (not is_app and (file.is_dir() or not file.suffix)):
-        file /= model.stem + FORMATS[options.format]
-    if file.resolve() == model.resolve():
-        raise ConfigError(f"{file}: is the model itself; give another file with -o")
+        file /= model.stem + ending
     # Suffixes that no format has, such as .hpp, are the user's choice.
-    ending = FORMATS[options.format]
-    if file.suffix != ending and file.suffix in (*FORMATS.values(), *OTHER_FILES):
-        kind = "a folder" if is_app else f"a {ending} file"
-        raise ConfigError(f"{file}: --format {options.format} writes {kind}, no {file.suffix} file")
+    if file.suffix != ending and file.suffix in (*FORMATS.values(), ".tflite", ".zip"):
+        raise ConfigError(f"{file}: --format {options.format} writes {model.stem}{ending}")
     refuse_existing(file / FOLDERS.get(options.format, ""), options.overwrite)
     name = options.name
     if name is None:
@@ -120,9 +98,8 @@ def run(options: Namespace) -> int:
     files = exported.files or {"": exported.content}
     for path, content in files.items():
         write_bytes(file / path, content)
-    print(f"settings: {exported.settings or 'in neither the zip nor its folder'}")
-    for fact in FACTS:
-        if fact in exported.metadata:
-            print(f"{fact}: {exported.metadata[fact]}")
+    print("settings:", exported.settings or "in neither the zip nor its folder")
+    for fact, value in exported.metadata.items():
+        print(f"{fact}: {value}")
     print(f"saved {file} ({sum(map(len, files.values()))} bytes)")
     return 0

@@ -18,7 +18,7 @@ import glob
 from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import (
     OVERWRITE,
@@ -81,22 +81,19 @@ def run(options: Namespace) -> int:
             raise ConfigError(f"{name!r}: two groups have this name; give NAME=PATTERN")
         groups[name] = [read_curve(folder, options.task) for folder in folders]
     kind = Path(options.output).suffix.removeprefix(".")
-    if kind not in ("png", "svg", "pdf"):
-        raise ConfigError(f"--output {options.output}: must end in .png, .svg or .pdf")
+    refuse_unknown("ending of --output", [kind], ("png", "svg", "pdf"))
     lines = {}
-    if options.thesis:  # its success is our survival
+    show = options.show
+    if options.thesis:
+        # Its success is our survival.
+        show = show or ["survival", "reward"]
         scenario = load_suite("thesis").scenario(THESIS_SCENARIOS[options.thesis])
         for name, published in scenario.published.items():
-            lines[f"thesis: {name}"] = published.model_dump(
-                include={"survival", "reward"}, exclude_none=True
-            )
-    show = options.show
-    if options.thesis and not show:
-        show = ["survival", "reward"]
-    curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
+            lines[f"thesis: {name}"] = published.model_dump(exclude_none=True)
+    figure = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
     refuse_existing(options.output, options.overwrite)
-    write_bytes(options.output, picture(curves, kind, dpi=130))
-    print(f"saved {options.output}")
+    write_bytes(options.output, picture(figure, kind, dpi=130))
+    print("saved", options.output)
     return 0
 
 

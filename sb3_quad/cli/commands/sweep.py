@@ -22,7 +22,6 @@ and report.html. For the keys of the file, see docs/sweeps.md.
 """
 
 import sys
-import time
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
@@ -39,11 +38,18 @@ from sb3_quad.cli.parser import (
     field_flags,
     given,
     positive,
-    refuse,
+    refuse_with_resume,
     seed,
 )
 from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 
+# The keys of flags that have other names. Those with several values make a grid.
+PLACES = {
+    "algo": "grid.algo",
+    "conf_file": "grid.conf_file",
+    "suite": "evaluation.suite",
+    "episodes": "evaluation.episodes",
+}
 FLAGS: Flags = {
     "sweep SWEEP": (
         {"nargs": "?"},
@@ -79,11 +85,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.sweep.spec import SweepSpec
 
     if options.resume is not None:
-        refuse(
-            options,
-            ("sweep", *SweepSpec.model_fields, "suite", "episodes"),
-            "--resume keeps the sweep's own settings; remove {}",
-        )
+        refuse_with_resume(options, "sweep", *SweepSpec.model_fields, "suite", "episodes")
         folder = Path(options.resume)
         return _execute(options, read_sweep(folder), folder)
     spec = _spec(options)
@@ -97,8 +99,7 @@ def run(options: Namespace) -> int:
             for stage in planned.stages
         ]
         print(f"{planned.name}: {', then '.join(stages)}")
-    configurations = {planned.configuration for planned in sweep.runs}
-    print(f"{_count(len(sweep.runs), 'run')} of {_count(len(configurations), 'configuration')}")
+    print(len(sweep.runs), "runs")
     return 0
 
 
@@ -107,28 +108,19 @@ def _spec(options: Namespace) -> Any:
 
     Flags replace the keys of the file.
     """
+    from sb3_quad.base.literals import put_key
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
 
     data: StrDict = {"name": "sweep"}
     if options.sweep is not None:
         data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
-    flags = given(options, *SweepSpec.model_fields)
-    grid = {key: values for key, values in data.get("grid", {}).items() if key not in flags}
-    # The pairs of a flag are added to those of the file.
-    for name in ("hyperparams", "env_kwargs"):
-        if name in flags:
-            flags[name] = {**data.get(name, {}), **flags[name]}
-    # Several values make a grid.
-    for name in ("conf_file", "algo"):
-        values = flags.get(name, [])
-        if len(values) == 1:
-            flags[name] = values[0]
-        elif values:
-            data.pop(name, None)
-            grid[name] = flags.pop(name)
-    evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
-    data |= {**flags, "grid": grid, "evaluation": evaluation}
+    for name, value in given(options, *SweepSpec.model_fields, "suite", "episodes").items():
+        # A flag takes the place of a key of the grid, and its pairs are added to those of the file.
+        data.get("grid", {}).pop(name, None)
+        if isinstance(value, dict):
+            value = data.get(name, {}) | value
+        put_key(data, PLACES.get(name, name), value, name)
     return validate(SweepSpec, data, options.sweep or "command line")
 
 
@@ -147,20 +139,19 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
     from sb3_quad.sweep.run import execute
     from sb3_quad.training.runs import claim_folder
 
-    start = time.perf_counter()
-    workers = min(options.workers or available_cpus(), len(sweep.runs))
-    runs = _count(len(sweep.runs), "run")
-    resources = dict(sweep.spec.resources)
-    with start_executor(options.executor, workers, options.address, **resources) as executor:
+    with start_executor(
+        options.executor,
+        options.workers or available_cpus(),
+        options.address,
+        **dict(sweep.spec.resources),
+    ) as executor:
         # A new folder only once it is known that the executor starts.
         if folder is None:
             folder = claim_folder(
                 Path(options.log_folder or "logs") / "sweep", sweep.spec.name or "sweep"
             )
             write_sweep(folder, sweep)
-        print(
-            f"sweep {folder}: {runs}, {executor.workers} in parallel, executor {options.executor}"
-        )
+        print(f"sweep {folder}: {len(sweep.runs)} runs")
         with (
             locked(folder, "sweep folder"),
             StopSignals() as signals,
@@ -173,18 +164,12 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
             for table in tables:
                 console().print(table)
     print(
-        f"{results.finished} of {runs} finished, {len(results.failed)} failed; "
-        f"{time.perf_counter() - start:.1f} s"
+        f"{results.finished} of {results.runs} runs finished, {len(results.failed)} failed; "
+        f"saved in {folder}"
     )
-    report = ", report.md, report.html" if results.finished else ""
-    print(f"saved in {folder}: results.csv, results.json, runs/{report}")
     for name, message in results.failed.items():
         print(f"failed: {name}: {message}", file=sys.stderr)
     if signals.received:
-        print(f"to continue: --resume {folder}")
+        print("to continue: --resume", folder)
         return signals.exit_code
     return int(bool(results.failed))
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -32,24 +32,20 @@ examples:
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
 
-import time
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     PAIRS,
     PROGRESS,
     SEVERAL,
-    SWITCH,
     TRUST,
     Flags,
     field_flags,
     given,
     positive,
-    refuse,
+    refuse_with_resume,
     seed,
 )
 from sb3_quad.training.options import (
@@ -66,7 +62,6 @@ THESIS = "thesis.yml"
 KEPT_BY_RESUME = (
     "algo",
     "env",
-    "conf_file",
     "hyperparams",
     "trained_agent",
     "log_folder",
@@ -76,6 +71,12 @@ KEPT_BY_RESUME = (
 
 
 # What is trained; tune has these as well.
+CONF_FILE: Flags = {
+    "-conf --conf-file FILE": (
+        "settings: a YAML file, or one of the package, such as thesis/dagger.yml "
+        "(ALGO.yml: undisturbed, PID expert)"
+    ),
+}
 SETTINGS_FLAGS: Flags = {
     "--algo": (
         f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, sac_bc, apg, ppo, sac or td3"
@@ -83,10 +84,6 @@ SETTINGS_FLAGS: Flags = {
     "--env": (
         f"environment id ({DEFAULT_ENV}); "
         "any id that Gymnasium knows, with --vec-env dummy or subproc"
-    ),
-    "-conf --conf-file FILE": (
-        "settings: a YAML file, or one of the package, such as thesis/dagger.yml "
-        "(ALGO.yml: undisturbed, PID expert)"
     ),
     "-params --hyperparams": (PAIRS, "settings to change, such as n_steps:500"),
     "--num-threads N": (positive, "threads (the cores; one where PyTorch computes)"),
@@ -98,9 +95,15 @@ SETTINGS_FLAGS: Flags = {
 }
 # The flags of rl-zoo's ``train.py``, with their meanings.
 FLAGS: Flags = {
+    "settings": {
+        **CONF_FILE,
+        "--thesis": (
+            {"action": "store_const", "dest": "conf_file", "const": THESIS},
+            f"the thesis's method: --conf-file {THESIS}",
+        ),
+        "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
+    },
     **SETTINGS_FLAGS,
-    "--thesis": (SWITCH, f"the thesis's method: --conf-file {THESIS}"),
-    "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
     **field_flags(JobOptions),
     # These replace what the fields say.
     "--seed N": (seed, "seed (0); negative: a random one, recorded in args.yml"),
@@ -117,8 +120,8 @@ def run(options: Namespace) -> int:
     from sb3_quad.training.config import TrainingJob, describe
     from sb3_quad.training.trainer import resume, train
 
-    start = time.perf_counter()
-    _check_flags(options)
+    if options.resume is not None:
+        refuse_with_resume(options, *KEPT_BY_RESUME)
     prepare(options)
     job = given(options, *JobOptions.model_fields)
     job["progress"] = shows_progress(options.progress)
@@ -127,37 +130,16 @@ def run(options: Namespace) -> int:
         if not pipeline.is_pipeline_run(folder):
             return close_run(resume(options.resume, **job))
         result = pipeline.resume_pipeline(folder, **job)
-    elif options.conf_file is not None and pipeline.is_pipeline(options.conf_file):
-        refuse(
-            options,
-            KEPT_BY_STAGES,
-            "{} goes with a single run (--algo, --env); "
-            f"a pipeline's stages have their own in {options.conf_file}",
-        )
-        stages = pipeline.with_settings(
-            pipeline.load_pipeline(options.conf_file), changed_settings(options)
-        )
-        result = pipeline.run_pipeline(stages, job, Path(options.conf_file).stem)
     else:
-        checked = validate(TrainingJob, {"config": make_config(options), **job}, "command line")
-        print(describe(checked))
-        return close_run(train(checked))
-    return close_pipeline(result, time.perf_counter() - start)
-
-
-def _check_flags(options: Namespace) -> None:
-    """Check that flags go together, and fill in the settings file that they stand for."""
-    if options.thesis:
-        if options.conf_file or options.resume:
-            raise ConfigError(
-                f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume"
-            )
-        options.conf_file = THESIS
-    if options.resume is not None:
-        refuse(options, KEPT_BY_RESUME, "--resume keeps the run's own settings; remove {}")
-    # Without any of these, the default is a pipeline rather than a single run.
-    elif not given(options, "conf_file", "algo", "env"):
-        options.conf_file = DEFAULT_PIPELINE
+        stages = plan(options)
+        if isinstance(stages, pipeline.Stage):
+            checked = validate(TrainingJob, {"config": stages.load(), **job}, "command line")
+            print(describe(checked))
+            return close_run(train(checked))
+        result = pipeline.run_pipeline(
+            stages, job, Path(options.conf_file or DEFAULT_PIPELINE).stem
+        )
+    return close_pipeline(result)
 
 
 def prepare(options: Namespace) -> None:
@@ -178,19 +160,13 @@ def prepare(options: Namespace) -> None:
         torch.set_num_threads(options.num_threads)
 
 
-def make_config(options: Namespace) -> Any:
-    """Return the :class:`~sb3_quad.training.config.TrainingConfig` of a command line."""
-    from sb3_quad.training.config import as_agent, load_config
+def plan(options: Namespace) -> Any:
+    """Return the :class:`~sb3_quad.training.pipeline.Pipeline` of a command line, or the only
+    :class:`~sb3_quad.training.pipeline.Stage` of a single run.
+    """
+    from sb3_quad.training.pipeline import plan_training
 
-    algo = options.algo or DEFAULT_ALGO
-    env = options.env or DEFAULT_ENV
-    changes = changed_settings(options)
-    # A file of settings takes precedence over those of the agent.
-    if options.trained_agent is not None and options.conf_file is None:
-        changes = as_agent(options.trained_agent, algo, env, changes)
-    return load_config(algo, env, options.conf_file, changes)
-
-
-def changed_settings(options: Namespace) -> StrDict:
-    """Return the settings that a command line puts over a settings file."""
-    return {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)}
+    return plan_training(
+        given(options, "conf_file", *KEPT_BY_STAGES),
+        {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)},
+    )

@@ -34,8 +34,9 @@ from typing import Any
 
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.process import StopSignals
-from sb3_quad.cli.commands.train import SETTINGS_FLAGS, make_config, prepare
+from sb3_quad.cli.commands.train import CONF_FILE, SETTINGS_FLAGS, plan, prepare
 from sb3_quad.cli.parser import Flags, given, natural, positive, seed
+from sb3_quad.training.options import DEFAULT_ALGO
 
 JOURNAL = "study.log"
 # Episodes per evaluation by --vec-env.
@@ -44,6 +45,7 @@ EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 
 # Those of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings.
 FLAGS: Flags = {
+    **CONF_FILE,
     **SETTINGS_FLAGS,
     "--n-trials N": (natural, 500, "trials of this process; 0 only writes the results (500)"),
     "--max-total-trials N": (
@@ -74,28 +76,23 @@ FLAGS: Flags = {
 def run(options: Namespace) -> int:
     """Search, report, write. Returns the exit code."""
     from sb3_quad.cli.output import progress_bar
-    from sb3_quad.tuning.results import count_trials, trial_line, write_results
+    from sb3_quad.tuning.results import trial_line, write_results
 
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
-        print(
-            f"study {search.name} in {search.storage}: {count_trials(search)}; "
-            f"results go to {search.job.log_folder}"
-        )
+        print("results go to", search.job.log_folder)
+        write_results(search)
         with progress_bar(options.progress) as show:
-            try:
-                for number in range(options.n_trials):
-                    show(number, options.n_trials, "trials")
-                    if signals.received:
-                        break
-                    trial = search.try_one(options.max_total_trials)
-                    if not trial:
-                        break
-                    write_results(search)
-                    print(trial_line(search, trial))
-            finally:
+            for number in range(options.n_trials):
+                show(number, options.n_trials, "trials")
+                if signals.received:
+                    break
+                trial = search.try_one(options.max_total_trials)
+                if trial is None:
+                    break
                 write_results(search)
+                print(trial_line(search, trial))
     _print_results(search)
     return signals.exit_code
 
@@ -110,7 +107,9 @@ def _make_search(options: Namespace) -> Any:
     from sb3_quad.tuning.search import Search
     from sb3_quad.tuning.space import load_space
 
-    config = make_config(options)
+    # A search is for the settings of a single run.
+    options.algo = options.algo or DEFAULT_ALGO
+    config = plan(options).load()
     space = load_space(config, options.search_space)
     job = validate(
         TrainingJob,
@@ -144,22 +143,20 @@ def _print_results(search: Any) -> None:
     from sb3_quad.cli.closing import print_agent
     from sb3_quad.controllers.zips import load_model
     from sb3_quad.training.runs import open_run
-    from sb3_quad.tuning.results import count_trials, train_command, trial_line
+    from sb3_quad.tuning.results import trial_line
     from sb3_quad.tuning.search import RUN
 
     best = search.best
     if best is not None:
-        print(f"the best: {trial_line(search, best)}")
-        path = Path(best.user_attrs[RUN])
+        print("the best:", trial_line(search, best))
+        run = Path(best.user_attrs[RUN])
         # A process on another machine may have trained it.
-        if search.job.config.task and path.is_dir():
-            model = open_run(path).model
+        if search.job.config.task and run.is_dir():
             job = search.job.model_copy(update={"config": search.config(best)})
+            model = open_run(run).model
             print_agent(job, load_model(model))
-            print(f"agent: {model}")
-        print(f"to train: {train_command(search)}")
-    print(f"{count_trials(search)}; saved in {search.job.log_folder}")
+            print("agent:", model)
     print(
-        "to continue, run the same command with "
+        f"saved in {search.job.log_folder}; to continue, run the same command with "
         f"--storage {search.storage} --study-name {search.name}"
     )
