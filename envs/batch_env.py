@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any, Literal, TypedDict
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -47,9 +47,9 @@ class FlightKeywords(TypedDict, total=False):
     task_kwargs: StrMapping | None
     vehicle: VehicleSource | Sequence[VehicleSource]
     rotor_layout: VehicleSource | None
-    noise: npt.ArrayLike | StrMapping | Noise
-    observation_mean: npt.ArrayLike | None
-    observation_std: npt.ArrayLike | None
+    noise: ArrayLike | StrMapping | Noise
+    observation_mean: ArrayLike | None
+    observation_std: ArrayLike | None
     features: Literal["body", "px4"]
     last_action: bool
     history: Sequence[int] | None
@@ -129,7 +129,7 @@ class BatchEnv:
         """
         return self.batch.true_state()
 
-    def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
+    def set_target(self, position: ArrayLike, indices: Rows = None) -> None:
         """Move targets, after reset. They stay there until the next reset of their rows.
 
         :param position: r_T, (3,) for all these rows or (rows, 3), world frame, m.
@@ -140,11 +140,11 @@ class BatchEnv:
 
     def set_reference(
         self,
-        position: npt.ArrayLike,
-        velocity: npt.ArrayLike = (0.0, 0.0, 0.0),
-        acceleration: npt.ArrayLike = (0.0, 0.0, 0.0),
-        heading: npt.ArrayLike | None = None,
-        heading_rate: npt.ArrayLike = 0.0,
+        position: ArrayLike,
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        acceleration: ArrayLike = (0.0, 0.0, 0.0),
+        heading: ArrayLike | None = None,
+        heading_rate: ArrayLike = 0.0,
         indices: Rows = None,
     ) -> None:
         """Set what these rows should do now: a position, how it moves, and a heading.
@@ -169,11 +169,11 @@ class BatchEnv:
         accelerations = per_row("acceleration", acceleration, n, 3)
         rate = per_row("heading_rate", heading_rate, n)[0]
         turning = np.zeros((3, n))
-        if heading is None and rate.any():
-            raise ConfigError("heading_rate: needs a heading")
         if heading is not None:
             angle = per_row("heading", heading, n)[0]
             turning = np.stack([np.cos(angle), np.sin(angle), rate])
+        elif rate.any():
+            raise ConfigError("heading_rate: needs a heading")
         # That reset would set another target.
         self._require_reset("set_target() or set_reference()", rows)
         # Nobody knows its future, so the acceleration ahead is the present one.
@@ -182,8 +182,8 @@ class BatchEnv:
 
     def set_wrench(
         self,
-        force: npt.ArrayLike = (0.0, 0.0, 0.0),
-        torque: npt.ArrayLike = (0.0, 0.0, 0.0),
+        force: ArrayLike = (0.0, 0.0, 0.0),
+        torque: ArrayLike = (0.0, 0.0, 0.0),
         force_frame: str = "world",
         torque_frame: str = "body",
         indices: Rows = None,
@@ -204,7 +204,7 @@ class BatchEnv:
         torques = per_row("torque", torque, rows.size, 3).T
         self.batch.wrench[:, rows] = make_wrench(forces, torques, force_frame, torque_frame)
 
-    def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
+    def set_wind(self, velocity: ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
         """Set the velocity of the air until you set another.
 
         It acts through drag alone, and a warning says so if no vehicle here has ``drag``.

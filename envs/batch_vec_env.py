@@ -1,9 +1,9 @@
 """``BatchVecEnv``: anybody's own compiled batch as one Stable-Baselines3 environment."""
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
@@ -33,18 +33,12 @@ class BatchVecEnv(VecEnv):
     render_mode = None
     #: Steps after which an episode is truncated; set your own.
     max_episode_steps = ENDLESS
-    #: Random numbers for your episodes, which :meth:`seed` seeds.
-    rng: np.random.Generator
     _lengths: IntArray | None = None
 
-    def __init__(
-        self,
-        num_envs: int,
-        observation_space: "spaces.Space[Any]",
-        action_space: "spaces.Space[Any]",
-    ) -> None:
-        super().__init__(num_envs, observation_space, action_space)
-        self.rng = np.random.default_rng()
+    @cached_property
+    def rng(self) -> np.random.Generator:
+        """Random numbers for your episodes, which :meth:`seed` seeds."""
+        return np.random.default_rng()
 
     def begin(self, rows: IntArray) -> Any:
         """Begin a new episode in the given rows (k,); return their observations (k, ...)."""
@@ -71,10 +65,12 @@ class BatchVecEnv(VecEnv):
 
     def _begin(self, rows: IntArray) -> AnyArray:
         """Begin new episodes and return their observations, checked (k, ...)."""
-        shape = (len(rows), *(self.observation_space.shape or ()))
-        return _checked(
-            "begin: observations", self.begin(rows), shape, self.observation_space.dtype
-        )
+        return self._observations("begin", self.begin(rows), len(rows))
+
+    def _observations(self, method: str, values: Any, n: int) -> AnyArray:
+        space = self.observation_space
+        shape = (n, *(space.shape or ()))
+        return _checked(f"{method}: observations", values, shape, space.dtype)
 
     def step_async(self, actions: AnyArray) -> None:
         """Keep the actions, (n, ...), for ``step_wait``."""
@@ -85,18 +81,15 @@ class BatchVecEnv(VecEnv):
         if self._lengths is None:
             raise ResetNeeded("call reset() before step()")
         results = self.advance(self._actions)
-        if not isinstance(results, (tuple, list)) or len(results) != 3:
-            raise ConfigError("advance: must return observations, rewards and terminated")
-        seen, gained, failed = results
+        with raised_as(ConfigError, "advance: must return observations, rewards and terminated"):
+            seen, gained, failed = results
         n = self.num_envs
-        shape = (n, *(self.observation_space.shape or ()))
-        observations = _checked("advance: observations", seen, shape, self.observation_space.dtype)
+        observations = self._observations("advance", seen, n)
         rewards = _checked("advance: rewards", gained, (n,), np.float32)
         terminated = _checked("advance: terminated", failed, (n,), np.bool_)
         self._returns += rewards
         self._lengths += 1
-        dones = self._lengths >= self.max_episode_steps
-        dones |= terminated
+        dones = terminated | (self._lengths >= self.max_episode_steps)
         infos: list[StrDict] = [{} for _ in dones]
         ended = np.flatnonzero(dones)
         for row in ended:
@@ -137,12 +130,12 @@ def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyA
     """
     with raised_as(ConfigError, f"{what} are no numbers"):
         array = np.array(values, dtype)
-    # None, of a method without a return, would be a NaN of shape ().
+    # None, of a method without a return, would be a number of shape ().
     if values is None:
         raise ConfigError(f"{what}: None; return an array of shape {shape}")
     if array.shape != shape:
         raise ConfigError(f"{what} of shape {array.shape}: must be of shape {shape}")
     if not np.isfinite(array).all():
-        row = int(np.argwhere(~np.isfinite(array))[0, 0])
+        row = np.argwhere(~np.isfinite(array))[0, 0]
         raise ConfigError(f"{what}: row {row} has a number that is not finite")
     return array

@@ -1,6 +1,5 @@
 """PyBullet's part of ``QuadcopterEnv``: the rigid body, and pictures of its flight."""
 
-import sys
 import time
 import weakref
 
@@ -8,13 +7,10 @@ import numpy as np
 
 from sb3_quad.base.bullet import p
 from sb3_quad.base.types import FloatArray, Image
-from sb3_quad.envs.rendering.camera import CHASE_MARGIN, CHASE_SLOPE, Lens, chasing, framing_camera
-from sb3_quad.envs.rendering.models import rotor_turning
+from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Lens, chasing, framing_camera
 from sb3_quad.envs.rendering.scene import Pose, Scene
 from sb3_quad.envs.rendering.window import (
-    disconnect,
-    has_display,
-    open_window,
+    Client,
     point_window,
     start_drawing,
 )
@@ -43,69 +39,48 @@ class BulletBody:
     """The rigid body of a vehicle in a PyBullet client of its own; several can exist at once.
 
     PyBullet integrates a floating multibody base, which is what specification section 1 describes:
-    explicit velocities, then the pose by the new velocities. Nothing else in the simulation can
-    move or be touched. The task decides on contact with the ground by the position, not PyBullet.
+    explicit velocities, then the pose by the new velocities. It has no shape, so that it touches
+    nothing: the task decides on contact with the ground by the position.
 
-    :param vehicle: mass, inertia, gravity, collision radius and physics step.
-    :param window: width and height in pixels of PyBullet's window, one per process; None: no
-        window. Without a display no window opens either, and a line on stderr says why.
-    :raises ConfigError: the window cannot be opened.
+    :param vehicle: mass, inertia, gravity and physics step.
+    :param client: is this body's own from now on.
     """
 
-    def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
-        if window is not None and not has_display():
-            sys.stderr.write(
-                "sb3_quad: DISPLAY is not set, so no window opens; "
-                "render_mode='rgb_array' makes pictures\n"
-            )
-            window = None
-        self.has_window = window is not None
-        client = self.client = open_window(*window) if window else int(p.connect(p.DIRECT))
+    def __init__(self, vehicle: Vehicle, client: Client) -> None:
+        self.client = client
         # The number of PyBullet's clients is limited, so this one is also closed if the object is
         # garbage-collected without close(), and when the interpreter exits.
-        self._close = weakref.finalize(self, disconnect, client)
+        self._close = weakref.finalize(self, client.close)
 
-        # A sphere without damping by PyBullet itself; drag is added in :meth:`fly`.
-        p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=client)
-        p.setPhysicsEngineParameter(
-            fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=client
-        )
-        ball = p.createCollisionShape(
-            p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=client
-        )
-        self.body = p.createMultiBody(vehicle.mass, ball, physicsClientId=client)
+        client.setGravity(0.0, 0.0, -vehicle.gravity)
+        client.setTimeStep(vehicle.physics_step)
+        self.body = client.createMultiBody(vehicle.mass)
         self.become(vehicle.parameters())
-        # The body must not collide with the ground or a target that is drawn.
-        p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=client)
 
     def become(self, parameters: FloatArray) -> None:
         """Take on the mass and inertia in a vehicle's ``parameters()``."""
-        p.changeDynamics(
+        # Without damping by PyBullet itself; drag is added in :meth:`fly`.
+        self.client.changeDynamics(
             self.body,
             -1,
-            mass=float(parameters[P.mass]),
-            localInertiaDiagonal=parameters[[P.ixx, P.iyy, P.izz]].tolist(),
+            mass=parameters[P.mass],
+            localInertiaDiagonal=parameters[[P.ixx, P.iyy, P.izz]],
             linearDamping=0.0,
             angularDamping=0.0,
-            physicsClientId=self.client,
         )
 
     @property
     def connected(self) -> bool:
         """Whether the simulation exists: it was not closed, and its window was not shut."""
-        return self._close.alive and bool(p.isConnected(self.client))
+        return self._close.alive and bool(self.client.isConnected())
 
     def place(self, state: QuadcopterState) -> None:
         """Put the body where the first vehicle of ``state`` is."""
         # PyBullet's quaternions end with w, and its angular velocities are in the world frame.
-        w, x, y, z = state.quaternion[0].tolist()
+        attitude = np.roll(state.quaternion[0], -1)
         rates = state.rotation[0] @ state.body_rates[0]
-        p.resetBasePositionAndOrientation(
-            self.body, state.position[0].tolist(), (x, y, z, w), physicsClientId=self.client
-        )
-        p.resetBaseVelocity(
-            self.body, state.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client
-        )
+        self.client.resetBasePositionAndOrientation(self.body, state.position[0], attitude)
+        self.client.resetBaseVelocity(self.body, state.velocity[0], rates)
 
     def fly(
         self, wrenches: FloatArray, wrench: FloatArray, drag: FloatArray | None, wind: FloatArray
@@ -126,31 +101,27 @@ class BulletBody:
         for force, torque in wrenches.tolist():
             if is_disturbed:
                 # A world-frame force acts at a point of the world: where the centre of mass is now.
-                position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
-                p.applyExternalForce(
-                    body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client
-                )
-                p.applyExternalTorque(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
+                position, _ = client.getBasePositionAndOrientation(body)
+                client.applyExternalForce(body, -1, world_force, position, p.WORLD_FRAME)
+                client.applyExternalTorque(body, -1, world_torque, p.WORLD_FRAME)
             # Drag depends on the velocity, which differs by physics step.
             if drag is not None:
                 force = np.add(force, self._drag(drag, wind))
-            p.applyExternalForce(body, -1, force, _ORIGIN, p.LINK_FRAME, physicsClientId=client)
-            p.applyExternalTorque(body, -1, torque, p.LINK_FRAME, physicsClientId=client)
-            p.stepSimulation(physicsClientId=client)
+            client.applyExternalForce(body, -1, force, _ORIGIN, p.LINK_FRAME)
+            client.applyExternalTorque(body, -1, torque, p.LINK_FRAME)
+            client.stepSimulation()
 
     def _drag(self, drag: FloatArray, wind: FloatArray) -> FloatArray:
         """Return the drag at the current velocity, (3,), body frame, N."""
-        _, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
-        velocity, _ = p.getBaseVelocity(self.body, physicsClientId=self.client)
+        _, quaternion = self.client.getBasePositionAndOrientation(self.body)
+        velocity, _ = self.client.getBaseVelocity(self.body)
         rotation = np.array(p.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
         return np.asarray(-drag * (rotation.T @ (velocity - wind)))
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
-        position, (x, y, z, w) = p.getBasePositionAndOrientation(
-            self.body, physicsClientId=self.client
-        )
-        velocity, rates = p.getBaseVelocity(self.body, physicsClientId=self.client)
+        position, (x, y, z, w) = self.client.getBasePositionAndOrientation(self.body)
+        velocity, rates = self.client.getBaseVelocity(self.body)
         state[POSITION, 0] = position
         state[QUATERNION, 0] = w, x, y, z
         state[VELOCITY, 0] = velocity
@@ -167,20 +138,19 @@ class Renderer:
 
     :param width: width of the pictures, pixels.
     :param height: height of the pictures, pixels.
-    :param body: the simulation. If it has a window, the renderer draws into it, in real time.
+    :param body: the simulation.
+    :param human: whether it has a window, into which this draws in real time.
     """
 
-    def __init__(self, vehicle: Vehicle, width: int, height: int, body: BulletBody) -> None:
+    def __init__(
+        self, vehicle: Vehicle, width: int, height: int, body: BulletBody, human: bool
+    ) -> None:
         self.vehicle = vehicle
         self.scene = Scene(vehicle, body.client)
-        self.lens = Lens(width, height, CHASE_SLOPE)
-        self.human = body.has_window
+        self.lens = Lens(width, height, WIDE)
+        self.human = human
         self.shown_at = time.perf_counter()
         self.frames_due = 1.0
-        # Otherwise PyBullet draws the collision sphere.
-        p.changeVisualShape(
-            body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client
-        )
         self.reset(np.zeros(TARGET.stop))
         if self.human:
             start_drawing(self.scene.client)
@@ -199,7 +169,7 @@ class Renderer:
             second, and this call waits until real time has caught up.
         """
         control_step = self.vehicle.control_step
-        self.rotor_angles += rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * control_step
+        self.rotor_angles += state[ROTOR_SPEEDS] * control_step
         if self.human:
             # Wait for real time. After a step that took longer, do not hurry.
             now = time.perf_counter()
@@ -212,8 +182,8 @@ class Renderer:
         self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])
         # Vehicle and target are in the picture.
         both = np.stack([state[POSITION], state[TARGET]])
-        camera = framing_camera(both, CHASE_MARGIN * self.scene.scale, self.forward, self.lens)
+        camera = framing_camera(both, MARGIN * self.scene.scale, self.forward, self.lens)
         if not self.human:
-            return self.scene.picture(camera)
+            return np.array(self.scene.picture(camera))
         point_window(self.scene.client, camera, state[POSITION])
         return None

@@ -7,11 +7,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import Unpack
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, BoolArray, Float32Array, StrDict
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
+
+MODES = ("NextStep", "SameStep")
 
 
 class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArray]):
@@ -54,17 +56,15 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
                 f"render_mode {render_mode!r}: the batched environment draws nothing; "
                 "use QuadcopterEnv"
             )
-        modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
-        name = getattr(autoreset_mode, "value", autoreset_mode)
-        if name not in modes:
-            raise ConfigError(unknown("autoreset_mode", name, modes))
-        self._mode = modes[name]
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        mode = str(getattr(autoreset_mode, "value", autoreset_mode))
+        refuse_unknown("autoreset_mode", [mode], MODES)
+        self._next_step = mode == "NextStep"
+        self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode(mode)}
         self._make_batch(num_envs, seed, n_threads, task, autoreset=False, **keywords)
         self.num_envs = self.batch.n
         # The batch does not reset rows by itself, since both modes need their last observations.
         # Rows that the next step resets, in mode NextStep.
-        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._ended = np.zeros(self.num_envs, bool)
         self.single_observation_space, self.single_action_space = quadcopter_spaces(
             self.batch.observation.size
         )
@@ -97,8 +97,9 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         for row, number in enumerate(seed or ()):
             if number is not None:
                 self.batch.seed([number], row)
-        self._ended[:] = False
-        return self._begin(~self._ended), self._infos()
+        everything = np.ones(self.num_envs, bool)
+        self._ended = ~everything
+        return self._begin(everything), self._infos(everything)
 
     def step(
         self, actions: AnyArray
@@ -111,18 +112,18 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         """
         observations, rewards, done = self._fly(actions)
         # In mode NextStep a step of a row that has ended is its reset, without reward.
-        if self._mode is AutoresetMode.NEXT_STEP and self._ended.any():
+        if self._next_step and self._ended.any():
             observations = self._begin(self._ended)
             rewards[self._ended] = 0.0
             done[self._ended] = False
         truncated = done & self.batch.outcome["truncated"]
         terminated = done & ~truncated
         final: StrDict = {}
-        if self._mode is AutoresetMode.NEXT_STEP:
+        if self._next_step:
             self._ended = done
         elif done.any():
             # Gymnasium wants an array of objects, with None for the rows that continue.
-            last = np.full(self.num_envs, None, dtype=object)
+            last = np.full(self.num_envs, None, object)
             for row in np.flatnonzero(done):
                 last[row] = observations[row]
             final = {
@@ -132,7 +133,8 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
                 "_final_info": done,
             }
             observations = self._begin(done)
-        return observations, rewards, terminated, truncated, {**self._infos(), **final}
+        infos = self._infos(np.ones_like(done)) | final
+        return observations, rewards, terminated, truncated, infos
 
     def _begin(self, rows: BoolArray) -> Float32Array:
         """Begin the next episodes of rows, bool (n,), and return the observations of all rows."""
@@ -140,12 +142,8 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
         self.batch.clear_outcome(rows)
         return observations
 
-    def _infos(self, rows: BoolArray | None = None) -> StrDict:
-        """Return the infos of the last step of some rows, bool (n,); None: of all.
-
-        The other rows are zeros.
-        """
+    def _infos(self, rows: BoolArray) -> StrDict:
+        """Return the infos of the last step of some rows, bool (n,), with zeros for the others."""
         # Gymnasium's form: values of all rows, and a mask of those that have one.
-        mask = np.ones(self.num_envs, dtype=np.bool_) if rows is None else rows.copy()
-        infos = {key: self.batch.outcome[field] * mask for key, field in INFOS.items()}
-        return infos | {f"_{key}": mask for key in infos}
+        infos = {key: self.batch.outcome[field] * rows for key, field in INFOS.items()}
+        return infos | {f"_{key}": rows for key in infos}

@@ -1,17 +1,19 @@
 """``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
 
 import math
+import sys
 from typing import Annotated
 
 import gymnasium
 import numpy as np
 from typing_extensions import Unpack
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, Image, StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
+from sb3_quad.envs.rendering.window import Client, has_display, open_window
 from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.settings import ENDLESS, AsList
 from sb3_quad.simulation.state import P
@@ -223,8 +225,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         seed: int | None = None,
         **keywords: Unpack[FlightKeywords],
     ) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
+        if render_mode is not None:
+            refuse_unknown("render_mode", [render_mode], RENDER_MODES)
         check_size(render_width, render_height)
         # Gymnasium's TimeLimit truncates, so the batch must not.
         steps = keywords.setdefault("max_episode_steps", ENDLESS)
@@ -234,7 +236,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             )
         # One row of the batched environment. PyBullet moves its body.
         self._make_batch(1, seed, 1, task, autoreset=False, **keywords)
-        self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
@@ -242,11 +243,19 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         self._open()
 
     def _open(self) -> None:
-        """Begin a simulation, with a window or pictures if the render mode asks for them."""
-        self._body = BulletBody(self.vehicle, self._size if self.render_mode == "human" else None)
+        """Begin a simulation, with a window or pictures if the render mode asks for them. Without a
+        display no window opens, and a line on stderr says why.
+        """
+        human = self.render_mode == "human" and has_display()
+        self._body = BulletBody(self.vehicle, open_window(*self._size) if human else Client())
         self._renderer = None
-        if self._body.has_window or self.render_mode == "rgb_array":
-            self._renderer = Renderer(self.vehicle, *self._size, self._body)
+        if human or self.render_mode == "rgb_array":
+            self._renderer = Renderer(self.vehicle, *self._size, self._body, human)
+        elif self.render_mode == "human":
+            sys.stderr.write(
+                "sb3_quad: DISPLAY is not set, so no window opens; "
+                "render_mode='rgb_array' makes pictures\n"
+            )
 
     def reset(
         self, *, seed: int | None = None, options: StrDict | None = None
@@ -273,7 +282,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         # Each episode may have another vehicle.
         self._body.become(batch.vehicles[:, 0])
         self._body.place(self.true_state())
-        self._ready = True
+        self._has_begun = True
         if self._renderer is not None:
             self._renderer.reset(batch.state[:, 0])
         if self.render_mode == "human":
@@ -288,12 +297,12 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         :param action: (4,), clipped to [-1, 1].
         :raises ValueError: a wrong shape, or a number that is not finite.
         """
-        array = np.asarray(action, dtype=np.float32)
+        array = np.asarray(action, np.float32)
         if array.shape != (4,):
             raise ValueError(
                 f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor"
             )
-        if not self._ready:
+        if not self._has_begun:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         # The sum is finite only if all numbers are; this is faster than NumPy for four of them.
         if not math.isfinite(sum(array.tolist())):
@@ -334,7 +343,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
-        self._ready = False
+        self._has_begun = False
         self._body.close()
 
     def observe(self) -> Float32Array:

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from typing_extensions import Unpack
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import IntArray, StrDict
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
@@ -186,8 +186,6 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
             state = self.true_state()
             return [state.rows(slice(row, row + 1)) for row in rows]
         if method_name not in _METHODS:
-            raise AttributeError(
-                f"no method {method_name!r} of rows; there are: true_state, {', '.join(_METHODS)}"
-            )
+            raise AttributeError(unknown("method of rows", method_name, ("true_state", *_METHODS)))
         getattr(self, method_name)(*method_args, indices=indices, **method_kwargs)
         return [None] * rows.size

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.rendering.window import Client
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 HOVER = np.zeros(4, dtype=np.float32)
@@ -149,28 +149,22 @@ def test_bad_size_is_refused(size: Any) -> None:
 
 def test_the_body_has_the_numbers_of_the_vehicle() -> None:
     vehicle = load_vehicle("itm")
-    body = BulletBody(vehicle)
-    mass, _, inertia, *at = p.getDynamicsInfo(body.body, -1, physicsClientId=body.client)[:5]
+    body = BulletBody(vehicle, Client())
+    mass, _, inertia, *at = body.client.getDynamicsInfo(body.body, -1)[:5]
     assert mass == vehicle.mass and tuple(inertia) == vehicle.inertia
     assert at == [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)]
-    assert (
-        p.getNumBodies(physicsClientId=body.client) == 1
-        and p.getNumJoints(body.body, physicsClientId=body.client) == 0
-    )
+    assert body.client.getNumBodies() == 1 and body.client.getNumJoints(body.body) == 0
     body.close()
 
 
 def test_what_is_only_drawn_has_no_mass_and_touches_nothing(env: QuadcopterEnv) -> None:
     client = env._body.client
-    drawn = [
-        p.getBodyUniqueId(k, physicsClientId=client)
-        for k in range(p.getNumBodies(physicsClientId=client))
-    ]
+    drawn = [client.getBodyUniqueId(k) for k in range(client.getNumBodies())]
     drawn.remove(env._body.body)
     assert len(drawn) >= 10
     for body in drawn:
-        assert p.getDynamicsInfo(body, -1, physicsClientId=client)[0] == 0.0
-        assert not p.getCollisionShapeData(body, -1, physicsClientId=client)
+        assert client.getDynamicsInfo(body, -1)[0] == 0.0
+        assert not client.getCollisionShapeData(body, -1)
 
 
 def test_any_name_of_a_vehicle_will_do() -> None:

@@ -2,6 +2,7 @@
 never lost.
 """
 
+import errno
 import importlib.util
 import os
 import re
@@ -16,15 +17,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sb3_quad.base.errors import ControllerError
+from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.cli import main
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.picture import Trail, draw_trails
+from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.evaluation.scenarios.parts import Wrench
 from sb3_quad.evaluation.scenarios.sample import sample_wrenches
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.show import sequence
+from sb3_quad.show import film, sequence
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, HOLD, film_frames, following_cameras, frame_times, write_film
 from sb3_quad.simulation.settings import FlightSettings
@@ -70,7 +72,7 @@ def test_a_recording_is_the_flight_of_the_environment():
         np.testing.assert_array_equal(recording.state.array[:, step], env.true_state().array[:, 0])
         total += env.step(expert.actions(env.true_state())[0])[1]
     np.testing.assert_array_equal(recording.state.array[:, 40], env.true_state().array[:, 0])
-    assert recording.reward == pytest.approx(total) and recording.lost == ""
+    assert recording.results.reward[0] == pytest.approx(total) and recording.lost == ""
     env.close()
 
 
@@ -137,16 +139,25 @@ def test_points_are_seen_where_they_are():
     np.testing.assert_allclose(depth, [4, 4, 4, 2])
 
 
-@pytest.mark.parametrize(("distance", "seen"), [(3.0, True), (8.0, False), (-3.0, False)])
-def test_trails_are_hidden_by_what_is_before_them(distance, seen):
+@pytest.mark.parametrize(("distance", "seen"), [(3.0, True), (-3.0, False)])
+def test_trails_are_drawn_unless_they_are_behind_the_camera(distance, seen):
     points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0], [distance, 0.0, 0.5]])
     picture = Image.new("RGBA", (80, 40))
-    draw_trails(
-        picture, [Trail(points, "red")], looking_along_x(), np.full((40, 80), 5.0, np.float32)
-    )
+    draw_trails(picture, [Trail(points, "red")], looking_along_x())
     drawn = np.asarray(picture)
     assert (drawn[..., 3] == 255).any() == (drawn[..., 3] > 0).any() == seen
     assert (drawn[drawn[..., 3] > 0, :3] == (255, 0, 0)).all()
+
+
+def test_vehicles_hide_trails(hit):
+    camera = looking_along_x()._replace(eye=hit.state.position[-1] - (1.0, 0.0, 0.0))
+    scene = Scene(hit.vehicle)
+    scene.place([hit.pose(60)], hit.state.target[-1:])
+    without = np.array(scene.picture(camera))
+    across = hit.state.position[-1] + np.outer([-1.0, 1.0], [0.0, 1.0, 0.0])
+    drawn = (np.array(scene.picture(camera, [Trail(across, "red")])) != without).any(axis=2)
+    assert drawn[:, :10].any() and drawn[:, -10:].any() and not drawn[:, 40].any()
+    scene.close()
 
 
 coordinates = st.floats(-20, 20, allow_nan=False)
@@ -174,7 +185,7 @@ def test_a_following_camera_never_loses_the_vehicle(fall, hit):
         ]
         assert len(cameras) == len(times)
         for seconds, camera in zip(times, cameras, strict=True):
-            column, row, _ = camera.project(recording.vehicle_and_target(recording.at(seconds)))[0]
+            column, row, _ = camera.project(recording.state.position[[recording.at(seconds)]])[0]
             assert 0 < column < 100 and 0 < row < 100
         eyes = np.array([camera.eye for camera in cameras])
         assert np.abs(np.diff(eyes, n=2, axis=0)).max() < 0.6  # m per frame²: no jolts
@@ -258,6 +269,31 @@ def test_a_sequence_explains_its_signs(fall, hit, monkeypatch):
         "green hoops: target",
         "green hoops: target; arrows: force (red), torque (violet)",
     ]
+
+
+def test_a_sequence_ends_when_the_vehicle_stays_at_its_target(fall, hit):
+    near = flown(fixed_setting(FlightSettings(task="target_tracking"), target=(0, 0, 16)), 1000)
+    ended = sequence.until_settled(near)
+    assert 0 < ended.times[-1] < near.times[-1]
+    assert (near.state.distance[ended.state.n - 1 :] <= sequence.SETTLED).all()
+    assert ended.state.distance[-2] > sequence.SETTLED
+    assert sequence.until_settled(fall) is fall
+    assert sequence.until_settled(hit).state.n == hit.state.n
+
+
+def test_a_film_tells_the_force(hit):
+    assert "N" not in film._caption(hit, 5)
+    assert film._caption(hit, 11).endswith("force 28.3 N")
+
+
+@pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
+def test_a_full_disk_is_one_line(tmp_path):
+    def frames():
+        raise OSError(errno.ENOSPC, "No space left on device")
+        yield
+
+    with pytest.raises(ConfigError, match=r"film\.gif: cannot be encoded \(No space left"):
+        write_film(tmp_path / "film.gif", frames())
 
 
 @pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")

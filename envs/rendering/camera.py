@@ -10,8 +10,8 @@ import numpy as np
 from sb3_quad.base.types import FloatArray
 
 SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that distance hardly changes sizes
-CHASE_SLOPE = math.tan(math.radians(27.0))
-CHASE_MARGIN = 0.6  # around vehicle and target, m, for the default vehicle
+WIDE = math.tan(math.radians(27.0))  # not more than that of PyBullet's window
+MARGIN = 0.6  # around a vehicle and its target, m, for the default vehicle
 ASIDE = math.radians(9.0)  # between the direction to the target and that of a chasing camera
 STEEPEST = math.radians(70.0)  # elevation of a chasing camera's direction
 # How far a camera that frames points looks down, and one that shows the path of a target
@@ -69,8 +69,7 @@ def broadside(points: FloatArray, down: float = DOWN) -> FloatArray:
     # The direction of the least spread. Of its two signs always the same one is taken, so that
     # similar flights are seen from the same side.
     x, y = np.linalg.eigh(spread)[1][:, 0]
-    sign = 1.0 if (y, x) > (0.0, 0.0) else -1.0
-    return direction(math.atan2(sign * y, sign * x), -down)
+    return direction(math.atan2(y, x) % math.pi, -down)
 
 
 def chasing(way: FloatArray) -> FloatArray:
@@ -80,7 +79,7 @@ def chasing(way: FloatArray) -> FloatArray:
     """
     x, y, z = way
     elevation = math.atan2(z, math.hypot(x, y)) - ASIDE
-    elevation = float(np.clip(elevation, -STEEPEST, STEEPEST))
+    elevation = np.clip(elevation, -STEEPEST, STEEPEST)
     return direction(math.atan2(y, x) + ASIDE, elevation)
 
 
@@ -101,6 +100,6 @@ def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens:
     # and up.
     before = (room - across).max(axis=0)
     after = (room + across).max(axis=0)
-    distance = float((0.5 * (before + after) / lens.slopes).max())
+    distance = (0.5 * (before + after) / lens.slopes).max()
     eye = np.array([-distance, *(0.5 * (after - before))]) @ axes
     return Camera(np.maximum(eye, LOWEST), axes, lens)

@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from sb3_quad.base.types import Float32Array, FloatArray, Image
-from sb3_quad.envs.rendering.camera import Camera, Lens
+from sb3_quad.envs.rendering.camera import Camera
 
 NEAR = 0.05  # distances between which bodies are drawn, m
 FAR = 120.0
@@ -37,49 +37,43 @@ class Trail(NamedTuple):
 def backdrop(camera: Camera, shadow: Float32Array) -> Image:
     """Draw sky, and chequered ground with a shadow and haze, uint8 (height, width, 3).
 
+    :param camera: above the ground.
     :param shadow: centre x, y and radius of the shadow on the ground, (3,).
     """
     width, height, slope = camera.lens
-    across = np.linspace(-1.0, 1.0, width, dtype=np.float32) * (slope * width / height)
-    upwards = np.linspace(slope, -slope, height, dtype=np.float32)
+    x, y = camera.lens.slopes
+    across = np.linspace(-x, x, width, dtype=np.float32)[:, None]
+    upwards = np.linspace(y, -y, height, dtype=np.float32)[:, None, None]
     forward, right, up = camera.axes.astype(np.float32)
     # One ray for each pixel, from the eye.
-    rays = forward + across[:, None] * right + upwards[:, None, None] * up
+    rays = forward + across * right + upwards * up
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    sky = SKY_HORIZON + np.clip(1.6 * rays[..., 2:], 0.0, 1.0) * (SKY_ZENITH - SKY_HORIZON)
+    climb = rays[..., 2:]
+    sky = SKY_HORIZON + (1.6 * climb).clip(0.0, 1.0) * (SKY_ZENITH - SKY_HORIZON)
     eye = camera.eye.astype(np.float32)
     # Where a ray meets no ground, it goes so far that haze hides the ground.
-    distance = np.maximum(eye[2], 0.0) / np.maximum(-rays[..., 2], 1e-6)
-    points = eye[:2] + distance[..., None] * rays[..., :2]
-    # The size of a pixel on the ground, in squares. Finer squares blur into their mean instead of
-    # flickering.
-    footprint = distance * distance * (2.0 * slope / height / max(eye[2], 0.1) / SQUARE)
-    wave = np.sin(np.pi / SQUARE * points).prod(axis=2) / np.maximum(2.0 * footprint, 0.02)
-    dark = 0.5 + 0.5 * np.clip(wave, -1.0, 1.0) * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
-    ground = GROUND_LIGHT + dark[..., None] * (GROUND_DARK - GROUND_LIGHT)
+    distance = eye[2] / np.maximum(-climb, 1e-6)
+    points = eye[:2] + distance * rays[..., :2]
+    # Twice the size of a pixel on the ground, in squares. Finer squares blur into their mean
+    # instead of flickering.
+    blur = distance**2 * (4.0 * slope / height / eye[2] / SQUARE)
+    wave = np.sin(np.pi / SQUARE * points).prod(axis=2, keepdims=True) / np.maximum(blur, 0.02)
+    dark = 0.5 + 0.5 * wave.clip(-1.0, 1.0) * (2.0 - blur).clip(0.0, 1.0)
+    ground = GROUND_LIGHT + dark * (GROUND_DARK - GROUND_LIGHT)
     # The shadow has a soft edge.
-    away = np.linalg.norm(points - shadow[:2], axis=2) / shadow[2]
-    ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
+    away = np.linalg.norm(points - shadow[:2], axis=2, keepdims=True) / shadow[2]
+    ground *= 1.0 - SHADOW * (1.8 - 1.6 * away).clip(0.0, 1.0)
     # The share of the ground that is seen through the haze.
-    haze = np.exp(distance / -VISIBILITY)[..., None]
+    haze = np.exp(distance / -VISIBILITY)
     return np.asarray(255.0 * (sky + haze * (ground - sky)) + 0.5, np.uint8)
 
 
-def draw_trails(
-    picture: Pillow.Image, trails: Sequence[Trail], camera: Camera, depth: Float32Array
-) -> None:
-    """Draw trails into a picture where nothing of less ``depth``, (height, width), m, is before
-    them.
-    """
-    high, wide = depth.shape
-    larger = camera._replace(lens=Lens(wide, high, camera.lens.slope))
-    width = max(2, round(LINE * high))
+def draw_trails(picture: Pillow.Image, trails: Sequence[Trail], camera: Camera) -> None:
+    """Draw trails into a picture by ``camera``, but for what is behind it."""
     draw = ImageDraw.Draw(picture)
-    for trail in trails:
-        column, row, away = larger.project(trail.points).T
-        before = depth[row.clip(0, high - 1).astype(int), column.clip(0, wide - 1).astype(int)]
-        is_seen = (away > NEAR) & (away < before)
-        # A piece of the line is drawn where both its ends are seen.
-        for k in np.flatnonzero(is_seen[:-1] & is_seen[1:]).tolist():
-            piece = (column[k], row[k], column[k + 1], row[k + 1])
-            draw.line(piece, fill=trail.colour, width=width)
+    width = max(2, round(LINE * picture.height))
+    for points, colour in trails:
+        screen = camera.project(points)
+        is_ahead = screen[:, 2] > NEAR
+        for k in np.flatnonzero(is_ahead[:-1] & is_ahead[1:]):
+            draw.line(screen[k : k + 2, :2].ravel().tolist(), colour, width)

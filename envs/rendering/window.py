@@ -1,15 +1,41 @@
-"""PyBullet's window."""
+"""PyBullet's simulations and its window."""
 
 import math
 import os
 import sys
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.bullet import p
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.rendering.camera import Camera
+
+
+class Client:
+    """PyBullet's functions in a simulation of its own: ``client.stepSimulation()`` is
+    ``p.stepSimulation(physicsClientId=client.number)``.
+
+    :param mode: ``p.DIRECT``, without a display, or ``p.GUI``.
+    """
+
+    def __init__(self, mode: int = p.DIRECT, **options: str) -> None:
+        self.number = int(p.connect(mode, **options))
+        if self.number < 0:
+            raise p.error("no connection")
+
+    def __getattr__(self, name: str) -> Any:
+        function = partial(getattr(p, name), physicsClientId=self.number)
+        # Kept, so that each function is looked up once.
+        vars(self)[name] = function
+        return function
+
+    def close(self) -> None:
+        """End the simulation, unless that has been done, as by shutting the window."""
+        if self.isConnected():
+            self.disconnect()
 
 
 def has_display() -> bool:
@@ -17,24 +43,19 @@ def has_display() -> bool:
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
 
 
-def open_window(width: int, height: int) -> int:
+def open_window(width: int, height: int) -> Client:
     """Open PyBullet's window, with a ground and without controls; it draws nothing until
     :func:`start_drawing`.
 
-    :return: its client.
     :raises ConfigError: there is one already in this process, or it cannot be opened.
     """
     sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
-    try:
-        client = int(p.connect(p.GUI, options=f"--width={width} --height={height} {sky}"))
-    except p.error:
-        raise ConfigError(
-            "render_mode 'human': PyBullet opens one window per process, and one is open already"
-        ) from None
-    if client < 0:
-        raise ConfigError(
-            "render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'"
-        )
+    with raised_as(
+        ConfigError,
+        "render_mode 'human': PyBullet could not open its window, of which a process may have one; "
+        "use render_mode='rgb_array'",
+    ):
+        client = Client(p.GUI, options=f"--width={width} --height={height} {sky}")
     # Only the scene is shown: no controls, no shortcuts, and nothing before start_drawing().
     for option in (
         p.COV_ENABLE_RENDERING,
@@ -42,38 +63,30 @@ def open_window(width: int, height: int) -> int:
         p.COV_ENABLE_MOUSE_PICKING,
         p.COV_ENABLE_KEYBOARD_SHORTCUTS,
     ):
-        p.configureDebugVisualizer(option, 0, physicsClientId=client)
+        client.configureDebugVisualizer(option, 0)
     import pybullet_data
 
-    # The ground is drawn only; vehicles must not collide with it.
+    # Vehicles have no shape that collides with it.
     plane = f"{pybullet_data.getDataPath()}/plane.urdf"
-    ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=client)
-    p.setCollisionFilterGroupMask(ground, -1, 0, 0, physicsClientId=client)
+    client.loadURDF(plane, useFixedBase=True, globalScaling=2.0)
     return client
 
 
-def start_drawing(client: int) -> None:
+def start_drawing(client: Client) -> None:
     """Let a window show what is in it."""
-    p.configureDebugVisualizer(p.COV_ENABLE_RENDERING, 1, physicsClientId=client)
+    client.configureDebugVisualizer(p.COV_ENABLE_RENDERING, 1)
 
 
-def point_window(client: int, camera: Camera, towards: FloatArray) -> None:
+def point_window(client: Client, camera: Camera, towards: FloatArray) -> None:
     """Look through a window from where ``camera`` is, and draw it; ``towards``: what it looks at,
     (3,).
     """
     forward = camera.axes[0]
-    distance = float(np.linalg.norm(towards - camera.eye))
-    p.resetDebugVisualizerCamera(
+    distance = np.linalg.norm(towards - camera.eye)
+    client.resetDebugVisualizerCamera(
         cameraDistance=distance,
         cameraYaw=math.degrees(math.atan2(forward[1], forward[0])) - 90.0,
-        cameraPitch=math.degrees(math.asin(np.clip(forward[2], -0.999, 0.999))),
-        cameraTargetPosition=(camera.eye + distance * forward).tolist(),
-        physicsClientId=client,
+        cameraPitch=math.degrees(math.asin(forward[2])),
+        cameraTargetPosition=camera.eye + distance * forward,
     )
-    p.configureDebugVisualizer(p.COV_ENABLE_SINGLE_STEP_RENDERING, 1, physicsClientId=client)
-
-
-def disconnect(client: int) -> None:
-    """Close a window or another client, unless that has been done, as by shutting the window."""
-    if p.isConnected(client):
-        p.disconnect(client)
+    client.configureDebugVisualizer(p.COV_ENABLE_SINGLE_STEP_RENDERING, 1)

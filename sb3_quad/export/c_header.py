@@ -17,7 +17,9 @@ WIDTH = 110  # columns
 def c_name(text: str) -> str:
     """Return ``text`` as the beginning of C identifiers: other characters become underscores."""
     name = re.sub(r"[^A-Za-z0-9_]+", "_", text).strip("_")
-    return name if name and not name[0].isdigit() else f"quad_{name}".rstrip("_")
+    if not name[:1].isalpha():
+        name = f"quad_{name}".rstrip("_")
+    return name
 
 
 def write_header(network: Network, metadata: StrDict, name: str, half: bool = False) -> bytes:

@@ -8,18 +8,17 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError, ExportError
-from sb3_quad.base.types import FloatArray, StrDict
+from sb3_quad.base.types import FloatArray
 from sb3_quad.controllers.statistics import statistics_of
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import (
-    GROUPS,
     OBSERVATION_SIZE,
     turn_features,
 )
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import REFERENCE_PARTS, X, row_slices
-from sb3_quad.simulation.tasks import Task
+from sb3_quad.simulation.tasks import TASKS, Task
 from sb3_quad.simulation.tracks import ACCELERATION_STD
 from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -30,7 +29,14 @@ SHORT, LONG = 2, 1000
 # Of the range between least and greatest output: above rounding, which grows along a flight where
 # an agent reacts strongly to its last actions, and far below any mistake.
 TOLERANCE = 1e-3
-WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "body_rates_std": 8.0}
+WIDE = TASKS["recovery_and_tracking"].model_copy(
+    update={
+        "target_distance": 30.0,
+        "nearest_target": 0.0,
+        "velocity_std": 4.0,
+        "body_rates_std": 8.0,
+    }
+)
 # Here the position integral is at work from the first step on.
 NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
 # References that files are checked with, slow enough to be followed for long.
@@ -47,8 +53,10 @@ ROUNDING = 2e-6  # relative, of the limits within which the position integral is
 class TrainedPolicy:
     """A trained policy in its own environment: an exported file must agree with it.
 
-    :ivar vehicle: in the layout that the policy knows.
-    :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise.
+    :ivar own: the vehicle in its own layout, which is the file's; ``vehicle`` in the one that the
+        policy knows.
+    :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise;
+        ``own_mean`` μ in the body frame of ``own``.
     :ivar clip: VecNormalize's bound of the scaled features, whose statistics are in μ and σ; 0:
         none.
     :ivar observation: the frames that the policy sees.
@@ -74,6 +82,7 @@ class TrainedPolicy:
         row = QuadcopterBatch(1, settings, n_threads=1)
         self.model = model
         self.output = output
+        self.own = vehicle
         self.vehicle = row.vehicle_list[0]
         self.mean = row.mean[:, 0]
         self.std = row.std[:, 0]
@@ -83,21 +92,17 @@ class TrainedPolicy:
         if statistics is not None:
             if self.observation.size != OBSERVATION_SIZE:
                 raise ConfigError("VecNormalize with more than the present features has no export")
-            self.clip = float(statistics.clip_obs)
+            self.clip = statistics.clip_obs
             self.mean = self.mean + self.std * statistics.obs_rms.mean
             self.std = self.std * np.sqrt(statistics.obs_rms.var + statistics.epsilon)
         self.turn = find_turn(vehicle, layout)
-
-    @property
-    def own_mean(self) -> FloatArray:
-        """μ in the vehicle's own body frame, (OBSERVATION_SIZE,)."""
-        return self.mean @ turn_features(self.turn)
+        self.own_mean = self.mean @ turn_features(self.turn)
 
     def results(self, actions: Any) -> FloatArray:
         """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape,
         in float64.
         """
-        thrusts = self.vehicle.action_to_thrust(np.asarray(actions, dtype=np.float64))
+        thrusts = self.vehicle.action_to_thrust(np.asarray(actions, np.float64))
         if self.output == "thrusts":
             return thrusts
         return np.sqrt(thrusts / self.vehicle.thrust_coefficient)
@@ -127,13 +132,13 @@ def compare(
         finite.
     """
     # Far and fast starts, or long flights for a policy with a state.
-    changes: StrDict = {"task": "recovery_and_tracking", "task_kwargs": WIDE}
+    task: Any = WIDE
     steps = SHORT
     if trained.observation.is_extended:
-        changes = {"task": {"recovery_and_tracking": 1.0, NEAR: 1.0}}
+        task = {"recovery_and_tracking": 1.0, NEAR: 1.0}
         steps = LONG
     settings = FlightSettings().with_changes(
-        **changes,
+        task=task,
         **dict(trained.observation),
         observation_mean=trained.mean,
         observation_std=trained.std,
@@ -146,16 +151,15 @@ def compare(
     # What a file sees of the same states: the present features, without the position integral.
     present = settings.with_changes(history=None, last_action=False, position_integral=None)
     shown = QuadcopterBatch(batch.n, present)
-    # The same as if the target rested; apart from that the file is given what the target does.
-    resting = QuadcopterBatch(batch.n, present)
-    for part in ("target_velocity", "target_heading", "target_heading_rate"):
-        resting.tracks[:, row_slices(REFERENCE_PARTS)[part]] = 0.0
+    if relates:
+        # As if the target rested; apart from that the file is given what the target does.
+        for part in ("target_velocity", "target_heading", "target_heading_rate"):
+            shown.tracks[:, row_slices(REFERENCE_PARTS)[part]] = 0.0
     ahead = np.zeros(3 * len(batch.previews))
     mean = np.append(trained.mean, ahead)
     std = np.append(trained.std, ahead + ACCELERATION_STD)
     observation = batch.reset()
-    flying = np.ones(batch.n, bool)
-    compared = flying.copy()
+    compared = np.ones(batch.n, bool)
     # The file flies the vehicle in its own axes and order of rotors.
     turned = turn_features(trained.turn)
     integral = trained.observation.position_integral
@@ -163,23 +167,20 @@ def compare(
     error = 0.0
     count = 0
     for _ in range(steps):
-        compared &= flying
         for name in ("state", "course", "streams"):
             getattr(shown, name)[...] = getattr(batch, name)
-            getattr(resting, name)[...] = getattr(batch, name)
-        features = shown.observe() * std + mean
+        state = batch.true_state()
         if integral is not None:
             # So close to a limit, rounding may begin to integrate one step earlier or later.
-            for group, limit in (("position", integral.distance), ("velocity", integral.speed)):
-                norm = np.linalg.norm(features[:, GROUPS[group]], axis=1)
+            speed = np.linalg.norm(state.velocity - state.target_velocity, axis=1)
+            for norm, limit in ((state.distance, integral.distance), (speed, integral.speed)):
                 compared &= np.abs(norm / limit - 1.0) > ROUNDING
         references = []
         if relates:
-            moving = batch.state[X.target_velocity :]
-            heading = np.arctan2(moving[7], moving[6])
-            numbers = np.stack([*moving[:3], heading, moving[8]], axis=1)
+            cosine, sine, rate = state.array[X.target_heading : X.target_heading_rate + 1]
+            numbers = np.column_stack([state.target_velocity, np.arctan2(sine, cosine), rate])
             references = [numbers.astype(np.float32, order="C")]
-            features = resting.observe() * std + mean
+        features = shown.observe() * std + mean
         features[:, :OBSERVATION_SIZE] = features[:, :OBSERVATION_SIZE] @ turned
         results, file_state = call(features.astype(np.float32), file_state, *references)
         if trained.clip:
@@ -187,12 +188,11 @@ def compare(
         actions, _ = trained.model.predict(observation, deterministic=True)
         difference = np.abs(results[:, trained.turn.order] - trained.results(actions))
         error = float(np.max(difference[compared], initial=error))  # NaN stays
-        count += int(compared.sum())
-        # A flight that is lost ends; what follows of it is not compared.
-        actions[~flying] = 0.0
+        count += compared.sum()
+        # What follows of a flight that is lost is not compared.
         observation, _, lost = batch.step(actions)
-        flying &= ~lost
-    allowed = TOLERANCE * float(np.ptp(trained.results([-1.0, 1.0])))
+        compared &= ~lost
+    allowed = TOLERANCE * np.ptp(trained.results([-1.0, 1.0]))
     # Negated, so that NaN fails as well.
     if not error <= allowed:
         raise ExportError(

@@ -1,13 +1,9 @@
-"""A policy as an app for the Crazyflie's firmware: an out-of-tree controller, by the templates
-``crazyflie.*.j2``.
-"""
+"""A policy as an app for the Crazyflie's firmware: an out-of-tree controller."""
 
 import math
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict
-from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.cost import cost_of
 from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
@@ -21,23 +17,23 @@ SHARE = 0.25
 MOST = 0.5
 # THRUST_MIN and THRUST_MAX of the firmware's platforms, N: src/platform/interface in its repository
 # of August 2026, with battery compensation.
-PLATFORMS = {
-    "Crazyflie 2.x": (0.0128, 0.12),
-    "thrust upgrade kit": (0.0192, 0.18),
-    "Crazyflie 2.1 Brushless": (0.0214, 0.2),
-}
+PLATFORMS = (
+    ("Crazyflie 2.x", 0.0128, 0.12),
+    ("thrust upgrade kit", 0.0192, 0.18),
+    ("Crazyflie 2.1 Brushless", 0.0214, 0.2),
+)
 
 
-def plan_app(network: Network, trained: TrainedPolicy) -> StrDict:
-    """Return what the templates need besides names.
+def plan_app(network: Network) -> StrDict:
+    """Return what the templates of the files need besides names.
 
-    :param trained: its vehicle's rotors are M1 to M4 of the firmware.
+    :param network: its vehicle's rotors are M1 to M4 of the firmware.
     :raises ConfigError: thrusts that no platform gives; a policy that is too slow, or whose control
         step is not a number of calls.
     """
-    vehicle = trained.vehicle
+    vehicle = network.trained.own
     high = vehicle.thrust_range[1]
-    able = [item for item in PLATFORMS.items() if high <= item[1][1] * (1.0 + 1e-4)]
+    able = [platform for platform in PLATFORMS if high <= 1.0001 * platform[2]]
     if not able:
         raise ConfigError(
             f"vehicle {vehicle.name}: up to {high:.4g} N a rotor, more than any Crazyflie"
@@ -67,23 +63,8 @@ def plan_app(network: Network, trained: TrainedPolicy) -> StrDict:
         "slices": slices,
         "share": math.ceil(cost.multiplications / slices) + longest_row,
         "highest": high,
-        "angle": trained.turn.angle,
-        "inputs": network.mean.numel(),
+        "angle": network.trained.turn.angle,
         "features": OBSERVATION_SIZE,
         "F": F,
         "able": able,
     }
-
-
-def write_app(plan: StrDict, metadata: StrDict, name: str) -> dict[str, bytes]:
-    """Return the files of the folder, by their paths in it, without ``src/policy.h``.
-
-    :param plan: of :func:`plan_app`.
-    :param name: beginning of the header's identifiers.
-    """
-    files = {}
-    for path in FILES:
-        template = f"crazyflie.{path.replace('/', '.')}.j2"
-        text = render("sb3_quad.export", template, name=name, metadata=metadata, **plan)
-        files[path] = text.encode()
-    return files

@@ -17,7 +17,6 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import Float32Array
 
-N_ROTORS = 4
 COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 Call = Callable[..., tuple[Float32Array, Any]]
@@ -34,7 +33,6 @@ def load_torchscript(content: bytes, state_size: int) -> tuple[Call, str]:
     """
     module = th.jit.load(io.BytesIO(content), "cpu")  # type: ignore[no-untyped-call]
 
-    @th.no_grad()
     def run(*inputs: Float32Array) -> list[Any]:
         outputs = module(*map(th.from_numpy, inputs))
         if not state_size:
@@ -66,7 +64,7 @@ def _call(run: Callable[..., Any], state_size: int) -> Call:
             return run(rows)[0], None
         # Zeros begin a flight.
         if state is None:
-            state = np.zeros((len(rows), state_size), dtype=np.float32)
+            state = np.zeros((len(rows), state_size), np.float32)
         return tuple(run(rows, state))
 
     return call
@@ -85,13 +83,7 @@ def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
             "--format c needs a C compiler, to check what it writes: "
             "install gcc or clang (apt install gcc)"
         )
-    program = render(
-        "sb3_quad.export",
-        "run.c.j2",
-        name=name,
-        stateful=state_size > 0,
-        rotors=N_ROTORS,
-    )
+    program = render("sb3_quad.export", "run.c.j2", name=name, stateful=state_size > 0)
     with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
         Path(folder, "policy.h").write_bytes(content)
         Path(folder, "run.c").write_text(program, encoding="ascii")
@@ -106,12 +98,12 @@ def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
 
     def call(rows: Float32Array, state: Any = None, references: Any = None) -> Any:
         if references is None:
-            references = np.zeros((len(rows), 5), dtype=np.float32)
+            references = np.zeros((len(rows), 5), np.float32)
         begins = state is None
         if begins:
             # A new struct holds anything before its reset.
-            state = np.full((len(rows), library.size()), 0xFF, dtype=np.uint8)
-        results = np.empty((len(rows), N_ROTORS), dtype=np.float32)
+            state = np.full((len(rows), library.size()), 0xFF, np.uint8)
+        results = np.empty((len(rows), 4), np.float32)
         arrays = map(np.ctypeslib.as_ctypes, (rows, references, results, state))
         library.run(*arrays, begins, ctypes.c_long(len(rows)))
         return results, state

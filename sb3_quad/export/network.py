@@ -6,6 +6,7 @@ import copy
 import io
 import itertools
 import json
+import math
 from typing import Any
 
 import numpy as np
@@ -59,15 +60,15 @@ class Network(nn.Module):
 
     def __init__(self, layers: nn.Sequential, trained: TrainedPolicy) -> None:
         super().__init__()
+        self.trained = trained
         vehicle = trained.vehicle
         observation = trained.observation
         self.observation = observation
         self.clip = trained.clip
-        self.output = trained.output
-        self.result, self.unit = OUTPUTS[self.output]
+        self.result, self.unit = OUTPUTS[trained.output]
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
         limits = np.array(vehicle.thrust_range)
-        if self.output == "speeds":
+        if trained.output == "speeds":
             if not vehicle.thrust_coefficient:
                 raise ConfigError(
                     f"output speeds: {vehicle.name} has no thrust_coefficient; export thrusts"
@@ -94,9 +95,9 @@ class Network(nn.Module):
         # From the integral to what it adds to the scaled features.
         self.shift = th.diag(self.inverse_std[:OBSERVATION_SIZE])[GROUPS["position"]]
         # An example of what the files take.
-        self.examples = [th.zeros(2, len(self.mean))]
+        self.examples: tuple[th.Tensor, ...] = (th.zeros(2, len(self.mean)),)
         if observation.is_extended:
-            self.examples.append(th.zeros(2, self.state_size))
+            self.examples += (th.zeros(2, self.state_size),)
         self.eval()
 
     def forward(self, observation: th.Tensor, state: th.Tensor | None = None) -> Any:
@@ -133,7 +134,7 @@ class Network(nn.Module):
     def command(self, action: th.Tensor) -> th.Tensor:
         """Rotor thrusts or speeds, (batch, 4), of actions."""
         value: th.Tensor = self.middle + self.half_range * action
-        if self.output == "thrusts":
+        if self.trained.output == "thrusts":
             return value
         # Rounding may leave a rotor that can stand still a hair below zero.
         return value.relu().sqrt()
@@ -178,12 +179,12 @@ def build_network(trained: TrainedPolicy, where: str = "model", features: str = 
         )
     if trained.observation.features != features:
         raise ConfigError(
-            f"{where}: does not see `features: {features}`; --format px4 needs and takes features:"
-            f" px4, all others body; train with --env-kwargs features:{features}"
+            f"{where}: --format px4 needs and takes features: px4, all others body; "
+            f"train with --env-kwargs features:{features}"
         )
     # C knows these layers only.
     for layer in layers:
-        if type(layer) is not nn.Linear and type(layer) not in ACTIVATIONS:
+        if type(layer) not in (nn.Linear, *ACTIVATIONS):
             raise ConfigError(
                 f"{where}: its network has a layer {layer}; "
                 "only linear layers, Tanh and ReLU export"
@@ -200,17 +201,15 @@ def own_layers(layers: nn.Sequential, trained: TrainedPolicy) -> nn.Sequential:
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
     turn = trained.turn
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
-    # One frame: the scaled features, then the last action if the policy sees it.
-    observation = trained.observation
-    std = trained.std
-    frame = np.eye(observation.frame_size)
-    frame[:OBSERVATION_SIZE, :OBSERVATION_SIZE] = turn_features(turn) * std / std[:, None]
-    if observation.last_action:
-        frame[OBSERVATION_SIZE:, OBSERVATION_SIZE:] = np.eye(4)[[*turn.order]]
     # Every observed frame is turned alike; the weights absorb it, so that files stay as fast.
-    frames = th.from_numpy(np.kron(np.eye(len(observation.ages)), frame))
-    seen = linear[0].weight[:, : len(frames)]
-    seen.copy_(seen @ frames)
+    shape = (len(trained.observation.ages), trained.observation.frame_size)
+    frames = linear[0].weight[:, : math.prod(shape)].view(-1, *shape)
+    features = frames[..., :OBSERVATION_SIZE]
+    turned = turn_features(turn) * trained.std / trained.std[:, None]
+    features.copy_(features @ th.from_numpy(turned))
+    if trained.observation.last_action:
+        action = frames[..., OBSERVATION_SIZE:]
+        action.copy_(action[..., turn.own])
     last = linear[-1]
     last.weight.copy_(last.weight[turn.own])
     last.bias.copy_(last.bias[turn.own])
@@ -263,7 +262,7 @@ def write_torchscript(network: Network, metadata: StrDict) -> bytes:
     """
     # Tracing writes out the computation of an example, without this package's classes.
     buffer = io.BytesIO()
-    traced = th.jit.trace(network, tuple(network.examples))  # type: ignore[no-untyped-call]
+    traced = th.jit.trace(network, network.examples)  # type: ignore[no-untyped-call]
     th.jit.save(traced, buffer, _extra_files={"metadata.json": json.dumps(metadata)})
     return buffer.getvalue()
 
@@ -284,7 +283,7 @@ def write_onnx(network: Network, metadata: StrDict) -> bytes:
     buffer: Any = io.BytesIO()
     th.onnx.export(
         network,
-        tuple(network.examples),
+        network.examples,
         buffer,
         input_names=inputs,
         output_names=outputs,

@@ -5,7 +5,7 @@ import re
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch.nn.utils import parameters_to_vector
 
@@ -16,16 +16,16 @@ from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.tensors import ENDING, write_tensors
 from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
-from sb3_quad.export import load
+from sb3_quad.export import crazyflie, load, px4
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, TrainedPolicy, compare
 from sb3_quad.export.cost import cost_of
-from sb3_quad.export.crazyflie import plan_app, write_app
+from sb3_quad.export.crazyflie import plan_app
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
-from sb3_quad.export.px4 import PARAMETERS, load_px4, motor_order, write_module, write_px4
+from sb3_quad.export.px4 import load_px4, motor_order, write_px4
 from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.simulation.settings import KEY
-from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
 
 # With the endings of their files, or of their folders.
 FORMATS = {
@@ -38,6 +38,8 @@ FORMATS = {
 }
 # Those that are folders, with the file that holds the policy.
 FOLDERS = {"crazyflie": "src/policy.h", "px4": "control_net.tflite"}
+# And the others in them; the template of FILE is FORMAT.FILE.j2, with . for /.
+FILES = {"crazyflie": crazyflie.FILES, "px4": px4.FILES}
 
 
 class Export(NamedTuple):
@@ -96,28 +98,27 @@ def export_policy(
         raise ConfigError(f"--half: is for --format c; --format {file_format} keeps float32")
     if file_format == "safetensors":
         return _agent_itself(path, output, vehicle)
-    is_app = file_format == "crazyflie"
     if file_format in FOLDERS and output != "thrusts":
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     if half:
-        for values in model.policy.parameters():
-            values.data = values.data.half().float()
+        model.policy.half().float()
     settings, source = agent_settings(path)
-    if source is None and vehicle is None:
-        raise ConfigError(
-            f"model {path}: does not say how its agent flies; if no wrapper of observations or"
-            " actions lay over its environment, name its vehicle with --vehicle"
-        )
-    given = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
-    if given.vehicles is not None:
-        raise ConfigError(
-            f"model {path}: flies any vehicle; "
-            "say with --vehicle which one's thrusts the file is to give"
-        )
-    flown = first_vehicle(given.vehicle)
-    if is_app:
+    if vehicle is None:
+        if source is None:
+            raise ConfigError(
+                f"model {path}: does not say how its agent flies; if no wrapper of observations or"
+                " actions lay over its environment, name its vehicle with --vehicle"
+            )
+        if settings.vehicles is not None:
+            raise ConfigError(
+                f"model {path}: flies any vehicle; "
+                "say with --vehicle which one's thrusts the file is to give"
+            )
+        vehicle = settings.vehicle
+    flown = first_vehicle(vehicle)
+    if file_format == "crazyflie":
         # Axes and rotors as the firmware has them.
         flown = flown.in_layout_of(load_vehicle("crazyflie"))
     trained = TrainedPolicy(model, settings, flown, output)
@@ -126,17 +127,18 @@ def export_policy(
     formats: StrDict = {
         "onnx": (write_onnx, load.load_onnx),
         "torchscript": (write_torchscript, load.load_torchscript),
-        "px4": (partial(write_px4, trained=trained), partial(load_px4, vehicle=flown)),
+        "px4": (write_px4, partial(load_px4, vehicle=flown)),
     }
     network = build_network(trained, f"model {path}", "px4" if file_format == "px4" else "body")
     write, read = formats.get(file_format, header)
-    facts: StrDict = {}
+    cost = None
     # What conversions from half precision take was not measured.
     if write is header[0] and not half:
-        facts["cost"] = cost_of(network)
-    if is_app:
-        facts["plan"] = plan_app(network, trained)
-    metadata = _describe(Path(path), saved_algorithm(path), network, trained, flown, facts)
+        cost = cost_of(network)
+    plan = {}
+    if file_format == "crazyflie":
+        plan = plan_app(network)
+    metadata = _describe(Path(path), network, cost=cost, plan=plan)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
         # files do not.
@@ -149,12 +151,15 @@ def export_policy(
             f"in {n_compared} observations of flights ({by})"
         )
         content = write(network, metadata)
-    files = None
-    if is_app:
-        files = {FOLDERS[file_format]: content, **write_app(facts["plan"], metadata, prefix)}
+    if file_format not in FOLDERS:
+        return Export(content, metadata, error, network.unit, source, None)
+    words = {"name": prefix, "metadata": metadata, "vehicle": flown, "content": content, **plan}
+    files = {FOLDERS[file_format]: content}
+    for file in FILES[file_format]:
+        template = f"{file_format}.{file.replace('/', '.')}.j2"
+        files[file] = render("sb3_quad.export", template, **words).encode()
     if file_format == "px4":
-        files = {FOLDERS[file_format]: content, **write_module(content, flown)}
-        metadata["parameters"] = "; ".join(files[PARAMETERS].decode().splitlines())
+        metadata["parameters"] = "; ".join(files[px4.PARAMETERS].decode().splitlines())
     return Export(content, metadata, error, network.unit, source, files)
 
 
@@ -167,45 +172,34 @@ def _agent_itself(path: StrPath, output: str, vehicle: VehicleSource | None) -> 
     model = load_model(path)
     settings, source = agent_settings(path)
     trained = TrainedPolicy(model, settings, first_vehicle(settings.vehicle))
-    network = build_network(trained, f"model {path}", settings.features)
+    build_network(trained, f"model {path}", settings.features)
     if trained.clip or model.use_sde:
         raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
     data = saved_data(path)
     if source is not None:
         settings.write_into(model)
         data[KEY] = getattr(model, KEY)
-    return Export(write_tensors(model, data), {}, 0.0, network.unit, source, None)
+    return Export(write_tensors(model, data), {}, 0.0, "N", source, None)
 
 
-def _describe(
-    path: Path,
-    algorithm: str,
-    network: Network,
-    trained: TrainedPolicy,
-    vehicle: Vehicle,
-    facts: StrDict,
-) -> StrDict:
+def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:
     """Return what users of the file must know; ASCII but for names."""
+    trained = network.trained
     text = render(
         "sb3_quad.export",
         "metadata.j2",
         version=__version__,
         network=network,
-        trained=trained,
-        vehicle=vehicle,
         # The limits of the results are those of the extreme actions.
         limits=trained.results([-1.0, 1.0]),
         features=FEATURES,
         places=GROUPS,
-        motors=motor_order(vehicle) if network.observation.features == "px4" else [],
+        motors=motor_order(trained.own) if network.observation.features == "px4" else [],
         n_parameters=parameters_to_vector(network.parameters()).numel(),
         needs=network.observation.model_dump(mode="json", exclude={"preview"}),
         **facts,
     )
     # The name of a file may hold anything, also the end of a line.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    metadata = {"policy": f"{path.name} ({algorithm}), sha256 {digest}"}
-    for line in text.splitlines():
-        key, _, value = line.partition(": ")
-        metadata[key] = value
-    return metadata
+    policy = f"{path.name} ({saved_algorithm(path)}), sha256 {digest}"
+    return {"policy": policy, **dict(line.split(": ", 1) for line in text.splitlines())}

@@ -11,9 +11,7 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
-from sb3_quad.base.templates import render
 from sb3_quad.base.types import Float32Array, StrDict
-from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.load import Call
 from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import GROUPS, F
@@ -35,22 +33,21 @@ SHOWN = np.r_[
 SIGNS = np.repeat([-1.0, 1.0], [3, 12]).astype(np.float32)
 
 
-def write_px4(network: Network, metadata: StrDict, trained: TrainedPolicy) -> bytes:
+def write_px4(network: Network, metadata: StrDict) -> bytes:
     """Return the file: inputs float32 (1, 15), outputs (1, 4), the actions of PX4's motors.
 
-    :param network: of ``trained``.
     :raises ConfigError: tflite is not installed; a network that the module cannot compute.
     """
     tflite = require("tflite", "px4", "--format px4")
     builder = require("flatbuffers", "px4", "--format px4").Builder()
-    _check(network, trained)
+    _check(network)
     # Weights and biases in turn. The first layer scales its inputs, the last one numbers the motors
     # as PX4 does.
     values = [parameter.numpy() for parameter in network.layers.parameters()]
     scaled = values[0][:, SHOWN] * network.inverse_std.numpy()[SHOWN]
     values[1] = values[1] - scaled @ network.mean.numpy()[SHOWN]
     values[0] = scaled * SIGNS
-    motors = motor_order(trained.vehicle)
+    motors = motor_order(network.trained.own)
     values[-2:] = values[-2][motors], values[-1][motors]
 
     def table(kind: str, **fields: Any) -> Any:
@@ -84,14 +81,15 @@ def write_px4(network: Network, metadata: StrDict, trained: TrainedPolicy) -> by
         last = tensor(bias[None], False)
         outputs = vector([last])
         bends = int(shape["activation"] == "relu")
-        operator = table(
-            "Operator",
-            Inputs=inputs,
-            Outputs=outputs,
-            BuiltinOptionsType=tflite.BuiltinOptions.FullyConnectedOptions,
-            BuiltinOptions=table("FullyConnectedOptions", FusedActivationFunction=bends),
+        operators.append(
+            table(
+                "Operator",
+                Inputs=inputs,
+                Outputs=outputs,
+                BuiltinOptionsType=tflite.BuiltinOptions.FullyConnectedOptions,
+                BuiltinOptions=table("FullyConnectedOptions", FusedActivationFunction=bends),
+            )
         )
-        operators.append(operator)
     kind = tflite.BuiltinOperator.FULLY_CONNECTED
     code = table("OperatorCode", DeprecatedBuiltinCode=kind, BuiltinCode=kind)
     graph = table(
@@ -113,19 +111,8 @@ def write_px4(network: Network, metadata: StrDict, trained: TrainedPolicy) -> by
     return bytes(builder.Output())
 
 
-def write_module(content: bytes, vehicle: Vehicle) -> dict[str, bytes]:
-    """Return the files of the folder, by their names, without that of :func:`write_px4`.
-
-    :param content: of that file.
-    """
-    files = {}
-    for name in FILES:
-        text = render("sb3_quad.export", f"{name}.j2", vehicle=vehicle, content=content)
-        files[name] = text.encode("ascii")
-    return files
-
-
-def _check(network: Network, trained: TrainedPolicy) -> None:
+def _check(network: Network) -> None:
+    trained = network.trained
     kinds = {shape["activation"] for shape in network.shapes}
     seen = network.observation
     refusals = {
@@ -152,12 +139,11 @@ def motor_order(vehicle: Vehicle) -> list[int]:
 
     :raises ConfigError: not one rotor in each corner.
     """
-    corners = np.sign(vehicle.rotor_positions).tolist()
-    order = np.array(ORDERS["px4"]).tolist()
+    corners = list(map(tuple, np.sign(vehicle.rotor_positions)))
     with raised_as(
         ConfigError, f"--format px4: vehicle {vehicle.name}: needs a rotor in each corner"
     ):
-        return [corners.index(corner) for corner in order]
+        return [corners.index(corner) for corner in ORDERS["px4"]]
 
 
 def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, str]:

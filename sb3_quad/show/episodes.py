@@ -1,18 +1,16 @@
 """Recorded flights to be shown: the same episodes for all controllers, on PyBullet."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
 from sb3_quad.envs.rendering.camera import DOWN, ON_PATH, broadside
-from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.picture import Trail
-from sb3_quad.envs.rendering.scene import MARKER, Pose
+from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
@@ -22,24 +20,61 @@ from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
-# The path of a target has the colour of its hoops.
-TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()
+TARGET = "#1ab847"  # colour of the path of a target: that of its hoops
 WRENCH_SECONDS = 0.4  # a wrench is shown for that long, so that a short blow can be seen
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """A flight of T control steps."""
+class Recording(Hook):
+    """A flight of T control steps, recorded as it is flown.
 
-    name: str
-    colour: str  # of its trail and its heading, #rrggbb
-    vehicle: Vehicle
-    state: QuadcopterState  # the true state before the first step and after each one, T + 1
-    # (T + 1, 12), of the step before: force in the world and in the body frame, N; torques
-    # likewise, N m
-    wrench: FloatArray
-    reward: float  # sum of the rewards
-    lost: str  # how it was lost: "crashed", "out of range", or empty
+    :ivar results: its metrics, the only ones; to be set once it has been flown.
+
+    :param colour: of its trail and its heading, #rrggbb.
+    """
+
+    results: Flights
+
+    def __init__(self, name: str, colour: str) -> None:
+        self.name = name
+        self.colour = colour
+
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self._states = [state.copy()]
+        self._wrenches = [np.zeros(WRENCH_SIZE)]
+
+    def before_step(
+        self,
+        state: QuadcopterState,
+        observation: Float32Array,
+        wrench: FloatArray,
+        flying: BoolArray,
+    ) -> None:
+        self._wrenches.append(wrench[0].copy())
+
+    def after_step(
+        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
+    ) -> None:
+        self._states.append(state.copy())
+
+    @cached_property
+    def state(self) -> QuadcopterState:
+        """The true state before the first step and after each one, T + 1."""
+        return QuadcopterState.concatenate(self._states)
+
+    @cached_property
+    def wrench(self) -> FloatArray:
+        """What acted in the step before each state, (T + 1, 12): force in the world and in the body
+        frame, N; torques likewise, N m.
+        """
+        return np.stack(self._wrenches)
+
+    @property
+    def lost(self) -> str:
+        """How it was lost; empty if it was not."""
+        if self.results.collision[0]:
+            return "crashed"
+        return "" if self.results.survival[0] else "out of range"
 
     @cached_property
     def times(self) -> FloatArray:
@@ -48,9 +83,8 @@ class Recording:
 
     @cached_property
     def rotor_angles(self) -> FloatArray:
-        """Angles by which the drawn rotors have turned, (T + 1, 4), rad."""
-        rates = rotor_turning(self.vehicle, self.state.rotor_speeds)
-        return np.cumsum(rates, axis=0) * self.vehicle.control_step
+        """Angles by which the rotors have turned, (T + 1, 4), rad."""
+        return np.cumsum(self.state.rotor_speeds, axis=0) * self.vehicle.control_step
 
     @property
     def targets(self) -> FloatArray:
@@ -73,19 +107,30 @@ class Recording:
         return trails
 
     @property
+    def end(self) -> str:
+        """How it ended, in words."""
+        end = self.lost or f"{self.state.distance[-1]:.3f} m from its target"
+        return f"{end} after {self.times[-1]:.2f} s"
+
+    @property
     def disturbances(self) -> list[int]:
         """The steps after which a wrench has begun to act."""
         # A wrench begins to act where it acts in a step and not in the one before.
-        acts = np.asarray(self.wrench.any(axis=1))
-        return (np.flatnonzero(acts[1:] & ~acts[:-1]) + 1).tolist()
+        acts = self.wrench.any(axis=1).astype(int)
+        return (np.flatnonzero(np.diff(acts) > 0) + 1).tolist()
 
-    def at(self, seconds: float) -> int:
-        """The index of the last state not later than ``seconds``."""
-        return int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1
+    def until(self, step: int) -> "Recording":
+        """The same flight, but as if it had ended in ``step``."""
+        part = Recording(self.name, self.colour)
+        part.vehicle = self.vehicle
+        part.results = self.results
+        part._states = self._states[: step + 1]
+        part._wrenches = self._wrenches[: step + 1]
+        return part
 
-    def vehicle_and_target(self, step: int) -> FloatArray:
-        """The positions of both, (2, 3), world frame, m."""
-        return np.stack([self.state.position[step], self.state.target[step]])
+    def at(self, seconds: float | FloatArray) -> Any:
+        """The index of the last state not later than ``seconds``, a number or an array."""
+        return np.searchsorted(self.times, seconds + 1e-9, side="right") - 1
 
     def wrench_around(self, step: int, seconds: float = WRENCH_SECONDS) -> FloatArray:
         """The largest force and torque, (12,), of the last ``seconds`` before ``step``."""
@@ -100,7 +145,11 @@ class Recording:
         )
 
 
-def landmarks(recordings: Iterable[Recording]) -> FloatArray:
+# What all controllers fly of one seed
+Episode: TypeAlias = Sequence[Recording]
+
+
+def landmarks(recordings: Episode) -> FloatArray:
     """Return the points and targets of flights, from which a camera is chosen, (n, 3), m."""
     points = []
     for recording in recordings:
@@ -108,7 +157,7 @@ def landmarks(recordings: Iterable[Recording]) -> FloatArray:
     return np.concatenate(points)
 
 
-def outlook(recordings: Sequence[Recording]) -> FloatArray:
+def outlook(recordings: Episode) -> FloatArray:
     """Return the direction in which cameras look at flights, (3,), from higher up at paths that
     targets move along.
     """
@@ -165,7 +214,7 @@ def fly_all(
     n_timesteps: int | None,
     deterministic: bool = True,
     n_envs: int = 1,
-) -> Iterator[list[Recording]]:
+) -> Iterator[Episode]:
     """Fly episodes one after the other, each by all controllers.
 
     :param controllers: by label; each as of :func:`~sb3_quad.evaluation.flights.fly`.
@@ -179,7 +228,7 @@ def fly_all(
     """
     # Without n_timesteps one whole episode is flown.
     longest = setting.settings.longest_episode
-    left = longest if n_timesteps is None else n_timesteps
+    left = n_timesteps or longest
     while left > 0:
         settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
         episode: list[Recording] = []
@@ -189,64 +238,24 @@ def fly_all(
             own = settings.with_changes(**setting.own.get(name, {}))
             for episode_seed in range(seed, seed + n_envs):
                 label = name if n_envs == 1 else f"seed {episode_seed}, {name}"
-                log = _Log()
+                recording = Recording(label, colours[name])
                 try:
-                    flights = fly_settings(
+                    recording.results = fly_settings(
                         controller,
                         own,
                         [episode_seed],
                         "pybullet",
                         (),
-                        [log],
+                        [recording],
                         setting.plan(episode_seed),
                         deterministic,
                     )
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
-                episode.append(log.recording(label, colours[name], flights))
+                episode.append(recording)
         yield episode
         if n_timesteps is None:
             return
         # The longest flight counts, since the others wait for it.
         left -= max(len(recording.times) - 1 for recording in episode)
         seed += n_envs
-
-
-class _Log(Hook):
-    """The state before a flight and after every control step, and the wrench in each."""
-
-    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        self.vehicle = vehicle
-        self.states = [state.copy()]
-        self.wrenches = [np.zeros(WRENCH_SIZE)]
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        self.wrenches.append(wrench[0].copy())
-
-    def after_step(
-        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
-    ) -> None:
-        self.states.append(state.copy())
-
-    def recording(self, name: str, colour: str, flights: Flights) -> Recording:
-        """Return the flight, whose results are the only ones of ``flights``."""
-        lost = ""
-        if flights.collision[0]:
-            lost = "crashed"
-        elif not flights.survival[0]:
-            lost = "out of range"
-        return Recording(
-            name=name,
-            colour=colour,
-            vehicle=self.vehicle,
-            state=QuadcopterState.concatenate(self.states),
-            wrench=np.stack(self.wrenches),
-            reward=float(flights.reward[0]),
-            lost=lost,
-        )

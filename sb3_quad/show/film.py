@@ -18,23 +18,31 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
-from sb3_quad.envs.rendering.camera import Camera, Lens, framing_camera
+from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
-from sb3_quad.show.episodes import Recording, outlook
+from sb3_quad.envs.rendering.window import open_window, point_window, start_drawing
+from sb3_quad.show.episodes import Episode, Recording, outlook
 from sb3_quad.show.labels import mark_lost, side_by_side, with_header
+from sb3_quad.simulation.state import POSITION, TARGET
 
 FPS = 25
 HOLD = 0.4  # the last picture stays for that long, s
-# Of the default vehicle, m: the margin around the vehicle, and how much of the way to its target a
-# camera shows.
-MARGIN = 0.6
-AHEAD = 3.0
+AHEAD = 3.0  # of the way to its target that a camera shows, m, of the default vehicle
 PANELS_ABREAST = 3
 LAG = 0.044  # s of flight after which a camera has followed to 1/e of a jump, as of a new target
-WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
-MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-FORMATS = (".mp4", ".webp", ".gif")
+LOOP = {"duration": 1000 / FPS, "loop": 0}
+# How imageio writes each.
+FORMATS: dict[str, StrDict] = {
+    ".mp4": {
+        "fps": FPS,
+        "codec": "libx264",
+        "quality": 7,
+        "macro_block_size": 2,
+        "ffmpeg_log_level": "error",
+    },
+    ".webp": LOOP,
+    ".gif": LOOP,
+}
 
 
 def check_film(path: Path) -> Any:
@@ -59,14 +67,11 @@ def write_film(path: Path, frames: Iterable[Image]) -> None:
     """
     imageio = check_film(path)
     suffix = path.suffix.lower()
-    options: StrDict = {"duration": 1000 / FPS, "loop": 0}
-    if suffix == ".mp4":
-        options = {"fps": FPS, **MP4}
     # In another folder: after an interruption, the encoder may still write for a moment.
     with tempfile.TemporaryDirectory(prefix="sb3_quad_", ignore_cleanup_errors=True) as folder:
         draft = Path(folder, f"film{suffix}")
         try:
-            with imageio.get_writer(draft, **options) as writer:
+            with imageio.get_writer(draft, **FORMATS[suffix]) as writer:
                 for frame in frames:
                     writer.append_data(frame)
             content = draft.read_bytes()
@@ -75,7 +80,7 @@ def write_film(path: Path, frames: Iterable[Image]) -> None:
     write_bytes(path, content)
 
 
-def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
+def frame_times(recordings: Episode, speed: float) -> FloatArray:
     """The times of flight, s, that the frames of a film of several flights show."""
     last = max(float(recording.times[-1]) for recording in recordings)
     frames = np.arange(round((last / speed + HOLD) * FPS) + 1)
@@ -83,7 +88,7 @@ def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
 
 
 def film_frames(
-    recordings: Sequence[Recording], width: int, height: int, speed: float = 1.0
+    recordings: Episode, width: int, height: int, speed: float = 1.0
 ) -> Iterator[Image]:
     """The frames of a film, FPS of them a second, uint8 (height, width, 3), all of one size.
 
@@ -102,7 +107,7 @@ def film_frames(
 
 
 def following_cameras(
-    recordings: Sequence[Recording],
+    recordings: Episode,
     times: FloatArray,
     scale: float,
     forward: FloatArray,
@@ -114,17 +119,19 @@ def following_cameras(
     :param scale: the vehicles' size, in that of the default one.
     :param forward: the direction in which the cameras look, a unit vector, (3,), not vertical.
     """
+    reach = AHEAD * scale
+    points = []
+    # The vehicles, and their targets, or at most AHEAD of the way there along each axis.
+    for recording in recordings:
+        steps = recording.at(times)
+        vehicle = recording.state.position[steps]
+        way = recording.state.target[steps] - vehicle
+        points += [vehicle, vehicle + way.clip(-reach, reach)]
     # The share of a jump that the camera follows from one frame to the next.
     share = 1.0 - math.exp(-(times[1] - times[0]) / LAG)
     eye = None
-    for seconds in times:
-        points = []
-        # The vehicles, and their targets, or at most AHEAD of the way there along each axis.
-        for recording in recordings:
-            vehicle, target = recording.vehicle_and_target(recording.at(seconds))
-            way = np.clip(target - vehicle, -AHEAD * scale, AHEAD * scale)
-            points += [vehicle, vehicle + way]
-        camera = framing_camera(np.stack(points), MARGIN * scale, forward, lens)
+    for shown in np.stack(points, axis=1):
+        camera = framing_camera(shown, MARGIN * scale, forward, lens)
         if eye is not None:
             # The camera follows with a lag, so that a jump of the target is no jump of the picture.
             camera = camera._replace(eye=eye + share * (camera.eye - eye))
@@ -139,10 +146,10 @@ def _panel(
     font_size = max(12, round(lens.height / 26))
     with closing(Scene(recording.vehicle)) as scene:
         cameras = following_cameras([recording], times, scene.scale, forward, lens)
-        for seconds, camera in zip(times, cameras, strict=True):
-            step = recording.at(seconds)
-            scene.place([recording.pose(step)], recording.state.target[[step]])
-            picture = Pillow.fromarray(scene.picture(camera, recording.trails(step)))
+        for step, camera in zip(recording.at(times), cameras, strict=True):
+            pose = recording.pose(step)
+            scene.place([pose], pose.state[None, TARGET])
+            picture = scene.picture(camera, recording.trails(step))
             # A lost vehicle stands still from then on, in a picture without colours.
             if recording.lost and step == recording.state.n - 1:
                 picture = mark_lost(picture, recording.lost, 2 * font_size)
@@ -161,9 +168,7 @@ def _caption(recording: Recording, step: int) -> str:
     return caption
 
 
-def show_in_window(
-    episodes: Sequence[Sequence[Recording]], width: int, height: int, speed: float
-) -> None:
+def show_in_window(episodes: Sequence[Episode], width: int, height: int, speed: float) -> None:
     """Show episodes one after the other, until the window is shut; flights of one start together.
 
     :raises ConfigError: the window cannot be opened.
@@ -175,16 +180,16 @@ def show_in_window(
         scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
         start_drawing(client)
         for recordings in episodes:
-            _play(scene, recordings, Lens(width, height, WINDOW_SLOPE), speed)
+            _play(scene, recordings, Lens(width, height, WIDE), speed)
     except p.error:
         # PyBullet also raises when somebody shuts the window; that is how this ends.
-        if p.isConnected(client):
+        if client.isConnected():
             raise
     finally:
-        disconnect(client)
+        client.close()
 
 
-def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
+def _play(scene: Scene, recordings: Episode, lens: Lens, speed: float) -> None:
     times = frame_times(recordings, speed)
     cameras = following_cameras(recordings, times, scene.scale, outlook(recordings), lens)
     begun = time.perf_counter()
@@ -195,12 +200,7 @@ def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: floa
         if early < -1.0 / FPS:
             continue
         time.sleep(max(0.0, early))
-        poses = []
-        both = []
-        for recording in recordings:
-            step = recording.at(seconds)
-            poses.append(recording.pose(step))
-            both.append(recording.vehicle_and_target(step))
-        vehicles, targets = np.stack(both, axis=1)
-        scene.place(poses, targets)
-        point_window(scene.client, camera, vehicles.mean(axis=0))
+        poses = [recording.pose(recording.at(seconds)) for recording in recordings]
+        states = np.stack([pose.state for pose in poses])
+        scene.place(poses, states[:, TARGET])
+        point_window(scene.client, camera, states[:, POSITION].mean(axis=0))

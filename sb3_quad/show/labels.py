@@ -34,15 +34,15 @@ def with_header(
     """
     # The band is as high as its lines, with a margin above and below them.
     band = round((0.7 + STEP * (1 + len(lines))) * size)
-    bar = 0.45 * size
     image = ImageOps.expand(picture, (0, band, 0, 0), "white")
     draw = ImageDraw.Draw(image)
-    draw.rectangle((0, 0, bar, band - 1), fill=recording.colour)
+    bar = 0.45 * size
+    draw.rectangle((0, 0, bar, band - 1), recording.colour)
     column = bar + 0.7 * size
-    draw.text((column, 0.35 * size), recording.name, font=font(size, "DejaVuSans-Bold"), fill=INK)
+    draw.text((column, 0.35 * size), recording.name, INK, font(size, "DejaVuSans-Bold"))
+    small = font(round(SMALLER * size))
     for number, line in enumerate(lines, 1):
-        row = (0.35 + number * STEP) * size
-        draw.text((column, row), line, font=font(round(SMALLER * size)), fill=INK)
+        draw.text((column, (0.35 + number * STEP) * size), line, INK, small)
     return image
 
 

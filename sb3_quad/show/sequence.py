@@ -2,9 +2,7 @@
 Fig. A.1).
 """
 
-from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +11,10 @@ from PIL import ImageDraw
 
 from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering.camera import Camera, Lens, framing_camera
-from sb3_quad.envs.rendering.models import span
+from sb3_quad.envs.rendering.models import rotor_radius
 from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.show.episodes import Recording, landmarks, outlook
+from sb3_quad.show.episodes import Episode, Recording, landmarks, outlook
 from sb3_quad.show.labels import INK, PLATE, font, side_by_side, with_header
-from sb3_quad.simulation.state import QuadcopterState
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays within that of its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
@@ -43,7 +40,7 @@ class View(NamedTuple):
         return screen[:, :2], self.breadth * lens.height / (2.0 * lens.slope * screen[:, 2])
 
 
-def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
+def sequence(recordings: Episode, width: int, height: int) -> Image:
     """Draw one panel for each recording, all seen by the same camera, with as many poses as do not
     hide one another.
 
@@ -58,26 +55,23 @@ def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
 
 def until_settled(recording: Recording) -> Recording:
     """Return a flight without what follows once the vehicle stays at its target."""
-    n = int(np.flatnonzero(recording.state.distance > SETTLED).max(initial=-1)) + 2
     if recording.lost or recording.follows:
         return recording
-    return replace(
-        recording,
-        state=QuadcopterState(recording.state.array[:, :n]),
-        wrench=recording.wrench[:n],
-    )
+    last = int(np.flatnonzero(recording.state.distance > SETTLED).max(initial=-1)) + 1
+    return recording.until(last)
 
 
-def view_of(recordings: Sequence[Recording], lens: Lens) -> View:
+def view_of(recordings: Episode, lens: Lens) -> View:
     """Return the view that has all flights in its picture."""
     points = landmarks(recordings)
     forward = outlook(recordings)
-    breadth = 2.0 * span(recordings[0].vehicle)
+    vehicle = recordings[0].vehicle
+    breadth = 2.0 * (vehicle.arm_length + rotor_radius(vehicle))
     size = 1.0
     # A larger vehicle needs a camera farther away, from which it must be drawn larger.
     for _ in range(5):
         camera = framing_camera(points, 0.8 * size * breadth, forward, lens)
-        depth = float(np.median((points - camera.eye) @ camera.axes[0]))
+        depth = np.median((points - camera.eye) @ camera.axes[0])
         size = float(np.clip(VEHICLE_SHARE * 2.0 * lens.slope * depth / breadth, 1.0, LARGEST))
     return View(camera, size, size * breadth)
 
@@ -103,31 +97,20 @@ def _panel(recording: Recording, view: View) -> Pillow.Image:
     targets = recording.state.target[-1:] if recording.follows else recording.targets
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
-        picture = Pillow.fromarray(scene.picture(view.camera, recording.trails(recording.state.n)))
+        picture = scene.picture(view.camera, recording.trails(recording.state.n))
     # The texts grow with the picture, but stay legible in a small one.
     size = max(12, round(view.camera.lens.height / 34))
     draw_times(ImageDraw.Draw(picture, "RGBA"), recording, steps, view, round(0.92 * size))
-    return with_header(picture, recording, _explanation(recording, steps, view), size)
-
-
-def _explanation(recording: Recording, steps: list[int], view: View) -> list[str]:
-    """The lines of text above a panel."""
-    # The end of the flight comes first.
-    seconds = f"{recording.times[-1]:.2f} s"
-    distance = recording.state.distance[-1]
-    if recording.lost:
-        lines = [f"{recording.lost} after {seconds}"]
-    elif distance <= SETTLED and not recording.follows:
-        lines = [f"within {SETTLED:g} m of its target from {seconds} on"]
-    else:
-        lines = [f"{distance:.2f} m from its target after {seconds}"]
+    lines = [recording.end]
+    if not recording.lost and not recording.follows and recording.state.distance[-1] <= SETTLED:
+        lines = [f"within {SETTLED:g} m of its target from {recording.times[-1]:.2f} s on"]
     # Then whatever a reader could misunderstand: an enlarged vehicle, hoops and arrows.
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
     signs = "green line: path of the target" if recording.follows else "green hoops: target"
     if recording.wrench[steps].any():
         signs += "; arrows: force (red), torque (violet)"
-    return [*lines, signs]
+    return with_header(picture, recording, [*lines, signs], size)
 
 
 def draw_times(
@@ -139,22 +122,22 @@ def draw_times(
     :param size: of the font, pixels.
     """
     places, breadths = view.project(recording.state.position)
-    # What should not be covered, as boxes: the points of the path, the poses, and then the plates.
-    centres = places
-    halves = np.zeros(places.shape)
-    halves[steps] = COVERED * breadths[steps, None]
+    # What should not be covered: the points of the path, the poses, and then the plates. Each is a
+    # box, by its centre and half its size.
+    boxes = np.hstack([places, np.zeros_like(places)])
+    boxes[steps, 2:] = COVERED * breadths[steps, None]
     for step in steps:
         text = f"{recording.times[step]:.2f} s"
         half = 0.5 * np.array([font(size).getlength(text) + 0.7 * size, 1.5 * size])
         # The centre is clipped so that the whole plate is inside the picture.
-        around = places[step] + AROUND * (halves[step] + half)
+        around = places[step] + AROUND * (boxes[step, 2:] + half)
         around = np.clip(around, half, view.camera.lens[:2] - half)
-        covered = (halves + half - abs(centres - around[:, None])).clip(0.0).prod(axis=2)
+        overlaps = boxes[:, 2:] + half - abs(boxes[:, :2] - around[:, None])
+        covered = overlaps.clip(0.0).prod(axis=2)
         best = covered.sum(axis=1).argmin()
         if covered[best, len(places) :].any():
             continue
         centre = around[best]
-        centres = np.vstack([centres, centre])
-        halves = np.vstack([halves, half])
+        boxes = np.vstack([boxes, [*centre, *half]])
         draw.rounded_rectangle((*(centre - half), *(centre + half)), 0.3 * size, fill=PLATE)
         draw.text((centre[0], centre[1]), text, font=font(size), fill=INK, anchor="mm")

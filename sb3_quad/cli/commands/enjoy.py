@@ -142,12 +142,10 @@ def run(options: Namespace) -> int:
             options.n_envs,
         )
     )
-    for episode in episodes:
+    for number, episode in enumerate(episodes, 1):
         for flight in episode:
-            end = flight.lost or f"{flight.state.distance[-1]:.3f} m from its target"
-            print(
-                f"{flight.name}: {end} after {flight.times[-1]:.2f} s, reward {flight.reward:.2f}"
-            )
+            prefix = f"episode {number}, " if len(episodes) > 1 else ""
+            print(f"{prefix}{flight.name}: {flight.end}, reward {flight.results.reward[0]:.2f}")
     width, height = options.size
     for file in options.output:
         if file.lower().endswith(PICTURE):
