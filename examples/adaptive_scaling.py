@@ -124,7 +124,7 @@ def main() -> None:
     adapted = {}
     for spec in parse_controllers(options.controllers):
         controller = resolve_expert(spec.spec, scenario.nominal_vehicle(), "controller")
-        plain[spec.label] = summarise(fly_scenario(controller, scenario, own=spec.observed)[0])
+        plain[spec.label] = summarise(fly_scenario(controller, scenario, own=spec.observed))
         # An expert sees the true state, and no observation that could be scaled.
         if hasattr(controller, "actions"):
             continue
@@ -137,7 +137,7 @@ def main() -> None:
         print(f"{spec.label}: offset μ = ({mean[0]:.4f}, {mean[1]:.4f}, {mean[2]:.4f}) m")
         scaled = AdaptiveScaling(controller, mean, spec.observed["observation_std"])
         adapted[f"{spec.label} (adaptive)"] = summarise(
-            fly_scenario(scaled, scenario, own=spec.observed)[0]
+            fly_scenario(scaled, scenario, own=spec.observed)
         )
     metrics = plain | adapted
     columns = [Column(label) for label in metrics]

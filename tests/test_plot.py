@@ -122,7 +122,7 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
         (["agent={runs}/Env_1", "--show", "losses"], "losses: the runs' evaluations hold none"),
         (
             ["agent={runs}/Env_1", "--task", "target_tracking"],
-            "is not one of this run's eval_tasks",
+            "one for each of its eval_tasks",
         ),
     ],
 )

@@ -10,6 +10,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.evaluate import fly_scenario
+from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.scenarios.load import parse_suite
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -39,9 +40,10 @@ def test_it_recovers_about_each_axis_and_flies_a_metre_to_its_target(axis, vehic
     differ in their order.
     """
     scenario = tilted(axis, 40).model_copy(update={"vehicle": vehicle})
-    flights, tracks = fly_scenario(resolve_expert("raptor:Raptor", vehicle), scenario, recorded=4)
+    recorder = Recorder(4)
+    flights = fly_scenario(resolve_expert("raptor:Raptor", vehicle), scenario, hooks=[recorder])
     assert flights.success.all()
-    w, x, y, z = tracks["quaternion"][:, -1].T
+    w, x, y, z = recorder.arrays()["quaternion"][:, -1].T
     assert np.abs([x, y, z]).max() < 0.1 and np.abs(w).min() > 0.99  # it turns to its heading, too
 
 
@@ -50,7 +52,7 @@ def test_it_follows_what_it_sees_relative_to_a_moving_target(vehicle):
     entry = "{name: s, reference: {curve: figure_eight, speed: 1}, duration: 10, episodes: 2}"
     scenario = parse_suite(f"{{name: one, scenarios: [{entry}]}}", "x").scenarios[0]
     scenario = scenario.model_copy(update={"vehicle": vehicle})
-    flights, _ = fly_scenario(resolve_expert("raptor:Raptor", vehicle), scenario)
+    flights = fly_scenario(resolve_expert("raptor:Raptor", vehicle), scenario)
     assert (flights.rms_error < 0.06).all()
 
 

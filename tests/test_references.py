@@ -17,7 +17,7 @@ from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import evaluate, fly_scenario
-from sb3_quad.evaluation.flightlog import read_tracks
+from sb3_quad.evaluation.flightlog import Recorder, read_tracks
 from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.evaluation.following import FOLLOWED, Following
 from sb3_quad.evaluation.metric_tables import overview
@@ -323,7 +323,9 @@ def test_a_scenario_moves_its_own_target(backend):
     flown = scenario(
         "target: [5, 0, 15], reference: {curve: circle, speed: 3}, duration: 3, episodes: 2"
     )
-    flights, arrays = fly_scenario(GeometricExpert(), flown, backend, recorded=2)
+    recorder = Recorder(2)
+    flights = fly_scenario(GeometricExpert(), flown, backend, [recorder])
+    arrays = recorder.arrays()
     table = flown.reference.tracks(DT).table
     moved = (5.0, 0.0, 15.0) + table[:301:2, :3]
     np.testing.assert_allclose(arrays["target"][0], moved, atol=1e-5)
@@ -332,8 +334,8 @@ def test_a_scenario_moves_its_own_target(backend):
 
 def test_both_backends_measure_the_same():
     flown = scenario("reference: {curve: lissajous, heading: path}, duration: 3, episodes: 2")
-    batch, _ = fly_scenario(GeometricExpert(), flown)
-    pybullet, _ = fly_scenario(GeometricExpert(), flown, "pybullet")
+    batch = fly_scenario(GeometricExpert(), flown)
+    pybullet = fly_scenario(GeometricExpert(), flown, "pybullet")
     for name in FOLLOWED:
         np.testing.assert_allclose(getattr(batch, name), getattr(pybullet, name), atol=1e-7)
 
@@ -345,7 +347,7 @@ def test_both_backends_measure_the_same():
         ("reference: circle, target: {waypoints: [[1, 0, 15]]}", "no waypoints"),
         (
             "reference: {curve: polynomial, waypoints: [[0, 0, -14.95]]}",
-            "reference: goes down to z = 0.05 m",
+            "reference: touches the ground at z = 0.05 m",
         ),
         ("reference: missing.csv", "missing.csv"),
         ("reference: circle, vary: {reference.speed: [1, 2]}", "holds no keys"),
@@ -390,7 +392,7 @@ def results(tmp_path_factory):
 
 def test_tables_and_files_hold_the_errors(results):
     folder, flown = results
-    text = str(overview(flown, ["geometric"]))
+    text = "".join(map(str, overview(flown, ["geometric"])))
     for row in ("position error, rms, m", "lag, s", "heading error, rms, °"):
         assert row in text
     assert "settling" not in text and "final error" not in text

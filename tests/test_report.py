@@ -32,9 +32,9 @@ scenarios:
   - name: tracking
     target: {distance: 3}
     duration: 6
-    tolerances: [0.5, 1.0, 2.0]
+    tolerances: [0.5, 0.7, 0.8, 0.9, 1.0, 1.5, 2.0]
     episodes: 5
-    published: {expert: {success: 0.5, time_to: {0.5: 1.25, 1.0: null}, path: [2, 3]}}
+    published: {expert: {success: 0.5, time_to: {0.8: 1.25, 1.0: null}, path: [2, 3]}}
   - name: course
     target: {waypoints: [[0, 0, 15.5], [0, 0.5, 15.5]], radius: 0.4}
     duration: 2
@@ -136,6 +136,14 @@ def test_the_page_holds_the_results(folder, page):
     assert f"{100 * low:.1f} to {100 * high:.1f}" in text
     for number in ("1.25", "never", "2 to 3", "paper"):  # the published ones
         assert number in text
+
+
+def test_the_overview_shows_published_shares_and_what_varies_has_a_table_of_success(parts):
+    table = parts["overview"].tables[0]
+    assert table.columns[-1].heading == "paper: expert" and table.rows[0].cells[-1].text == "50"
+    (table,) = parts["noise"].tables
+    assert table.corner == "noise (relative std): success (%)"
+    assert [row.name for row in table.rows] == ["0", "0.1"]
 
 
 def test_nothing_in_the_page_leads_outside(page):

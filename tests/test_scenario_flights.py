@@ -13,7 +13,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.evaluate import fly_scenario
-from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
+from sb3_quad.evaluation.flightlog import Recorder, episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
@@ -29,6 +29,13 @@ def scenario(entry: str) -> Scenario:
 
 def hover(observation):
     return np.zeros((len(observation), 4), dtype=np.float32)
+
+
+def recorded(controller, flown, m, backend="batch"):
+    """Return the flights of a scenario, and the trajectories of the first m."""
+    recorder = Recorder(m)
+    flights = fly_scenario(controller, flown, backend, [recorder])
+    return flights, recorder.arrays()
 
 
 class OnObservations:
@@ -83,10 +90,7 @@ GUSTS = (
     ids=["mixed", "mixed, on observations", "recovery", "side hit", "gusts"],
 )
 def test_both_backends_fly_the_same(entry, controller):
-    flown = [
-        fly_scenario(controller, scenario(entry), backend, recorded=2)
-        for backend in ("batch", "pybullet")
-    ]
+    flown = [recorded(controller, scenario(entry), 2, backend) for backend in ("batch", "pybullet")]
     (batch, one), (bullet, two) = flown
     for column in (field.name for field in dataclasses.fields(Flights)):
         ours, theirs = (getattr(each, column) for each in (batch, bullet))
@@ -106,13 +110,13 @@ def test_both_backends_fly_the_same(entry, controller):
 
 def test_gusts_push_and_the_suite_of_changes_flies():
     calm, gusty = (
-        fly_scenario(PIDExpert(), scenario(f"randomize: {{gusts: {{std: {std}}}}}, duration: 4"))[0]
+        fly_scenario(PIDExpert(), scenario(f"randomize: {{gusts: {{std: {std}}}}}, duration: 4"))
         for std in (0, 3)
     )
     assert calm.final_error.max() < 1e-3 and gusty.final_error.min() > 0.01
     for each in load_suite("robustness").with_changes(episodes=2).scenarios:
         if each.group != "starts":
-            flights, _ = fly_scenario(
+            flights = fly_scenario(
                 PIDExpert(),
                 each.model_copy(update={"duration": 0.3, "wrenches": each.wrenches[:1]}),
             )
@@ -125,7 +129,7 @@ def test_episodes_are_those_of_the_task():
         .scenario("recovery")
         .model_copy(update={"episodes": 8, "duration": 2.0})
     )
-    ours, _ = fly_scenario(PIDExpert(), recovery)
+    ours = fly_scenario(PIDExpert(), recovery)
     plain = fly(PIDExpert(), "state_recovery", 8, seed_for("suite", recovery.seed), max_steps=200)
     for name in ("reward", "length", "path_length", "final_error", "start"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
@@ -137,7 +141,7 @@ def test_an_impulse_is_force_times_time(factor):
         f"{{start: 0.1, duration: 0.05, force: [6, 0, 0], torque: [0, 0, 0.01], factor: {factor}}}"
     )
     entry = f"noise: 0, duration: 0.5, episodes: 2, wrenches: [{push}]"
-    flights, log = fly_scenario(hover, scenario(entry), recorded=2)
+    flights, log = recorded(hover, scenario(entry), 2)
     np.testing.assert_allclose(log["velocity"][:, -1, 0], factor * 6 * 0.05 / 1.727, rtol=1e-4)
     np.testing.assert_allclose(
         log["body_rates"][:, -1, 2], factor * 0.01 * 0.05 / 0.00996, rtol=1e-3
@@ -153,7 +157,7 @@ def test_waypoints_are_flown_one_after_the_other():
         "target: {waypoints: [[0, 0, 17], [2, 0, 17], [2, 2, 16]], radius: 0.4}, "
         "duration: 20, episodes: 3"
     )
-    flights, log = fly_scenario(PIDExpert(), course, recorded=3)
+    flights, log = recorded(PIDExpert(), course, 3)
     assert (np.diff(flights.waypoint_times, axis=1) > 0).all()
     for row in range(3):
         assert [tuple(target) for target in dict.fromkeys(map(tuple, log["target"][row]))] == list(
@@ -169,8 +173,8 @@ def test_waypoints_are_flown_one_after_the_other():
 
 
 def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_path):
-    flights, log = fly_scenario(
-        lambda observation: hover(observation) - 1, scenario("episodes: 2, duration: 5"), recorded=2
+    flights, log = recorded(
+        lambda observation: hover(observation) - 1, scenario("episodes: 2, duration: 5"), 2
     )
     assert (
         flights.collision.all()
@@ -188,7 +192,7 @@ def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_
 
 
 def specified(name: str, episodes: int):
-    flights, _ = fly_scenario(
+    flights = fly_scenario(
         PIDExpert(), load_suite("thesis").scenario(name).model_copy(update={"episodes": episodes})
     )
     metrics = summarise(flights)

@@ -23,8 +23,8 @@ from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.picture import Trail, draw_trails
 from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.evaluation.scenarios.parts import Wrench
 from sb3_quad.evaluation.scenarios.sample import sample_wrenches
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.show import film, sequence
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
@@ -32,7 +32,6 @@ from sb3_quad.show.film import FPS, HOLD, film_frames, following_cameras, frame_
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.config import load_config
 from sb3_quad.training.runs import claim_run
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 HIT = {"start": 0.1, "duration": 0.02, "force": (-20, -20, 0), "torque": (-5, -5, -5)}
 VIDEO = importlib.util.find_spec("imageio_ffmpeg") is not None
@@ -54,9 +53,8 @@ def fall():
 def hit():
     """A hit on the way to a target."""
     setting = fixed_setting(FlightSettings(task="target_tracking", noise=0.0), target=(3, 0, 16))
-    wrenches = sample_wrenches(
-        [Wrench(**HIT)], load_vehicle("itm"), 1500, [np.random.default_rng(0)]
-    )
+    scenario = Scenario(name="hit", wrenches=[HIT])
+    wrenches = sample_wrenches(scenario, [np.random.default_rng(0)])
     plan = setting.plan(0)._replace(wrenches=wrenches)
     return flown(setting._replace(plan=lambda seed: plan), 60)
 

@@ -122,6 +122,17 @@ def _observed(settings: FlightSettings) -> StrDict:
     return observed
 
 
+def settings_of_model(model: Any) -> FlightSettings | None:
+    """Return what a model says about how it flies; None: it says nothing.
+
+    :raises ConfigError: what it says does not fit.
+    """
+    record = getattr(model, KEY, None)
+    if not isinstance(record, dict):
+        return None
+    return settings_of_record(record, f"{type(model).__name__}.{KEY}")
+
+
 def settings_of_record(record: Any, where: str) -> FlightSettings:
     """Return the settings that a zip or a model holds.
 
@@ -157,17 +168,6 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     if settings.reference is not None and settings.reference.curve == "file":
         settings = settings.model_copy(update={"reference": None})
     return settings
-
-
-def settings_of_model(model: Any) -> FlightSettings | None:
-    """Return the settings that a model holds; None: it holds none.
-
-    :raises ConfigError: they do not fit.
-    """
-    record = getattr(model, KEY, None)
-    if not isinstance(record, dict):
-        return None
-    return settings_of_record(record, f"{type(model).__name__}.{KEY}")
 
 
 def _settings_of_run(config: Path) -> FlightSettings:

@@ -107,15 +107,14 @@ def compare(
         seed = seed_for("table")
     seeds = episode_seeds(seed, n_flights)
     suite = load_suite("thesis")
-    published = [suite.scenario(name).published for name in THESIS_SCENARIOS.values()]
-    refuse_unknown("thesis column", thesis_columns, {*published[0], *published[1]})
+    published = [name for scenario in suite.scenarios for name in scenario.published]
+    refuse_unknown("thesis column", thesis_columns, {*published})
     own_reward = load_reward(reward)
     settings = _settings(controllers, env_kwargs)
-    pilots = {}
-    for label, how in settings.items():
-        pilots[label] = resolve_expert(
-            controllers[label], how.vehicle, "controller", layout=how.rotor_layout
-        )
+    pilots = {
+        label: resolve_expert(controllers[label], how.vehicle, "controller", how.rotor_layout)
+        for label, how in settings.items()
+    }
 
     comparison = Comparison()
     comparison.tables = []
@@ -136,7 +135,11 @@ def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, Flig
     shared: StrDict = {}
     own = {}
     for label, controller in controllers.items():
-        known = _own_settings(controller)
+        if isinstance(controller, (str, Path)):
+            path = agent_path(str(controller))
+            known = ControllerSpec(path, path).own
+        else:
+            known = settings_of_model(controller)
         if known is not None:
             # On another vehicle the agent still finds its rotors where it knows them.
             own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
@@ -151,14 +154,6 @@ def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, Flig
     for label in controllers:
         settings[label] = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
     return settings
-
-
-def _own_settings(controller: Any) -> FlightSettings | None:
-    """Return what a zip or a model says about how it flies; None: it says nothing."""
-    if isinstance(controller, (str, Path)):
-        path = agent_path(str(controller))
-        return ControllerSpec(path, path).own
-    return settings_of_model(controller)
 
 
 def _task_table(
@@ -181,14 +176,12 @@ def _task_table(
     if reference is not None:
         # Nothing is published of targets that move.
         scenario = scenario.model_copy(update={"reference": reference, "published": {}})
-    columns = [*map(Column, metrics)]
-    published = []
+    names = []
     if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):
-        for name in thesis_columns:
-            if name in scenario.published:
-                columns.append(Column(name, source="thesis"))
-                published.append(scenario.published[name])
-    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], published)
+        names = [name for name in thesis_columns if name in scenario.published]
+    columns = [*map(Column, metrics), *(Column(name, source="thesis") for name in names)]
+    cells = [*map(metric_cells, metrics.values())]
+    rows = metric_rows(scenario, cells, [scenario.published[name] for name in names])
 
     title = f"{task}: {n_flights} fresh episodes, the same for all"
     if not any(np.hstack(levels(how.noise)).any() for how in settings.values()):

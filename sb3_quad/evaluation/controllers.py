@@ -91,16 +91,25 @@ def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
 
     Without a label it is the spec; of a zip, the file's name.
 
-    :raises ConfigError: two controllers of the same label.
+    :raises ConfigError: two controllers of the same label, or a label that cannot be printed.
     """
     # Labels that differ may still be the same as names of files.
     specs: dict[str, ControllerSpec] = {}
-    for spec in map(_parse, texts):
-        who = f"controller {spec.label!r}"
-        if not spec.label.isprintable():
-            raise ConfigError(f"{who}: holds control characters; label it: name={spec.spec}")
-        if specs.setdefault(file_name(spec.label), spec) is not spec:
-            raise ConfigError(f"{who}: two have this label; label them: name={spec.spec}")
+    for text in texts:
+        label, equals, path = text.partition("=")
+        # An equals sign after a slash belongs to the path.
+        if not equals or {"/", "\\"} & {*label}:
+            label = Path(text).name.removesuffix(".zip").removesuffix(ENDING)
+            path = text
+        if not label or not path or not label.isprintable():
+            raise ConfigError(
+                f"controller {text!r}: write name=path with a printable name, or a path"
+            )
+        spec = ControllerSpec(label, agent_path(path))
+        if specs.setdefault(file_name(label), spec) is not spec:
+            raise ConfigError(
+                f"controller {label!r}: two have this label; label them: name={spec.spec}"
+            )
     return [*specs.values()]
 
 
@@ -135,14 +144,3 @@ def load_reward(reward: OwnReward) -> Reward | None:
     if not callable(function):
         raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
     return function  # type: ignore[no-any-return]
-
-
-def _parse(text: str) -> ControllerSpec:
-    label, equals, spec = text.partition("=")
-    # An equals sign after a slash belongs to the path.
-    if not equals or {"/", "\\"} & {*label}:
-        label = Path(text).name.removesuffix(".zip").removesuffix(ENDING)
-        return ControllerSpec(label, agent_path(text))
-    if not label or not spec:
-        raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
-    return ControllerSpec(label, agent_path(spec))

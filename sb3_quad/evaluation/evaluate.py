@@ -4,22 +4,29 @@ folder of its own.
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import as_completed
-from contextlib import nullcontext
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
-from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
+from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
-from sb3_quad.evaluation.flights import Flights, OwnReward, Reward, fly_settings
+from sb3_quad.evaluation.flights import (
+    Flights,
+    Hook,
+    OwnReward,
+    Reward,
+    fly_settings,
+    reward_name,
+)
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
     FLIGHTS,
@@ -29,13 +36,13 @@ from sb3_quad.evaluation.results import (
     Entry,
     Failure,
     Results,
-    flights_path,
+    file_name,
     load_results,
     write_episodes,
 )
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
-from sb3_quad.executors import Executor, start_executor
+from sb3_quad.executors import start_executor
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
@@ -61,14 +68,6 @@ class Job(NamedTuple):
     def name(self) -> tuple[str, str]:
         """Scenario and controller, as :class:`~sb3_quad.evaluation.results.Entry` has it."""
         return self.scenario.name, self.spec.label
-
-    @property
-    def repeats(self) -> bool:
-        """Whether the flights are sure to be the same again.
-
-        Code outside of this package may have changed: a factory's, and that of an own reward.
-        """
-        return self.spec.kind != "factory" and self.reward is None
 
 
 def evaluate(
@@ -117,17 +116,18 @@ def evaluate(
     jobs = [
         Job(spec, scenario, backend, reward) for scenario in suite.scenarios for spec in records
     ]
+    reward_as_named = reward_name(reward)
     results = Results(
         suite=suite.name,
         description=suite.description,
         source=suite.source,
-        reward=_name_of(reward),
+        reward=reward_as_named,
         package_version=__version__,
         controllers=[*records.values()],
         scenarios=suite.scenarios,
         entries=[],
         failures=failures,
-        digest=_digest(jobs, records),
+        digest=_digest(suite, records, backend, reward_as_named),
     )
     place = Path(folder)
     # Without a controller there is nothing to write, and no folder.
@@ -145,27 +145,28 @@ def _load_controllers(
     """Load the controllers; report those that fly another vehicle than they were trained on."""
     records = {}
     failures = []
-    vehicles = {}
+    flown = {}
     for spec in specs:
         try:
             record = controller_record(spec)
+            vehicles = [_vehicle(spec, scenario) for scenario in suite.scenarios]
             # Several scenarios give the same notice, or an empty one: report it once.
-            notices = {spec.notice(_vehicle(spec, scenario)): "" for scenario in suite.scenarios}
+            notices = dict.fromkeys(map(spec.notice, vehicles))
         except SB3QuadError as error:
-            failures.append(_failure(spec.label, None, error))
+            failures.append(_failure((None, spec.label), error))
             continue
         records[spec] = record
         for notice in filter(None, notices):
             report(notice)
         # All fly the vehicle that a scenario names.
-        for scenario in suite.scenarios:
+        for scenario, vehicle in zip(suite.scenarios, vehicles, strict=True):
             if scenario.vehicle is None:
-                vehicles[spec.label] = _vehicle(spec, scenario).name
+                flown[spec.label] = vehicle.name
     if any(scenario.published and scenario.vehicle is None for scenario in suite.scenarios):
-        vehicles["the published one"] = DEFAULT_VEHICLE
-    if len({*vehicles.values()}) > 1:
-        flown = ", ".join(map(" flies ".join, vehicles.items()))
-        report(f"not all fly the same vehicle: {flown}; --vehicle gives all of them one")
+        flown["the published one"] = DEFAULT_VEHICLE
+    if len({*flown.values()}) > 1:
+        who = ", ".join(map(" flies ".join, flown.items()))
+        report(f"not all fly the same vehicle: {who}; --vehicle gives all of them one")
     return records, failures
 
 
@@ -184,12 +185,9 @@ def _fly_missing(
     done = {entry.name for entry in results.entries}
     missing = [job for job in jobs if job.name not in done]
     progress(len(done), len(jobs), "")
-    pool: Any = nullcontext()
-    if executor != "local" or min(workers, len(missing)) > 1:
-        pool = start_executor(executor, workers, address)
-    unfinished = results.model_copy(update={"finished": False})
-    with pool as working:
-        for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
+    # Closed, so that the workers end at once where an outcome cannot be written.
+    with closing(_fly_jobs(missing, workers, executor, address)) as flown:
+        for number, (job, outcome) in enumerate(flown, len(done) + 1):
             if isinstance(outcome, Failure):
                 results.failures.append(outcome)
             else:
@@ -198,42 +196,32 @@ def _fly_missing(
                 results.entries.append(entry)
                 results.entries.sort(key=lambda entry: order.index(entry.name))
                 # After each job, so that an interrupted evaluation can resume.
-                _write(place, unfinished)
+                results.write(place, finished=False)
             progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
     if results.entries:
         write_episodes(place, results.entries)
-        _write(place, results)
+        results.write(place, finished=True)
     return results
-
-
-def _write(place: Path, results: Results) -> None:
-    write_text(place / RESULTS, results.model_dump_json(indent=2))
 
 
 def fly_scenario(
     controller: Any,
     scenario: Scenario,
     backend: str = "batch",
-    recorded: int | None = 0,
+    hooks: Sequence[Hook] = (),
     own: StrMapping | None = None,
     reward: Reward | None = None,
-) -> tuple[Flights, Arrays]:
+) -> Flights:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
 
     :param controller: as :func:`~sb3_quad.evaluation.flights.fly` takes it, as is ``reward``.
-    :param recorded: flights to sample; None: all of a scenario that is the same each time, the
-        first few of others.
+    :param hooks: are called along the first flights, at most ``PART_SIZES``.
     :param own: settings that go with the controller: its ``FlightSettings.observed``.
-    :return: the metrics, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
     :raises ConfigError: an unknown backend, or a controller of an unknown kind.
     :raises ControllerError: a controller or reward that fails in flight.
     """
     seeds = scenario.episode_seeds()
     settings = scenario.flown_as.with_changes(**(own or {}))
-    if recorded is None:
-        recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
-    recorder = Recorder(recorded)
-    hooks = [recorder]
     parts = []
     size = PART_SIZES.get(backend, 1)
     for first in range(0, len(seeds), size):
@@ -250,9 +238,8 @@ def fly_scenario(
                 reward=reward,
             )
         )
-        # Only flights of the first part are recorded.
-        hooks = []
-    return Flights.concatenate(parts), recorder.arrays()
+        hooks = ()
+    return Flights.concatenate(parts)
 
 
 def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
@@ -266,16 +253,13 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
     try:
         scenario = job.scenario.flown_by(own and own.vehicle)
         controller = resolve_expert(job.spec.spec, scenario.nominal_vehicle(), "controller")
-        flights, trajectories = fly_scenario(
-            controller,
-            scenario,
-            job.backend,
-            recorded=None,
-            own=job.spec.observed,
-            reward=load_reward(job.reward),
+        recorder = Recorder(RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM)
+        reward = load_reward(job.reward)
+        flights = fly_scenario(
+            controller, scenario, job.backend, [recorder], job.spec.observed, reward
         )
     except SB3QuadError as error:
-        return _failure(job.spec.label, job.scenario.name, error)
+        return _failure(job.name, error)
     entry = Entry(
         controller=job.spec.label,
         scenario=scenario.name,
@@ -285,27 +269,30 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         metrics=summarise(flights),
         physical_limit=scenario.physical_limit,
-        flights=flights_path(job.spec.label, scenario.name),
+        flights=f"{FLIGHTS}/{file_name(job.spec.label)}/{scenario.name}.npz",
     )
-    return entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories}
+    return entry, {**episode_arrays(flights, scenario.episode_seeds()), **recorder.arrays()}
 
 
-def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tuple[Job, Any]]:
+def _fly_jobs(
+    jobs: Sequence[Job], workers: int, executor: str, address: str | None
+) -> Generator[tuple[Job, Any], None, None]:
     """Fly jobs and yield each when it is done: in this process, or in an executor's workers.
 
     A job whose worker process ends, by a crash or too little memory, becomes a :class:`Failure`.
     """
-    if executor is None:
+    if executor == "local" and min(workers, len(jobs)) <= 1:
         for job in jobs:
             yield job, fly_job(job)
         return
-    submitted = {executor.submit(fly_job, job): job for job in jobs}
-    for future in as_completed(submitted):
-        job = submitted[future]
-        try:
-            yield job, future.result()
-        except WorkerDied as error:
-            yield job, _failure(job.spec.label, job.scenario.name, error)
+    with start_executor(executor, workers, address) as pool:
+        submitted = {pool.submit(fly_job, job): job for job in jobs}
+        for future in as_completed(submitted):
+            job = submitted[future]
+            try:
+                yield job, future.result()
+            except WorkerDied as error:
+                yield job, _failure(job.name, error)
 
 
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
@@ -339,7 +326,8 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
             if file in made:
                 file.unlink()
         return []
-    kept = {job.name for job in jobs if job.repeats}
+    # Code outside of this package may have changed: a factory's, and that of an own reward.
+    kept = {job.name for job in jobs if job.spec.kind != "factory" and job.reward is None}
     if before.digest != digest or (before.finished and len(kept) < len(jobs)):
         raise ConfigError(
             f"{folder}: holds results already; give another folder with -o,"
@@ -348,30 +336,27 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
     return [entry for entry in before.entries if entry.name in kept]
 
 
-def _digest(jobs: Sequence[Job], records: Mapping[ControllerSpec, ControllerRecord]) -> str:
+def _digest(
+    suite: Suite, records: Mapping[ControllerSpec, ControllerRecord], backend: str, reward: str
+) -> str:
     """Hash all inputs of the flights, the sources of this package included (SHA-256)."""
     digest = hashlib.sha256()
     # The environments lie next to the package in a checkout, inside it when installed.
     for folder in (Path(__file__).parents[1], Path(registration.__file__).parent):
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
             digest.update(path.read_bytes())
-    for job in jobs:
-        # The text of a function has its address, which is another one in each process.
-        named = job._replace(reward=_name_of(job.reward))
-        inputs = named, records[job.spec], job.spec.own, _vehicle(job.spec, job.scenario)
-        digest.update(repr(inputs).encode())
-        reference = job.scenario.reference
-        if reference and reference.file:
-            digest.update(Path(reference.file).read_bytes())
+    own = [(spec.own, spec.own and first_vehicle(spec.own.vehicle)) for spec in records]
+    digest.update(repr((suite, records, own, backend, reward)).encode())
+    for scenario in suite.scenarios:
+        if scenario.reference and scenario.reference.file:
+            digest.update(Path(scenario.reference.file).read_bytes())
     return digest.hexdigest()
 
 
-def _name_of(reward: OwnReward) -> str:
-    if reward is None or isinstance(reward, str):
-        return reward or ""
-    return str(getattr(reward, "__name__", type(reward).__name__))
+def _failure(name: tuple[str | None, str], error: SB3QuadError) -> Failure:
+    """Return the record of an error, in one line.
 
-
-def _failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:
-    """Return the record of an error, in one line; scenario None: the controller did not load."""
+    :param name: of the job; without a scenario the controller did not load.
+    """
+    scenario, controller = name
     return Failure(controller=controller, scenario=scenario, message=" ".join(str(error).split()))

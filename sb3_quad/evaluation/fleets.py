@@ -69,7 +69,6 @@ class PyBulletFleet(Fleet):
 
     def begin(self, start: Mapping[str, FloatArray]) -> Float32Array:
         super().begin(start)
-        self.clear_outcome()
         for row, env in enumerate(self._envs):
             # The target, which is no part of an environment's state, matters to the score only.
             state = {name: values[row] for name, values in start.items() if name != "target"}

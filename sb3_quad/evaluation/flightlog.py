@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_quad.base.files import read_arrays
-from sb3_quad.base.types import Arrays, BoolArray, Float32Array, FloatArray, StrPath
+from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, StrPath
 from sb3_quad.evaluation.flights import Flights, Hook
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.supervisor import SUPERVISED
@@ -25,8 +25,8 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
 OUTCOMES = ("success", "missed", "collision", "out_of_range")
-# How a flight ended that was lost, in words.
-LOST = {"collision": "touches the ground", "out_of_range": "leaves the range"}
+# How a flight ends that is lost.
+LOST = OUTCOMES[2:]
 STATES = ("position", "quaternion", "velocity", "body_rates", "target")
 # Fields of Flights that become arrays of the same name.
 EPISODES = (
@@ -58,7 +58,7 @@ class Recorder(Hook):
         self._samples = np.zeros(min(self._m, state.n), dtype=np.int64)
         self._wrench = np.zeros((len(self._samples), 6))
         # No action has been given at the start.
-        self._sample(state, np.full((state.n, 4), np.nan, np.float32), np.ones(state.n, bool))
+        self._sample(state, np.full((state.n, 4), np.nan), np.ones(state.n, bool))
 
     def before_step(
         self,
@@ -83,29 +83,26 @@ class Recorder(Hook):
         if step % self._stride == 0:
             self._sample(state, actions, flying)
 
-    def _sample(self, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+    def _sample(self, state: QuadcopterState, actions: AnyArray, flying: BoolArray) -> None:
         rows = flying[: self._m]
         values = {name: getattr(state, name) for name in STATES}
         values["action"] = actions
         values["wrench"] = self._wrench / self._stride
         for name, array in values.items():
-            shown = np.where(rows[:, None], array[: self._m], np.nan)
-            values[name] = shown.astype(np.float32)
+            values[name] = np.where(rows[:, None], array[: self._m], np.nan)
         self._log.append(values)
         self._samples[rows] = len(self._log)
         self._wrench[:] = 0.0
 
     def arrays(self) -> Arrays:
-        """Return the arrays of trajectories, as long as the longest flight; none if ``m`` is 0."""
-        if self._m == 0:
-            return {}
+        """Return the arrays of trajectories, as long as the longest flight."""
         log = self._log[: self._samples.max(initial=1)]
         arrays: Arrays = {
             "time": np.arange(len(log)) * (self._stride * self._control_step),
             "samples": self._samples,
         }
         for name in log[0]:
-            arrays[name] = np.stack([sample[name] for sample in log], axis=1)
+            arrays[name] = np.stack([sample[name] for sample in log], axis=1).astype(np.float32)
         return arrays
 
 
@@ -137,7 +134,7 @@ class Track(NamedTuple):
     target: Float32Array
     # (k, 6), mean since the sample before: force, world frame, N; torque, body frame, N m
     wrench: Float32Array
-    lost: str  # how it was lost, empty if it was not
+    lost: bool
 
     @property
     def error(self) -> FloatArray:
@@ -158,7 +155,7 @@ def read_tracks(path: StrPath) -> list[Track]:
     """
     arrays = read_arrays(path)
     tracks = []
-    for number, samples in enumerate(arrays.get("samples", ())):
+    for number, samples in enumerate(arrays["samples"]):
         flown = slice(samples)
         tracks.append(
             Track(
@@ -166,7 +163,7 @@ def read_tracks(path: StrPath) -> list[Track]:
                 arrays["position"][number, flown],
                 arrays["target"][number, flown],
                 arrays["wrench"][number, flown],
-                LOST.get(str(arrays["episode_outcome"][number]), ""),
+                str(arrays["episode_outcome"][number]) in LOST,
             )
         )
     return tracks

@@ -14,15 +14,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, unknown
+from sb3_quad.base.errors import ControllerError, raised_as, refuse_unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict, StrPath
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
 from sb3_quad.controllers.agent_settings import settings_of_model, unlike_trained
 from sb3_quad.controllers.controller import Controller, warn_of_vehicle
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.batch_env import quadcopter_spaces
-from sb3_quad.evaluation.fleets import FLEETS, Fleet
+from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.evaluation.supervisor import Supervisor
@@ -106,15 +106,17 @@ class Flights:
     @staticmethod
     def concatenate(parts: Sequence["Flights"]) -> "Flights":
         """Join several parts in their order."""
-        columns: StrDict = {}
-        for name, first in vars(parts[0]).items():
-            values = [getattr(part, name) for part in parts]
-            if isinstance(first, Mapping):
-                arrays = zip(*[value.values() for value in values], strict=True)
-                columns[name] = dict(zip(first, map(np.concatenate, arrays), strict=True))
-            else:
-                columns[name] = np.concatenate(values)
-        return Flights(**columns)
+        return Flights(**_joined([vars(part) for part in parts]))
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Join arrays, also those within mappings."""
+    if not isinstance(parts[0], Mapping):
+        return np.concatenate(parts)
+    joined = {}
+    for key in parts[0]:
+        joined[key] = _joined([part[key] for part in parts])
+    return joined
 
 
 def arrival_tolerance(tolerances: Iterable[float]) -> float:
@@ -201,13 +203,20 @@ def fly(
     limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
     layout = environment.get("rotor_layout")
     controller = resolve_expert(controller, vehicle, "controller", layout)
-    # A model flies with its rotors where it knows them.
     own = settings_of_model(controller)
+    # A model flies with its rotors where it knows them.
     if layout is None and own is not None:
         environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", max_steps)
     settings = FlightSettings().with_changes(task=task, vehicle=vehicle, noise=noise, **environment)
-    _warn_if_unlike(controller, own, settings)
+    # A distribution has no particular vehicle.
+    if settings.vehicles is None:
+        warn_of_vehicle(controller, settings.load_vehicles())
+        if own is not None:
+            name = type(controller).__name__
+            notice = unlike_trained(name, own, first_vehicle(settings.vehicle))
+            if notice:
+                warnings.warn(f"{notice}; give **env_kwargs(the agent)", stacklevel=2)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
@@ -222,19 +231,7 @@ def episode_seeds(seed: int, n_flights: int) -> list[int]:
     return row_seeds(whole_number("seed", seed, 0, LARGEST_SEED), n)
 
 
-def _warn_if_unlike(controller: Any, own: FlightSettings | None, settings: FlightSettings) -> None:
-    """Warn of an agent or an expert of another vehicle than it flies."""
-    # A distribution has no particular vehicle.
-    if settings.vehicles is not None:
-        return
-    flown = settings.load_vehicles()
-    warn_of_vehicle(controller, flown)
-    if own is not None:
-        notice = unlike_trained(type(controller).__name__, own, first_vehicle(settings.vehicle))
-        if notice:
-            warnings.warn(f"{notice}; give **env_kwargs(the agent)", stacklevel=3)
-
-
+# It is long because a split would hand over a dozen arrays that each step changes.
 def fly_settings(
     controller: Any,
     settings: FlightSettings,
@@ -252,140 +249,122 @@ def fly_settings(
     :param plan: what happens to the episodes along the way.
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
-    if backend not in FLEETS:
-        raise ConfigError(unknown("backend", backend, FLEETS))
+    refuse_unknown("backend", [backend], FLEETS)
+    plan = plan or Plan()
+    if isinstance(reward, type):
+        # A reward that remembers, such as the last actions, begins afresh with these episodes.
+        reward = reward()
     with closing(FLEETS[backend](seeds, settings)) as fleet:
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
             controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic
         )
-        if isinstance(reward, type):
-            # A reward that remembers, such as the last actions, begins afresh with these episodes.
-            reward = reward()
-        steps = settings.longest_episode
-        return _fly_fleet(fleet, pilot, plan or Plan(), steps, tolerances, hooks, reward, record)
-
-
-# It is long because a split would hand over a dozen arrays that each step changes.
-def _fly_fleet(
-    fleet: Fleet,
-    controller: Controller,
-    plan: Plan,
-    max_steps: int,
-    tolerances: Sequence[float],
-    hooks: Sequence[Hook],
-    reward: Reward | None,
-    record: StrPath | None,
-) -> Flights:
-    vehicle = fleet.vehicle_list[0]
-    observation = fleet.begin(plan.start)
-    # The state is a live view: copy what later steps need.
-    state = fleet.true_state()
-    start = state.copy()
-    position = start.position
-    course = Waypoints(plan, fleet.n)
-    distance = state.distance
-    arrivals = Arrivals(tolerances, course.to_last(distance))
-    motion = Motion(start, vehicle.control_step)
-    following = Following(fleet.n, vehicle.control_step)
-    supervisor = Supervisor(fleet.vehicle_list)
-    if len(plan.waypoints):
-        # A course has no single straight line to deviate from.
-        motion.cross_track_error[:] = np.nan
-    flying = np.ones(fleet.n, bool)  # a flight survives until it is lost
-    collision = np.zeros(fleet.n, bool)
-    length = np.zeros(fleet.n, np.int64)
-    path_length = np.zeros(fleet.n)
-    total = np.zeros(fleet.n)
-    own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
-    observed = []  # for ``record``, as is ``acted``
-    acted = []
-    for hook in hooks:
-        hook.on_start(state, vehicle)
-
-    for step in range(1, max_steps + 1):
-        time = step * vehicle.control_step
-        # Disturbances of the plan begin and end between two control steps.
-        if step - 1 in plan.wrenches:
-            fleet.wrench[:] = plan.wrenches[step - 1].T
-        try:
-            actions = controller.actions(observation, flying)
-        except ControllerError as error:
-            before = time - vehicle.control_step
-            raise ControllerError(f"{error}, after {before:.2f} s") from error
-        for hook in hooks:
-            hook.before_step(state, observation, fleet.total_wrench().T, flying)
-        if record is not None:
-            observed.append(observation[flying])
-            # The environment clips them, too.
-            acted.append(actions[flying].clip(-1.0, 1.0))
-        observation, rewards, _ = fleet.step(actions)
+        vehicle = fleet.vehicle_list[0]
+        observation = fleet.begin(plan.start)
+        # The state is a live view: copy what later steps need.
         state = fleet.true_state()
-
-        # This step counts also for the flights that it has ended; their distance stays.
-        length += flying
-        collision |= flying & fleet.outcome["collision"]
-        np.copyto(distance, fleet.outcome["distance"], where=flying)
-        total += np.where(flying, rewards, 0.0)
-        if reward is not None:
-            own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
-        way = np.linalg.norm(state.position - position, axis=1)
-        path_length += np.where(flying, way, 0.0)
-        position = state.position.copy()
-        arrivals.update(time, course.to_last(distance))
-
-        # From here on, only the flights that continue count.
-        flying &= fleet.outcome["truncated"]
-        motion.update(step, state, flying)
-        supervisor.update(state, flying)
-        if fleet.moves:
-            following.update(step, state, flying)
+        start = state.copy()
+        position = start.position
+        fleet.clear_outcome()
+        # What became of the flights so far; of a lost one it stays as it is then.
+        outcome = fleet.outcome.copy()
+        distance = outcome["distance"]
+        flying = outcome["truncated"].copy()  # a flight survives until it is lost
+        course = Waypoints(plan, fleet.n)
+        arrivals = Arrivals(tolerances, np.where(course.on_last, distance, np.inf))
+        motion = Motion(start, vehicle.control_step)
+        following = Following(fleet.n, vehicle.control_step)
+        supervisor = Supervisor(fleet.vehicle_list)
+        total = np.zeros(fleet.n)
+        own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
+        path_length = np.zeros(fleet.n)
+        observed = []  # for ``record``, as is ``acted``
+        acted = []
         for hook in hooks:
-            hook.after_step(step, state, actions, flying)
-        if not flying.any():
-            break
-        if len(plan.waypoints):
+            hook.on_start(state, vehicle)
+
+        for step in range(1, settings.longest_episode + 1):
+            time = step * vehicle.control_step
+            # Disturbances of the plan begin and end between two control steps.
+            if step - 1 in plan.wrenches:
+                fleet.wrench[:] = plan.wrenches[step - 1].T
+            try:
+                actions = pilot.actions(observation, flying)
+            except ControllerError as error:
+                before = time - vehicle.control_step
+                raise ControllerError(f"{error}, after {before:.2f} s") from error
+            for hook in hooks:
+                hook.before_step(state, observation, fleet.total_wrench().T, flying)
+            if record is not None:
+                observed.append(observation[flying])
+                # The environment clips them, too.
+                acted.append(actions[flying].clip(-1.0, 1.0))
+            observation, rewards, _ = fleet.step(actions)
+            state = fleet.true_state()
+
+            # This step counts also for the flights that it has ended.
+            outcome[flying] = fleet.outcome[flying]
+            total += np.where(flying, rewards, 0.0)
+            if reward is not None:
+                own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
+            way = np.linalg.norm(state.position - position, axis=1)
+            path_length += np.where(flying, way, 0.0)
+            position = state.position.copy()
+            arrivals.update(time, np.where(course.on_last, distance, np.inf))
+
+            # From here on, only the flights that continue count.
+            flying = outcome["truncated"].copy()
+            motion.update(step, state, flying)
+            supervisor.update(state, flying)
+            if fleet.moves:
+                following.update(step, state, flying)
+            for hook in hooks:
+                hook.after_step(step, state, actions, flying)
+            if not flying.any():
+                break
             # Whoever has reached a waypoint sees the next one from the next step on.
             onward = course.update(time, distance, flying)
             if onward.size:
-                fleet.state[TARGET, onward] = course.targets(onward).T
+                fleet.state[TARGET, onward] = plan.waypoints[course.next[onward]].T
                 observation = fleet.observe()
 
-    if record is not None:
-        write_arrays(record, observations=np.concatenate(observed), actions=np.concatenate(acted))
-    # A flight that was lost, or that did not get to its last target, has no success and no time
-    # after which it stays there.
-    settling_time = np.where(flying, arrivals.settling_time, np.nan)
-    offset = state.position - state.target
-    return Flights(
-        success=fleet.outcome["success"] & flying & course.on_last,
-        survival=flying,
-        collision=collision,
-        reward=total,
-        own_reward=own_total,
-        length=length,
-        flown=length.astype(np.float64) * vehicle.control_step,
-        time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
-        settling_time=dict(zip(tolerances, settling_time, strict=True)),
-        overshoot=arrivals.overshoot,
-        path_length=path_length,
-        final_error=distance,
-        final_offset=np.where(flying[:, None], offset, np.nan),
-        recovery_time=motion.recovery_time,
-        cross_track_error=np.where(following.moves, np.nan, motion.cross_track_error),
-        **following.errors(flying),
-        cut_by_supervisor=supervisor.cut,
-        low_force_time=supervisor.longest,
-        waypoint_times=course.times,
-        start=start.array[:13].T,
-        target=start.target,
-    )
+        if record is not None:
+            write_arrays(
+                record, observations=np.concatenate(observed), actions=np.concatenate(acted)
+            )
+        # A flight that was lost has no time after which it stays at its target.
+        settling_time = np.where(flying, arrivals.settling_time, np.nan)
+        offset = state.position - state.target
+        # Neither a course nor a target that moves has a straight line to deviate from.
+        has_no_line = following.moves | (plan.waypoints.size > 0)
+        return Flights(
+            success=outcome["success"] & course.on_last,
+            survival=flying,
+            collision=outcome["collision"],
+            reward=total,
+            own_reward=own_total,
+            length=outcome["length"],
+            flown=outcome["length"] * vehicle.control_step,
+            time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
+            settling_time=dict(zip(tolerances, settling_time, strict=True)),
+            overshoot=arrivals.overshoot,
+            path_length=path_length,
+            final_error=distance,
+            final_offset=np.where(flying[:, None], offset, np.nan),
+            recovery_time=motion.recovery_time,
+            cross_track_error=np.where(has_no_line, np.nan, motion.cross_track_error),
+            **following.errors(flying),
+            cut_by_supervisor=supervisor.cut,
+            low_force_time=supervisor.longest,
+            waypoint_times=course.times,
+            start=start.array[:13].T,
+            target=start.target,
+        )
 
 
 def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -> FloatArray:
     """Return the rewards of a function of the user's, which may do anything, as (n,) numbers."""
-    # Instances of a class have no name of their own.
-    name = f"reward {getattr(reward, '__name__', type(reward).__name__)}"
+    name = f"reward {reward_name(reward)}"
     with raised_as(ControllerError, f"{name}: fails"):
         values = np.asarray(reward(state, actions), dtype=np.float64)
     if values.shape != (state.n,):
@@ -394,6 +373,14 @@ def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -
     if wrong.size:
         raise ControllerError(f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite")
     return values
+
+
+def reward_name(reward: OwnReward) -> str:
+    """Return the name of a reward of your own; empty without any."""
+    if reward is None or isinstance(reward, str):
+        return reward or ""
+    # Instances of a class have no name of their own.
+    return str(getattr(reward, "__name__", type(reward).__name__))
 
 
 class Arrivals:
@@ -409,13 +396,14 @@ class Arrivals:
 
     def __init__(self, tolerances: Sequence[float], distance: FloatArray) -> None:
         self._limits = np.array(tolerances)[:, None]
-        self.time_to = np.where(distance <= self._limits, 0.0, np.nan)
+        self.time_to = np.full((len(tolerances), len(distance)), np.nan)
         self.settling_time = self.time_to.copy()
-        self._first = np.full(len(distance), np.nan)
+        self.overshoot = np.full(len(distance), np.nan)
+        self._first = self.overshoot.copy()
         if tolerances:
             # A view, which shows the arrivals that follow.
             self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
-        self.overshoot = np.where(np.isnan(self._first), np.nan, distance)
+        self.update(0.0, distance)
 
     def update(self, time: float, distance: FloatArray) -> None:
         """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s.
@@ -424,50 +412,37 @@ class Arrivals:
         """
         inside = distance <= self._limits
         np.fmin(self.time_to, np.where(inside, time, np.nan), out=self.time_to)
-        self.settling_time = _since(self.settling_time, inside, time)
-        arrived = ~np.isnan(self._first)
+        since = np.fmin(self.settling_time, time)
+        self.settling_time = np.where(inside, since, np.nan)
+        arrived = np.isfinite(self._first)
         np.fmax(self.overshoot, distance, out=self.overshoot, where=arrived)
-
-
-def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
-    """Return since when a condition has held, given that it ``holds`` now; else NaN."""
-    return np.where(holds, np.fmin(times, time), np.nan)
 
 
 class Waypoints:
     """The waypoints of n flights: which of them each has reached, and when.
 
-    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet.
+    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet. ``next`` (n,): the
+    number of the present one.
     """
 
     def __init__(self, plan: Plan, n: int) -> None:
-        self._plan = plan
-        self._next = np.zeros(n, dtype=np.int64)
+        self._radius = plan.radius
         self._count = len(plan.waypoints)
+        self.next = np.zeros(n, dtype=np.int64)
         self.times = np.full((n, self._count), np.nan)
 
     def update(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
-        near = flying & (distance <= self._plan.radius)
-        reached = np.flatnonzero(near & (self._next < self._count))
-        self.times[reached, self._next[reached]] = time
-        self._next[reached] += 1
-        return reached[self._next[reached] < self._count]
+        near = flying & (distance <= self._radius)
+        reached = np.flatnonzero(near & (self.next < self._count))
+        self.times[reached, self.next[reached]] = time
+        self.next[reached] += 1
+        return reached[self.next[reached] < self._count]
 
     @property
     def on_last(self) -> BoolArray:
         """Whether the present target is the last one, (n,); always without waypoints."""
-        return self._next >= self._count - 1
-
-    def to_last(self, distance: FloatArray) -> FloatArray:
-        """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
-        if not self._count:
-            return distance
-        return np.where(self.on_last, distance, np.inf)
-
-    def targets(self, rows: IntArray) -> FloatArray:
-        """The present waypoints of some rows, (len(rows), 3), m."""
-        return self._plan.waypoints[self._next[rows]]
+        return self.next >= self._count - 1
 
 
 class Motion:
@@ -501,7 +476,7 @@ class Motion:
         x, y = state.quaternion.T[1:3]
         upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
         stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
-        self._stable_since = _since(self._stable_since, stable, time)
+        self._stable_since = np.where(stable, np.fmin(self._stable_since, time), np.nan)
         # Half a step of tolerance, since times are multiples of steps only up to rounding.
         held = flying & (time - self._stable_since > HOLD - 0.5 * self._control_step)
         np.fmin(self.recovery_time, self._stable_since, out=self.recovery_time, where=held)

@@ -45,10 +45,10 @@ def read_curve(run: StrPath, task: str | None = None) -> Curve:
     """
     path = Path(run) / ("evaluations.npz" if task is None else f"evaluations_{task}.npz")
     if not path.is_file():
-        reason = "a run that was trained with --eval-episodes 0 has no curve"
-        if task is not None:
-            reason = f"{task} is not one of this run's eval_tasks"
-        raise ConfigError(f"{path}: no such file; {reason}")
+        raise ConfigError(
+            f"{path}: no such file; a run has one for itself and one for each of its eval_tasks,"
+            " unless it was trained with --eval-episodes 0"
+        )
     arrays = read_arrays(path)
     measures = {}
     # A file of another program may hold anything.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.evaluation.flights import arrival_tolerance
+from sb3_quad.evaluation.flights import TOLERANCES, arrival_tolerance
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
@@ -63,7 +63,6 @@ ROWS = {
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD, OWN_REWARD}
 MOST_TOLERANCES = 6
-MAIN_TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
 
 NOTHING = Cell()
@@ -135,13 +134,13 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
 
 def published_cells(published: Published) -> Cells:
     """Return others' metrics."""
+    rows = ROWS | {"final_error": MEDIAN}
     cells = {}
-    for name, row in {**ROWS, "final_error": MEDIAN}.items():
-        number = getattr(published, name, None)
-        if number is not None:
-            cells[row] = _printed(row, number)
-            if row in (SUCCESS, SURVIVAL):
-                cells[row] = cells[row]._replace(note=published.note)
+    for name, number in published:
+        if name in rows and number is not None:
+            cells[rows[name]] = _printed(rows[name], number)
+    for row in cells.keys() & {SUCCESS, SURVIVAL}:
+        cells[row] = cells[row]._replace(note=published.note)
     # Here None has a meaning: never within the tolerance.
     for tolerance, time in published.time_to.items():
         row = time_row(tolerance)
@@ -162,19 +161,15 @@ def metric_rows(
     none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells)
     rows = []
     for row in _rows_of(scenario):
-        own = cells_of(row, ours)
+        own = [cells.get(row, NOTHING) for cells in ours]
         # A row without any number of ours is left out, whatever others measured.
         if own == [NOTHING] * len(own):
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        rows.append(row._replace(cells=[*own, *cells_of(row, others)]))
+        own += [cells.get(row, NOTHING) for cells in others]
+        rows.append(row._replace(cells=own))
     return rows
-
-
-def cells_of(row: Row, columns: Iterable[Cells]) -> list[Cell]:
-    """Return the cells of a row, empty in the columns that have none."""
-    return [cells.get(row, NOTHING) for cells in columns]
 
 
 def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
@@ -197,49 +192,56 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     return marked
 
 
-def overview(results: Results, controllers: Sequence[str]) -> Table:
-    """Return all scenarios in one table: a section each, published metrics in the last column.
+def overview(results: Results, labels: Sequence[str]) -> list[Table]:
+    """Return the tables of all scenarios for a terminal; the last one says how to read them.
 
-    :param controllers: labels, in the order of their columns.
+    :param labels: of the controllers, in the order of their columns.
     """
-    columns = [*map(Column, controllers)]
-    rows = []
-    if any(scenario.published for scenario in results.scenarios):
-        columns.append(Column(results.source, align="left"))
+    tables = []
     for heading, scenarios in scenario_groups(results):
-        rows.append(Row(heading))
-        for scenario in scenarios:
-            rows += _section(results, controllers, scenario)
-    return Table(columns, rows, title=results.suite, caption=CAPTION)
+        table = group_table(results, labels, heading, scenarios)
+        tables.append(_narrowed(table, len(labels)))
+    tables[-1] = tables[-1]._replace(caption=CAPTION)
+    return tables
 
 
-def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -> list[Row]:
-    """The rows of a scenario in the overview."""
-    rows = scenario_rows(results, controllers, scenario)
-    values = axis_values(scenario.cell)
-    section = []
-    for row in rows:
-        # The values of a cell are name enough for its only row.
-        names = values if values and len(rows) == 1 else [*values, row.name]
-        cells = [*row.cells[: len(controllers)]]
-        # All published metrics share a column.
+def _narrowed(table: Table, count: int) -> Table:
+    """Return a table with its columns after the first ``count``, those of others, in one."""
+    others = table.columns[count:]
+    if not others:
+        return table
+    rows = []
+    for row in table.rows:
         words = []
-        for who, cell in zip(scenario.published, row.cells[len(controllers) :], strict=True):
+        for column, cell in zip(others, row.cells[count:], strict=True):
             if cell != NOTHING:
-                words.append(f"{who} {cell._replace(note='').text}")
-        if words:
-            cells.append(Cell(words="; ".join(words)))
-        section.append(Row(f"  {', '.join(names)}", row.unit, cells))
-    return section
+                words.append(f"{column.name} {cell._replace(note='').text}")
+        rows.append(row._replace(cells=[*row.cells[:count], Cell(words="; ".join(words))]))
+    columns = [*table.columns[:count], Column(others[0].source, align="left")]
+    return table._replace(columns=columns, rows=rows)
 
 
-def scenario_rows(results: Results, labels: Iterable[str], scenario: Scenario) -> list[Row]:
-    """Return the :func:`metric_rows` of a scenario: some controllers, then what was published."""
-    return metric_rows(
-        scenario,
-        [measured_cells(results, label, scenario) for label in labels],
-        scenario.published.values(),
-    )
+def group_table(
+    results: Results, labels: Iterable[str], heading: str, scenarios: Sequence[Scenario]
+) -> Table:
+    """Return the table of a scenario, or of the cells that ``vary`` makes of one: some controllers,
+    then what was published.
+    """
+    rows = []
+    for scenario in scenarios:
+        measured = [measured_cells(results, label, scenario) for label in labels]
+        for row in metric_rows(scenario, measured, scenario.published.values()):
+            names = [*axis_values(scenario.cell), row.name]
+            rows.append(row._replace(name=", ".join(names)))
+    return Table(table_columns(results, labels, scenarios[0].published), rows, title=heading)
+
+
+def table_columns(
+    results: Results, labels: Iterable[str], published: Iterable[str]
+) -> list[Column]:
+    """Return the columns of some controllers, then those of what was published."""
+    columns = [Column(label, results.colours[label]) for label in labels]
+    return [*columns, *(Column(name, source=results.source) for name in published)]
 
 
 def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
@@ -273,7 +275,7 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     tolerances = {*scenario.tolerances}
     if len(tolerances) > MOST_TOLERANCES:
         # Only the main ones and published ones; a plot shows the others.
-        kept = {min(tolerances), *MAIN_TOLERANCES}
+        kept = {min(tolerances), *TOLERANCES}
         for published in scenario.published.values():
             kept |= {*published.time_to}
         tolerances &= kept
@@ -286,8 +288,6 @@ def _printed(row: Row, value: Printed) -> Cell:
     """A number as its source prints it; a pair is a range, None a time that never came."""
     if value is None:
         return Cell(words="never")
-    if isinstance(value, tuple):
-        # Tables have a proper minus sign.
-        return Cell(words=" to ".join(f"{row.factor * end:g}" for end in value).replace("-", "−"))
-    value *= row.factor
-    return Cell(value, decimals=len(f"{value:g}".partition(".")[2]))
+    ends = map("{:g}".format, row.factor * np.atleast_1d(value))
+    # Tables have a proper minus sign.
+    return Cell(words=" to ".join(ends).replace("-", "−"))

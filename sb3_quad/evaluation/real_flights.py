@@ -82,21 +82,22 @@ def read_logs(folder: StrPath, step: float) -> list[Log]:
 
 def read_log(path: Path, step: float) -> Log:
     """Read one log, see :func:`read_logs`."""
+    measured = ["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS]
     with raised_as(ConfigError, f"{path}: not a table of numbers"):
         table = pd.read_csv(path).astype(float)
     commands = THRUSTS if THRUSTS[0] in table else PWM
-    missing = {"t", *CAPTURE_COLUMNS, *GYRO_COLUMNS, *commands} - {*table}
+    missing = {*measured, *commands} - {*table}
     if missing:
         raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
     if len(table) < 2:
         raise ConfigError(f"{path}: fewer than two rows")
     # Commands may be missing where none came, and do not count there.
-    refuse_gaps(path, table[["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS]])
+    refuse_gaps(path, table[measured])
     # q and -q are the same attitude, but in between lie others.
-    quaternions = table[CAPTURE_COLUMNS[QUATERNION]].to_numpy(copy=True)
-    cosines = (quaternions[1:] * quaternions[:-1]).sum(axis=1)
-    quaternions[1:] *= np.cumprod(np.where(cosines < 0.0, -1.0, 1.0))[:, None]
-    table[CAPTURE_COLUMNS[QUATERNION]] = quaternions
+    quaternions = table[CAPTURE_COLUMNS[QUATERNION]]
+    cosines = (quaternions * quaternions.shift()).sum(axis=1)
+    signs = np.where(cosines < 0.0, -1.0, 1.0).cumprod()
+    table[CAPTURE_COLUMNS[QUATERNION]] = quaternions.mul(signs, axis=0)
     time = table["t"]
     grid = np.arange(time.iloc[0], time.iloc[-1], step)
 

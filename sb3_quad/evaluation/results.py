@@ -150,6 +150,14 @@ class Results(Frozen):
                 return entry
         return None
 
+    def write(self, folder: Path, finished: bool) -> None:
+        """Write ``results.json``.
+
+        :param finished: whether all flights were flown.
+        """
+        results = self.model_copy(update={"finished": finished})
+        write_text(folder / RESULTS, results.model_dump_json(indent=2))
+
 
 def load_results(folder: StrPath) -> Results:
     """Read the ``results.json`` of a folder.
@@ -167,43 +175,34 @@ def file_name(label: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", label).strip("_.") or "_"
 
 
-def flights_path(controller: str, scenario: str) -> str:
-    """Return the path of a controller's flights in a scenario, relative to the folder."""
-    return f"{FLIGHTS}/{file_name(controller)}/{scenario}.npz"
-
-
 def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
     """Write ``episodes.csv``, empty where there is no number.
 
     :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
     """
+    tables = []
+    for entry in entries:
+        arrays = read_arrays(folder / entry.flights, "episode_")
+        columns: StrDict = {
+            "controller": entry.controller,
+            "scenario": entry.scenario,
+            "episode": range(entry.metrics.n),
+        }
+        for name in _COLUMNS:
+            columns[name] = arrays[f"episode_{name}"]
+        waypoints = arrays["episode_waypoints"]
+        columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
+        # Arrays of several numbers become a column for each of them.
+        tolerances = " ".join(map("{:g}".format, arrays["episode_tolerances"]))
+        titles = {**_AXES, "time_to": tolerances, "settling_time": tolerances}
+        for name, parts in titles.items():
+            for part, values in zip(parts.split(), arrays[f"episode_{name}"].T, strict=True):
+                columns[f"{name}_{part}"] = values
+        columns["overshoot"] = arrays["episode_overshoot"]
+        for number, values in enumerate(waypoints.T, 1):
+            columns[f"waypoint_{number}"] = values
+        tables.append(pd.DataFrame(columns))
     # Scenarios differ in tolerances and waypoints, and so in their columns.
-    table = pd.concat([_table(folder, entry) for entry in entries])
     # Nine digits tell any two float32 apart.
-    write_text(
-        folder / EPISODES, table.to_csv(index=False, float_format="%.9g", lineterminator="\n")
-    )
-
-
-def _table(folder: Path, entry: Entry) -> pd.DataFrame:
-    """The flights of an entry, a line for each."""
-    arrays = read_arrays(folder / entry.flights, "episode_")
-    columns: StrDict = {
-        "controller": entry.controller,
-        "scenario": entry.scenario,
-        "episode": range(entry.metrics.n),
-    }
-    for name in _COLUMNS:
-        columns[name] = arrays[f"episode_{name}"]
-    waypoints = arrays["episode_waypoints"]
-    columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
-    # Arrays of several numbers become a column for each of them.
-    tolerances = " ".join(map("{:g}".format, arrays["episode_tolerances"]))
-    titles = {**_AXES, "time_to": tolerances, "settling_time": tolerances}
-    for name, parts in titles.items():
-        for part, values in zip(parts.split(), arrays[f"episode_{name}"].T, strict=True):
-            columns[f"{name}_{part}"] = values
-    columns["overshoot"] = arrays["episode_overshoot"]
-    for number, values in enumerate(waypoints.T, 1):
-        columns[f"waypoint_{number}"] = values
-    return pd.DataFrame(columns)
+    table = pd.concat(tables).to_csv(index=False, float_format="%.9g", lineterminator="\n")
+    write_text(folder / EPISODES, table)

@@ -18,7 +18,7 @@ WIDTH = 200  # characters of a line of a table as plain text, at most
 class Cell(NamedTuple):
     """A metric with the ends of its 95 % interval, or words in its place.
 
-    :param ends: of the interval; an infinite upper end is an unknown one.
+    :param ends: of the interval.
     :param note: small print after it.
     :param best: better than all others of its row, and the intervals are apart.
     """
@@ -45,7 +45,7 @@ class Cell(NamedTuple):
         low, high = map(self._rounded, self.ends)
         if low == high:
             return ""
-        return f"above {low}" if high == "inf" else f"{low} to {high}"
+        return f"{low} to {high}"
 
     @property
     def text(self) -> str:
@@ -82,7 +82,7 @@ class Column(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A metric with its unit, and a cell for each column; without cells it is a heading.
+    """A metric with its unit, and a cell for each column.
 
     :param decimals: of its cells.
     :param verb: what the flights do whose mean time it holds, of which less is better.
@@ -158,12 +158,8 @@ class Table(NamedTuple):
         for column in self.columns:
             table.add_column(Text(column.heading), justify=column.align)
         for row in self.rows:
-            if row.cells:
-                texts = [Text(cell.text, "bold" if cell.best else "") for cell in row.cells]
-                table.add_row(row.heading, *texts)
-            else:
-                table.add_section()
-                table.add_row(Text(row.heading, "bold"))
+            texts = [Text(cell.text, "bold" if cell.best else "") for cell in row.cells]
+            table.add_row(Text(row.heading), *texts)
         return table
 
 

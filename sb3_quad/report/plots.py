@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.types import StrDict
 
-INK = "#1c2430"
 # The colours of the style, by their names in the page's own, which may be dark.
-COLOURS = {INK: "ink", "#5c6672": "quiet", "#dfe3e8": "grid", "#ffffff": "paper"}
+COLOURS = {"#1c2430": "ink", "#5c6672": "quiet", "#dfe3e8": "grid", "#ffffff": "paper"}
 # Inches: two stand side by side in the page, and one can be read on a telephone.
 WIDTH = 5.0
 HEIGHT = 3.3

@@ -2,7 +2,7 @@
 that ``vary`` makes.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
@@ -11,19 +11,20 @@ from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import (
+    NOTHING,
     SUCCESS,
     SURVIVAL,
-    cells_of,
+    group_table,
     mark_best,
     measured_cells,
     published_cells,
     scenario_groups,
-    scenario_rows,
+    table_columns,
 )
 from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Published, Scenario
-from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
+from sb3_quad.evaluation.tables import Cell, Row, Table, text_table
 from sb3_quad.report.page import PAGE, TEMPLATES, Section, write_page
 from sb3_quad.report.plots import Plot
 from sb3_quad.report.scenario_plots import (
@@ -100,8 +101,7 @@ def _flights_section(
     flown = f"{first.episodes} flights of each controller"
     tables = []
     if first.group is None:
-        rows = scenario_rows(results, results.colours, first)
-        tables.append(Table(_columns(results, first.published), rows))
+        tables.append(group_table(results, results.colours, heading, scenarios))
         plots = _scenario_plots(results, first, folder)
     else:
         flown += f" in each of {len(scenarios)} cells"
@@ -154,11 +154,12 @@ def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Tab
         cells = mark_best(
             row, [_share(row, results, label, scenarios) for label in results.colours]
         )
-        # A scenario may lack the published metrics of another one.
-        printed = [scenarios[0].published.get(name, Published()) for name in others]
-        cells += cells_of(row, map(published_cells, printed))
+        for name in others:
+            # A scenario may lack the published metrics of another one.
+            published = scenarios[0].published.get(name, Published())
+            cells.append(published_cells(published).get(row, NOTHING))
         rows.append(Row(heading, "", cells))
-    return Table(_columns(results, others), rows, corner)
+    return Table(table_columns(results, results.colours, others), rows, corner)
 
 
 def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
@@ -171,8 +172,3 @@ def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]
         return cells[0]
     shares = [cell.value or 0.0 for cell in cells]
     return Cell(words=f"{min(shares):.0f} to {max(shares):.0f}")
-
-
-def _columns(results: Results, others: Iterable[str]) -> list[Column]:
-    own = map(Column, results.colours, results.colours.values())
-    return [*own, *(Column(name, source=results.source) for name in others)]

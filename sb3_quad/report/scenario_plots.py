@@ -12,7 +12,7 @@ from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.report.plots import HEIGHT, INK, POINTS, WIDTH, Plot, band, legend, new_axes, styled
+from sb3_quad.report.plots import HEIGHT, POINTS, WIDTH, Plot, band, legend, new_axes, styled
 
 FORCE = "#db1a24"
 TARGET = "#1a9a45"
@@ -25,34 +25,22 @@ SHOWN_FLIGHTS = 4  # of a controller, where episodes differ
 def arrivals_plot(
     scenario: Scenario, metrics: Mapping[str, Metrics], colours: Mapping[str, str]
 ) -> Plot:
-    """Draw bars of the mean times to each tolerance, cf. Figs. 4.6 and 4.7.
+    """Draw the mean times to each tolerance, cf. Figs. 4.6 and 4.7.
 
     :param metrics: by the controllers' labels, as are ``colours``.
     """
     figure, axes = new_axes("tolerance (m)", "time (s)")
-    places = np.arange(len(scenario.tolerances))
-    width = 0.75 / len(metrics)
-    # A group of bars at each tolerance, one for each controller.
-    for number, (label, measured) in enumerate(metrics.items()):
-        # There is no bar where no flight arrives.
+    for label, measured in metrics.items():
+        # There is no point where no flight arrives.
         means = [dict(arrival.time or {}) for arrival in measured.arrivals]
-        times = pd.DataFrame(means, columns=["value", "low", "high"], dtype=np.float64)
-        axes.bar(
-            places + (number - 0.5 * (len(metrics) - 1)) * width,
-            times.value,
-            0.92 * width,
-            color=colours[label],
-            label=label,
-            yerr=[times.value - times.low, times.high - times.value],
-            error_kw={"ecolor": INK, "elinewidth": 0.9, "capsize": 2},
-        )
-    axes.set_xticks(places, [*map("{:g}".format, scenario.tolerances)])
-    axes.grid(axis="x", visible=False)
+        times = pd.DataFrame(means, scenario.tolerances, ["value", "low", "high"], np.float64)
+        band(axes, colours[label], label, times, **POINTS)
+    axes.set_ylim(bottom=0.0)
     legend(figure)
     return Plot(
         f"{scenario.name}_times",
         "Mean time until the vehicle is first within a tolerance of its target, over the flights"
-        " that get there.",
+        " that get there, with 95 % intervals.",
         figure,
     )
 

@@ -245,10 +245,9 @@ def fly_all(
                         own,
                         [episode_seed],
                         "pybullet",
-                        (),
-                        [recording],
-                        setting.plan(episode_seed),
-                        deterministic,
+                        hooks=[recording],
+                        plan=setting.plan(episode_seed),
+                        deterministic=deterministic,
                     )
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error

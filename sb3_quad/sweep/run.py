@@ -162,7 +162,7 @@ def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluat
         spec = ControllerSpec("agent", str(agent))
         for scenario in suite.scenarios:
             flown = scenario.flown_by(spec.own and spec.own.vehicle)
-            flights[scenario.name] = _numbers(fly_scenario(model, flown, own=spec.observed)[0])
+            flights[scenario.name] = _numbers(fly_scenario(model, flown, own=spec.observed))
         return flights
     # Without a suite, the episodes are those of the closing table of train.
     for task in TASKS:

@@ -102,7 +102,7 @@ def run(options: Namespace) -> int:
     # Each controller once, in the order of the command line.
     flown = list(dict.fromkeys(entry.controller for entry in results.entries))
     if flown:
-        console().print(overview(results, flown))
+        console().print(*overview(results, flown))
         print(f"results in {folder}: results.json, episodes.csv, flights/")
         if options.report:
             from sb3_quad.report.results_page import write_report

@@ -5,10 +5,9 @@ With ``vary``, one scenario is written down and a grid of them is flown, for hea
 
 import copy
 import itertools
+import math
 from collections.abc import Mapping
 from pathlib import Path
-
-import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
@@ -81,10 +80,10 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
             entry["vehicle"] = str(folder / vehicle)
         reference = entry.get("reference")
-        if str(reference).endswith(".csv"):
-            reference = {"curve": "file", "file": reference}
         if isinstance(reference, dict) and "file" in reference:
             entry["reference"] = {**reference, "file": folder / str(reference["file"])}
+        elif str(reference).endswith(".csv"):
+            entry["reference"] = folder / str(reference)
         # A cell of a grid is a scenario like any other.
         scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)
@@ -110,7 +109,7 @@ def grid(entry: StrMapping, where: str) -> list[StrDict]:
     for key, values in axes.items():
         # A bool is an int to Python, but no number to a reader.
         numbers = isinstance(values, list) and {*map(type, values)} in NUMBERS
-        if not numbers or len({*values}) < len(values) or not np.isfinite(values).all():
+        if not numbers or len({*values}) < len(values) or not all(map(math.isfinite, values)):
             raise ConfigError(
                 f"{where}: vary.{key} must be a list of different numbers, not {values!r}"
             )
@@ -134,7 +133,8 @@ def grid(entry: StrMapping, where: str) -> list[StrDict]:
 
 def axis_name(key: str) -> str:
     """Return the short name of a varied key: ``start.body_rates.magnitude`` is ``body_rates``."""
-    return [part for part in key.split(".") if part not in _SILENT and not part.isdigit()][-1]
+    parts = [part for part in key.split(".") if part not in _SILENT and not part.isdigit()]
+    return parts[-1] if parts else key
 
 
 def axis_values(cell: Mapping[str, float]) -> list[str]:

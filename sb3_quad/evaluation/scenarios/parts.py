@@ -10,6 +10,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, mo
 
 from sb3_quad.base.errors import unknown
 from sb3_quad.base.validate import Frozen
+from sb3_quad.simulation.randomization import flyable
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector = tuple[float, float, float]
@@ -191,17 +192,17 @@ class VehicleChanges(Frozen):
         thrusts of its own mass (Eq. 3.18), are divided by the mass factor, so that action 0 is the
         hover of the unchanged vehicle.
 
-        :raises ValueError: no such vehicle can fly, for example one too heavy for its rotors.
+        :raises ConfigError: it cannot fly, for example because it is too heavy for its rotors.
         """
         if self == VehicleChanges():
             return vehicle
-        return vehicle.model_copy(
-            update={
-                "mass": vehicle.mass * self.mass,
-                "inertia": np.multiply(vehicle.inertia, self.inertia).tolist(),
-                "thrust_limits": np.divide(vehicle.thrust_limits, self.mass).tolist(),
-                "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
-                "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,
-                "delay": vehicle.delay if self.delay is None else self.delay,
-            }
-        )
+        changes = {
+            "mass": vehicle.mass * self.mass,
+            "inertia": np.multiply(vehicle.inertia, self.inertia).tolist(),
+            "thrust_limits": np.divide(vehicle.thrust_limits, self.mass).tolist(),
+            "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
+            "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,
+        }
+        if self.delay is not None:
+            changes["delay"] = self.delay
+        return flyable(vehicle, changes, "vehicle_changes")

@@ -9,10 +9,9 @@ import numpy as np
 
 from sb3_quad.base.seeds import SCENARIO_STREAM
 from sb3_quad.base.types import FloatArray
-from sb3_quad.evaluation.scenarios.parts import Attitude, VectorDistribution, Wrench
+from sb3_quad.evaluation.scenarios.parts import Attitude, VectorDistribution
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices
-from sb3_quad.vehicles.vehicle import Vehicle
 
 Generators = Sequence[np.random.Generator]  # one for each episode
 
@@ -55,28 +54,21 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
         start["velocity"] = np.einsum("nij,nj->ni", rotation, start["velocity"])
     if target.points:
         start["target"] = np.tile(target.points[0], (len(seeds), 1))
-    wrenches = sample_wrenches(
-        scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators
-    )
+    wrenches = sample_wrenches(scenario, generators)
     return Plan(start, wrenches, np.array(target.waypoints or ()).reshape(-1, 3), target.radius)
 
 
-def sample_wrenches(
-    wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, generators: Generators
-) -> dict[int, FloatArray]:
-    """Sum some wrenches over the time of n episodes, for a :class:`Plan`.
-
-    :param vehicle: its control step divides the time, and its weight is the unit of some wrenches.
-    :param steps: control steps of an episode.
-    """
+def sample_wrenches(scenario: Scenario, generators: Generators) -> dict[int, FloatArray]:
+    """Sum the wrenches of a scenario over the time of n episodes, for a :class:`Plan`."""
+    vehicle = scenario.nominal_vehicle()
     acting = []
     times = set[int]()
-    for wrench in wrenches:
-        # A wrench acts for whole control steps, at least one.
+    for wrench in scenario.wrenches:
+        # A wrench acts for whole control steps.
         first = round(wrench.start / vehicle.control_step)
-        last = first + steps
+        last = first + scenario.steps
         if wrench.duration is not None:
-            last = first + max(1, round(wrench.duration / vehicle.control_step))
+            last = first + round(wrench.duration / vehicle.control_step)
         newton, newton_metre = wrench.units(vehicle)
         force = newton * _vectors(wrench.force, generators)
         torque = newton_metre * _vectors(wrench.torque, generators)
@@ -85,7 +77,7 @@ def sample_wrenches(
         times |= {first, last}
     # The sum changes only where a wrench begins or ends.
     sums = {}
-    for time in sorted(times & {*range(steps)}):
+    for time in sorted(times & {*range(scenario.steps)}):
         sums[time] = np.zeros((len(generators), WRENCH_SIZE))
         for when, values in acting:
             if time in when:

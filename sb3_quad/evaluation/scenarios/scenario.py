@@ -1,24 +1,16 @@
 """A scenario: one way to judge a controller, flown many times; and a suite of them."""
 
-import math
-from collections import Counter
 from collections.abc import Sequence
 from functools import cache
 from typing import Annotated, Any
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    PositiveFloat,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+import numpy as np
+from pydantic import AfterValidator, Field, PositiveFloat, field_validator, model_validator
 
 from sb3_quad.base.errors import refuse_unknown
 from sb3_quad.base.seeds import Seed, row_seeds, seed_for
 from sb3_quad.base.types import StrDict
-from sb3_quad.base.validate import Frozen, explain, validate
+from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.references import Reference
@@ -125,10 +117,7 @@ class Scenario(Frozen):
             vehicle = self.vehicles.hardest(vehicle)
         self._check_way(vehicle)
         # The task checks the ranges of its own fields.
-        try:
-            _ = self.task
-        except ValidationError as error:
-            raise ValueError(explain(error, Task)) from None
+        _ = self.task
         if self.randomize is not None:
             self.randomize.hardest(vehicle)
             if self.randomize.sets_wrench and self.wrenches:
@@ -137,17 +126,13 @@ class Scenario(Frozen):
                 )
         step = vehicle.control_step
         if self.duration < step:
-            raise ValueError(f"duration: {self.duration:g} s is below a control step, {step:g} s")
+            raise ValueError(f"duration: must be a control step, {step:g} s, or longer")
         for number, wrench in enumerate(self.wrenches):
-            if wrench.duration is not None and wrench.duration < step * (1 - 1e-9):
+            is_short = wrench.duration is not None and wrench.duration < step * (1 - 1e-9)
+            if is_short or wrench.start >= self.duration:
                 raise ValueError(
-                    f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control"
-                    f" step, {step:g} s"
-                )
-            if wrench.start >= self.duration:
-                raise ValueError(
-                    f"wrenches.{number}: starts at {wrench.start:g} s, when the episode of"
-                    f" {self.duration:g} s is over"
+                    f"wrenches.{number}: must start within the episode of {self.duration:g} s, and"
+                    f" last for a control step, {step:g} s, or longer"
                 )
         return self
 
@@ -172,23 +157,16 @@ class Scenario(Frozen):
         vehicle = first_vehicle(own)
         return validate(
             Scenario,
-            {**self.model_dump(), "vehicle": vehicle},
+            self.model_dump() | {"vehicle": vehicle},
             f"scenario {self.name}, flown by {vehicle.name}",
         )
 
     def flown_vehicle(self) -> Vehicle:
         """The vehicle that flies, changes included.
 
-        :raises ValueError: a vehicle that cannot be loaded (ConfigError), or cannot fly once
-            changed.
+        :raises ConfigError: a vehicle that cannot be loaded, or cannot fly once changed.
         """
-        nominal = self.nominal_vehicle()
-        try:
-            return self.vehicle_changes.apply(nominal)
-        except ValidationError as error:
-            raise ValueError(
-                f"vehicle_changes: no such vehicle can fly ({explain(error, Vehicle)})"
-            ) from None
+        return self.vehicle_changes.apply(self.nominal_vehicle())
 
     def episode_seeds(self) -> list[int]:
         """The seeds of the episodes, for ``reset(seed=…)`` of one environment."""
@@ -209,16 +187,18 @@ class Scenario(Frozen):
         """The task that samples random targets and attitudes, as in training."""
         start = self.start
         elsewhere = self.target.distance or {*self.target.points} - {start.position}
-        return Task(
-            name="scenario",
-            start_position=start.position,
-            target_distance=self.target.distance or 0.0,
-            random_attitude=start.attitude.distribution == "uniform",
-            velocity_std=start.velocity.std or 0.0,
-            body_rates_std=start.body_rates.std or 0.0,
-            max_distance=self.max_distance,
-            **({} if elsewhere or self.reference else RECOVERED),
-        )
+        fields: StrDict = {
+            "name": "scenario",
+            "start_position": start.position,
+            "target_distance": self.target.distance or 0.0,
+            "random_attitude": start.attitude.distribution == "uniform",
+            "velocity_std": start.velocity.std or 0.0,
+            "body_rates_std": start.body_rates.std or 0.0,
+            "max_distance": self.max_distance,
+        }
+        if not elsewhere and self.reference is None:
+            fields |= RECOVERED
+        return validate(Task, fields, "start and target")
 
     @property
     def flown_as(self) -> FlightSettings:
@@ -255,34 +235,31 @@ class Scenario(Frozen):
         return not any([*random, self.randomize, self.vehicles, smooth])
 
     def _check_way(self, vehicle: Vehicle) -> None:
-        """Check that start and targets lie above ground, within ``max_distance`` of each other."""
-        least = vehicle.collision_radius
-        distance = self.target.distance or 0.0
-        before = self.start.position
-        for point in (before, *self.target.points):
-            if point[2] <= least:
-                place = "start.position" if point == self.start.position else "target"
+        """Check that the way lies above ground, its targets within ``max_distance`` of each
+        other.
+        """
+        points = np.array([self.start.position, *self.target.points])
+        lowest = {"start.position": points[0, 2], "target": points[:, 2].min()}
+        if self.reference is not None:
+            if self.target.waypoints or self.reference.function is not None:
                 raise ValueError(
-                    f"{place}: {list(point)} touches the ground; z must exceed {least:g} m"
+                    "reference: must be a curve or file, no function, and goes with no waypoints of"
+                    " the target; the curve polynomial has waypoints of its own"
                 )
-            distance = max(distance, math.dist(before, point))
-            before = point
-        if distance > self.max_distance:
+            heights = self.reference.tracks(vehicle.control_step).table[:, 2]
+            lowest["reference"] = points[-1, 2] + heights.min()
+        for place, z in lowest.items():
+            if z <= vehicle.collision_radius:
+                raise ValueError(
+                    f"{place}: touches the ground at z = {z:.3g} m; z must exceed"
+                    f" {vehicle.collision_radius:g} m"
+                )
+        ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        farthest = max(ways, default=self.target.distance or 0.0)
+        if farthest > self.max_distance:
             raise ValueError(
-                f"target: {distance:.3g} m away, and an episode ends beyond max_distance"
+                f"target: {farthest:.3g} m away, and an episode ends beyond max_distance"
                 f" {self.max_distance:g} m"
-            )
-        if self.reference is None:
-            return
-        if self.target.waypoints or self.reference.function is not None:
-            raise ValueError(
-                "reference: must be a curve or file, no function, and goes with no waypoints of the"
-                " target; the curve polynomial has waypoints of its own"
-            )
-        lowest = before[2] + self.reference.tracks(vehicle.control_step).table[:, 2].min()
-        if lowest <= least:
-            raise ValueError(
-                f"reference: goes down to z = {lowest:.3g} m; it must stay above {least:g} m"
             )
 
 
@@ -322,31 +299,26 @@ class Suite(Frozen):
             for the vehicle.
         """
         chosen: StrDict = {"episodes": episodes, "seed": seed, "vehicle": vehicle}
+        changes = {key: value for key, value in chosen.items() if value is not None}
         flown_by = ""
         if vehicle is not None:
-            chosen["published"] = {}
+            changes["published"] = {}
             flown_by = f", flown by {vehicle}"
-        changes = {key: value for key, value in chosen.items() if value is not None}
         known = set[str]()
         changed = []
         for scenario in self.scenarios:
             own = {scenario.name, scenario.group or scenario.name}
             known |= own
             if not names or own & {*names}:
-                changed.append(
-                    validate(
-                        Scenario,
-                        scenario.model_dump() | changes,
-                        f"scenario {scenario.name}{flown_by}",
-                    )
-                )
+                data = scenario.model_dump() | changes
+                changed.append(validate(Scenario, data, f"scenario {scenario.name}{flown_by}"))
         refuse_unknown("scenario", names, known)
         return self.model_copy(update={"scenarios": changed})
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = Counter(scenario.name for scenario in self.scenarios)
-        for name, times in names.items():
-            if times > 1:
+        names = [scenario.name for scenario in self.scenarios]
+        for name in names:
+            if names.count(name) > 1:
                 raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
         return self
