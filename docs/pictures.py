@@ -54,15 +54,15 @@ sb3-quad enjoy "our agent (itm-robust)=itm-robust" "PID expert=pid"
 """,
     "recovery_sequence.png": """
 sb3-quad enjoy "RL agent=itm-recovery" "PID expert=pid"
-    --scenario thesis:recovery_s1 --size 480x480 -o recovery_sequence.png
+    --scenario thesis:recovery_s1 -o recovery_sequence.png
 """,
     "thesis_s1_sequence.png": """
 sb3-quad enjoy PID=pid RL-agent=thesis-recovery
-    --scenario thesis:recovery_s1 --size 480x480 -o thesis_s1_sequence.png
+    --scenario thesis:recovery_s1 -o thesis_s1_sequence.png
 """,
     "side_hit_sequence.png": """
 sb3-quad enjoy "RL agent=itm-recovery" "PID expert=pid"
-    --scenario thesis:side_hit --size 480x480 -o side_hit_sequence.png
+    --scenario thesis:side_hit -o side_hit_sequence.png
 """,
     "film_frame.png": """
 sb3-quad enjoy "RL agent=itm-recovery" geometric "PID expert=pid"

@@ -26,6 +26,7 @@ agent (vehicle, task and observation) hold for all, unless you give --env,
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
+import sys
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -54,6 +55,9 @@ from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.training.options import DEFAULT_ENV
 
 PICTURE = ".png"
+# Width and height of the only panel, and of one of several, pixels.
+SINGLE = (640, 480)
+PANEL = (480, 480)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -113,7 +117,7 @@ FLAGS: Flags = {
         [],
         "write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
     ),
-    "--size WxH": (_size, (640, 480), "size of one controller's panel, pixels (640x480)"),
+    "--size WxH": (_size, "size of one controller's panel, pixels"),
     "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
     **TRUST,
     **OVERWRITE,
@@ -124,6 +128,7 @@ FLAGS: Flags = {
 def run(options: Namespace) -> int:
     """Fly, print the results, show the flights. Returns the exit code."""
     from PIL import Image
+    from rich.console import Console
 
     from sb3_quad.show.episodes import fly_all
     from sb3_quad.show.film import show_in_window
@@ -132,28 +137,29 @@ def run(options: Namespace) -> int:
     window = not (options.no_render or options.output)
     _check(options, window)
     setting, controllers = _setting(options)
-    episodes = list(
-        fly_all(
-            controllers,
-            setting,
-            options.seed,
-            options.n_timesteps,
-            not options.stochastic,
-            options.n_envs,
+    with Console(file=sys.stderr).status("flying"):
+        episodes = list(
+            fly_all(
+                controllers,
+                setting,
+                options.seed,
+                options.n_timesteps,
+                not options.stochastic,
+                options.n_envs,
+            )
         )
-    )
     for number, episode in enumerate(episodes, 1):
         for flight in episode:
             prefix = f"episode {number}, " if len(episodes) > 1 else ""
             print(f"{prefix}{flight.name}: {flight.end}, reward {flight.results.reward[0]:.2f}")
-    width, height = options.size
+    width, height = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
         if file.lower().endswith(PICTURE):
             picture = Image.fromarray(sequence(episodes[0], width, height))
             with replacing(file) as stream:
                 picture.save(stream, format="png", optimize=True)
         else:
-            _write_film(file, episodes, options)
+            _write_film(file, episodes, width, height, options)
         print("saved", file)
     if window:
         show_in_window(episodes, width, height, options.speed)
@@ -178,7 +184,8 @@ def _check(options: Namespace, window: bool) -> None:
         raise ConfigError(
             f"{unknown('environment', env_id, ENVIRONMENTS)}; rl_zoo3.enjoy shows others"
         )
-    check_size(*options.size)
+    if options.size:
+        check_size(*options.size)
     for file in options.output:
         if not file.lower().endswith(PICTURE):
             check_film(Path(file))
@@ -266,12 +273,13 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     return f"{options.algo} {path.name}", str(path)
 
 
-def _write_film(file: str, episodes: Sequence[Sequence[Any]], options: Namespace) -> None:
+def _write_film(
+    file: str, episodes: Sequence[Sequence[Any]], width: int, height: int, options: Namespace
+) -> None:
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.show.film import film_frames, frame_times, write_film
 
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
-    width, height = options.size
     images = chain.from_iterable(
         film_frames(episode, width, height, options.speed) for episode in episodes
     )
