@@ -392,7 +392,7 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
         (["--exp-id", "7"], "QuadStateRecovery-v0_1"),
         (["--load-last-checkpoint"], "--save-freq"),
         (["--load-checkpoint", "500"], "best_model.zip"),
-        (["--algo", "ppoo"], "ppoo: there is no run"),
+        (["--algo", "ppoo"], "did you mean 'ppo'"),
     ):
         capsys.readouterr()
         assert main([*asked, *wrong]) == 2

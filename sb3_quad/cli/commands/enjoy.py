@@ -256,8 +256,12 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
 
     :raises ConfigError: No such run or file.
     """
+    from sb3_quad.training.algorithms import get_algorithm
     from sb3_quad.training.runs import find_run
 
+    if not (Path(options.folder) / options.algo).is_dir():
+        # Raises if there is no such algorithm.
+        get_algorithm(options.algo)
     run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
     if options.load_last_checkpoint:
         path = run.latest_checkpoint()
