@@ -155,7 +155,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
         "success",
         "mean time to 0.1 m",
         "mean path",
-        "saved in",
+        "trained in",
         str(run),
     ):
         assert part in output

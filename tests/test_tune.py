@@ -98,7 +98,8 @@ def test_a_search_leaves_settings_that_train_takes_and_resumes(command, capsys):
     assert (
         "trial 1 finished" in output
         and "fresh episodes" in output
-        and f"saved in {folder()}" in output
+        and "to train: sb3-quad train" in output
+        and str(folder() / "best.yml") in output
     )
     files = {path.name for path in folder().iterdir()}
     assert files == {"best.yml", "trials.csv", "study.log", "dagger"}

@@ -63,6 +63,9 @@ def close_run(result: TrainingResult) -> int:
         return result.exit_code
     if result.job.config.task:
         print_agent(result.job, result.model)
+    # A complete run without evaluations does not know how long it took.
+    if result.seconds:
+        print(f"trained in {result.seconds:.1f} s")
     print("saved in", result.run.path)
     _print_next(result.run)
     return 0
@@ -81,8 +84,8 @@ def close_pipeline(result: PipelineResult) -> int:
         _print_stages(result.job, flown)
     else:
         print("no tables: their flights have no wrappers; the evaluations above have them")
-    for name, agent in agents.items():
-        print(f"{name}: {agent}")
+    for name, stage in result.stages.items():
+        print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print("saved in", result.folder)
     *_, last = result.stages.values()
     _print_next(open_run(last.run))

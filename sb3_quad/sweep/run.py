@@ -84,7 +84,8 @@ def execute(
             continue
         write_result(folder, result)
         results[run.name] = result
-        report(f"{run.name}: {result.state} {result.message}".rstrip())
+        end = result.message or f"{result.seconds:.0f} s"
+        report(f"{run.name}: {result.state}, {end} ({len(results)} of {len(sweep.runs)})")
         show(len(results), len(sweep.runs), "runs")
     return results
 

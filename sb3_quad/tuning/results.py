@@ -34,8 +34,8 @@ def write_results(search: Search) -> None:
             "state": trial.state.name,
             "evaluations": len(trial.intermediate_values),
         }
-        assert trial.duration is not None
-        row["seconds"] = round(trial.duration.total_seconds(), 2)
+        if trial.duration is not None:
+            row["seconds"] = round(trial.duration.total_seconds(), 2)
         if trial.state == TrialState.COMPLETE:
             row["value"] = trial.value
         if trial.state == TrialState.FAIL:
@@ -50,8 +50,21 @@ def write_results(search: Search) -> None:
         return
     config = search.config(best)
     settings = yaml.safe_dump({config.env_id: config.settings}, sort_keys=False)
-    # The best settings say where they come from, in a comment that train skips.
-    write_text(folder / BEST, f"# {trial_line(search, best)} of study {search.name}\n{settings}")
+    # The best settings say where they come from, in comments that train skips.
+    origin = f"# {trial_line(search, best)} of study {search.name}\n# {train_command(search)}\n"
+    write_text(folder / BEST, origin + settings)
+
+
+def train_command(search: Search) -> str:
+    """Return the command that trains with the best settings, as the trials did."""
+    config = search.job.config
+    command = (
+        f"sb3-quad train --algo {config.algo} --env {config.env_id} "
+        f"--conf-file {Path(search.job.log_folder, BEST)}"
+    )
+    if search.job.trained_agent:
+        command += f" -i {search.job.trained_agent}"
+    return command
 
 
 def trial_line(search: Search, trial: FrozenTrial) -> str:

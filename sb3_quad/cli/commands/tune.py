@@ -143,7 +143,7 @@ def _print_results(search: Any) -> None:
     from sb3_quad.cli.closing import print_agent
     from sb3_quad.controllers.zips import load_model
     from sb3_quad.training.runs import open_run
-    from sb3_quad.tuning.results import trial_line
+    from sb3_quad.tuning.results import train_command, trial_line
     from sb3_quad.tuning.search import RUN
 
     best = search.best
@@ -156,6 +156,7 @@ def _print_results(search: Any) -> None:
             model = open_run(run).model
             print_agent(job, load_model(model))
             print("agent:", model)
+        print("to train:", train_command(search))
     print(
         f"saved in {search.job.log_folder}; to continue, run the same command with "
         f"--storage {search.storage} --study-name {search.name}"
