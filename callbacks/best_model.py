@@ -123,7 +123,6 @@ class BestModel(EveryTimesteps):
                 other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}"
             )
         self.stopped = False  # by ``should_continue``
-        self.latest = 0  # timesteps of the latest evaluation
         self.best: Score = (-np.inf, -np.inf)
 
     def _on_training_start(self) -> None:
@@ -135,7 +134,6 @@ class BestModel(EveryTimesteps):
         self._start = time.perf_counter()
         for row in self._own.rows:
             self.best = max(self.best, score(row, self._by))
-            self.latest = int(row["timesteps"])
         if self._own.rows:
             self._start -= self._own.rows[-1].get("seconds", 0.0)
         self._last = last_timestep(self.model)
@@ -149,9 +147,14 @@ class BestModel(EveryTimesteps):
         if self.num_timesteps >= self._last and not self.stopped:
             self.evaluate()
 
+    @property
+    def latest(self) -> int:
+        """Timesteps of the latest evaluation; 0: there was none."""
+        rows = self._own.rows
+        return int(rows[-1]["timesteps"]) if rows else 0
+
     def evaluate(self) -> None:
         """Evaluate the model as it is now, note the results, and keep it if it is the best."""
-        self.latest = self.num_timesteps
         seconds = time.perf_counter() - self._start
         values: StrDict = {"timesteps": self.num_timesteps, "seconds": seconds}
         # The log still holds the losses of the latest update.

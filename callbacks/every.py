@@ -151,15 +151,17 @@ class EpisodeLog(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._start = time.time()
-        is_new = not self._path.exists()
-        if not is_new:
+        lines: list[str] = []
+        if self._path.exists():
             # A crash may have cut the last row.
             with self._path.open("rb+") as file:
                 file.truncate(file.read().rfind(b"\n") + 1)
-            # The seconds of an earlier training count, too; two lines are the file's head.
-            rows = read_text(self._path).splitlines()[2:]
-            if rows:
-                self._start -= float(rows[-1].split(",")[2])
+            lines = read_text(self._path).splitlines()
+        # Two lines are the file's head, which a crash may have cut, too.
+        is_new = len(lines) < 2
+        # The seconds of an earlier training count, too.
+        if len(lines) > 2:
+            self._start -= float(lines[-1].split(",")[2])
         self._writer = ResultsWriter(
             str(self._path),
             {"t_start": self._start, "env_id": self._env_id},

@@ -201,6 +201,10 @@ def test_the_episode_log_is_a_monitor_file(tmp_path):
     log.write_text(log.read_text() + "1.0,2")  # as a crash may leave it
     make_model().learn(80, callback=EpisodeLog(log, "Walk-v0"))
     assert len(load_results(str(tmp_path))) == 3 * 80 / 10
+    for head in ("", log.read_text().splitlines()[0] + "\n"):
+        log.write_text(head)  # as a crash in the first moment may leave it
+        make_model().learn(80, callback=EpisodeLog(log, "Walk-v0"))
+        assert len(load_results(str(tmp_path))) == 80 / 10
 
 
 def test_a_line_a_minute_says_how_far_the_training_is(monkeypatch):

@@ -60,8 +60,9 @@ class FlightTape:
 
     def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
         n = batch.n
-        self.substeps = substeps or batch.substeps
-        self.physics_step = batch.physics_step * batch.substeps / self.substeps
+        self.substeps = batch.substeps if substeps is None else substeps
+        self.control_step = batch.physics_step * batch.substeps
+        self.physics_step = self.control_step / self.substeps
         self.batch = batch
         self.n_steps = n_steps
         # The states before each control step and after the last one

@@ -81,6 +81,8 @@ def run(options: Namespace) -> int:
     # Without a suffix it is a folder; without -o, this one. An app is a folder itself.
     if not options.file or (not is_app and (file.is_dir() or not file.suffix)):
         file /= model.stem + ending
+    if file.resolve() == model.resolve():
+        raise ConfigError(f"{file}: is the model itself; give another file with -o")
     # Suffixes that no format has, such as .hpp, are the user's choice.
     if file.suffix != ending and file.suffix in (*FORMATS.values(), ".tflite", ".zip"):
         raise ConfigError(f"{file}: --format {options.format} writes {model.stem}{ending}")
