@@ -561,10 +561,7 @@ def test_a_policy_that_cannot_fly_so_is_refused(make, message):
     ("arguments", "message"),
     [
         (["agent.zip", "--format", "c"], "--overwrite"),
-        (
-            ["agent.zip", "--format", "c", "--overwrite", "-o", "agent.zip"],
-            "--format c writes agent.h",
-        ),
+        (["agent.zip", "--format", "c", "--overwrite", "-o", "agent.zip"], "the model itself"),
         (["agent.zip", "--format", "c", "-o", "b.h", "--name", "1st"], "C identifier"),
         (["agent.zip", "--format", "c", "-o", "b.onnx"], "--format c writes agent.h"),
         (["agent.zip", "--format", "px4", "-o", "b.tflite"], "--format px4 writes agent_px4"),
