@@ -175,7 +175,7 @@ class SACBC(ExpertMixin, SAC):
                 " observations; give 1"
             )
         self._check_arguments()
-        self._clones = self.will_clone()
+        self._clones = super().will_clone()
         if self._clones and self.replay_buffer_class not in _STOCK_BUFFERS:
             raise ConfigError(
                 f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's"
@@ -196,6 +196,10 @@ class SACBC(ExpertMixin, SAC):
     def policy_is_idle(self) -> bool:
         """Whether only the critic has learnt so far (``critic_warmup``)."""
         return 0 < self.critic_warmup >= self._n_updates
+
+    def will_clone(self) -> bool:
+        """Return whether the expert is needed: decided with the kind of the replay buffer."""
+        return self._clones
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """Load a replay buffer by SB3's ``load_replay_buffer``.

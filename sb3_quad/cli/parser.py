@@ -71,7 +71,7 @@ class Parser(ArgumentParser):
             return "the command sb3-quad tune does that"
         guess = did_you_mean(option, valid)
         if guess:
-            return guess
+            return guess.strip()
         commands = [f"sb3-quad {name}" for name, known in self.siblings.items() if option in known]
         if commands:
             return f"it belongs to {' and '.join(commands)}"

@@ -271,7 +271,7 @@ def fly_settings(
         distance = outcome["distance"]
         flying = outcome["truncated"].copy()  # a flight survives until it is lost
         course = Waypoints(plan, fleet.n)
-        arrivals = Arrivals(tolerances, np.where(course.on_last, distance, np.inf))
+        arrivals = Arrivals(tolerances, course.to_last(distance))
         motion = Motion(start, vehicle.control_step)
         following = Following(fleet.n, vehicle.control_step)
         supervisor = Supervisor(fleet.vehicle_list)
@@ -310,7 +310,7 @@ def fly_settings(
             way = np.linalg.norm(state.position - position, axis=1)
             path_length += np.where(flying, way, 0.0)
             position = state.position.copy()
-            arrivals.update(time, np.where(course.on_last, distance, np.inf))
+            arrivals.update(time, course.to_last(distance))
 
             # From here on, only the flights that continue count.
             flying = outcome["truncated"].copy()
@@ -412,10 +412,14 @@ class Arrivals:
         """
         inside = distance <= self._limits
         np.fmin(self.time_to, np.where(inside, time, np.nan), out=self.time_to)
-        since = np.fmin(self.settling_time, time)
-        self.settling_time = np.where(inside, since, np.nan)
+        self.settling_time = _since(self.settling_time, inside, time)
         arrived = np.isfinite(self._first)
         np.fmax(self.overshoot, distance, out=self.overshoot, where=arrived)
+
+
+def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
+    """Return since when a condition has held, given that it ``holds`` now; else NaN."""
+    return np.where(holds, np.fmin(times, time), np.nan)
 
 
 class Waypoints:
@@ -443,6 +447,10 @@ class Waypoints:
     def on_last(self) -> BoolArray:
         """Whether the present target is the last one, (n,); always without waypoints."""
         return self.next >= self._count - 1
+
+    def to_last(self, distance: FloatArray) -> FloatArray:
+        """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
+        return np.where(self.on_last, distance, np.inf)
 
 
 class Motion:
@@ -476,7 +484,7 @@ class Motion:
         x, y = state.quaternion.T[1:3]
         upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
         stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
-        self._stable_since = np.where(stable, np.fmin(self._stable_since, time), np.nan)
+        self._stable_since = _since(self._stable_since, stable, time)
         # Half a step of tolerance, since times are multiples of steps only up to rounding.
         held = flying & (time - self._stable_since > HOLD - 0.5 * self._control_step)
         np.fmin(self.recovery_time, self._stable_since, out=self.recovery_time, where=held)

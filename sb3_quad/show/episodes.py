@@ -10,7 +10,7 @@ from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
 from sb3_quad.envs.rendering.camera import DOWN, ON_PATH, broadside
 from sb3_quad.envs.rendering.picture import Trail
-from sb3_quad.envs.rendering.scene import Pose
+from sb3_quad.envs.rendering.scene import MARKER, Pose
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
@@ -20,7 +20,8 @@ from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
-TARGET = "#1ab847"  # colour of the path of a target: that of its hoops
+# The path of a target has the colour of its hoops.
+TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()
 WRENCH_SECONDS = 0.4  # a wrench is shown for that long, so that a short blow can be seen
 
 

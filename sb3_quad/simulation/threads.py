@@ -69,6 +69,9 @@ def share_out(function: Function, helpers: int, *arguments: Any) -> Any:
     """
     pool = _pool
     control = np.zeros(CONTROL, np.int64)
+    if helpers < 1:
+        # It takes no part in whether other calls rest.
+        return function(control, True, *arguments)
     if pool.resting > 0:
         pool.resting -= 1
         helpers = 0

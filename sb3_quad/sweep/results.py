@@ -84,7 +84,6 @@ def write_results(
     parts = {}
     failed = {}
     configurations: dict[str, list[int]] = {}
-    curves: dict[str, list[Curve]] = {}
     # In the order of the plan, not in that in which runs ended.
     for run in sweep.runs:
         if run.name not in results:
@@ -97,10 +96,6 @@ def write_results(
             lines.append(line)
             continue
         configurations.setdefault(run.configuration, []).append(run.seed)
-        # A run without evaluations has no curve.
-        stage = (folder / "runs" / run.name / result.agent).parent
-        if (stage / "evaluations.npz").is_file():
-            curves.setdefault(run.configuration, []).append(read_curve(stage))
         for scenario, measures in result.flights.items():
             # A row for each episode, NaN where there is no number.
             part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
@@ -122,7 +117,7 @@ def write_results(
     tables = []
     if parts:
         tables = _compare(summary, pd.concat(parts, names=LEVELS))
-        _write_report(folder, summary, tables, curves)
+        _write_report(folder, summary, tables, _curves(folder, sweep, results))
     write_text(folder / "results.json", summary.model_dump_json(indent=1) + "\n")
     return summary, tables
 
@@ -216,6 +211,21 @@ def verdict(difference: Estimate) -> str:
     if difference.high < 0:
         return "worse"
     return "cannot tell"
+
+
+def _curves(folder: Path, sweep: Sweep, results: Mapping[str, RunResult]) -> dict[str, list[Curve]]:
+    """Read the learning curves of the finished runs, by configuration; of pipelines, those of the
+    last stage.
+    """
+    curves: dict[str, list[Curve]] = {}
+    for run in sweep.runs:
+        if run.name not in results or results[run.name].state == "failed":
+            continue
+        stage = (folder / "runs" / run.name / results[run.name].agent).parent
+        # A run without evaluations has no curve.
+        if (stage / "evaluations.npz").is_file():
+            curves.setdefault(run.configuration, []).append(read_curve(stage))
+    return curves
 
 
 def _write_report(

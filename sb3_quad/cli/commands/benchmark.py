@@ -89,7 +89,8 @@ def run(options: Namespace) -> int:
     if options.training is not False:
         for algo in options.algo:
             subjects.append(_training_loop(algo, options.conf_file))
-    rates = np.median(_measure(subjects, options.seconds), axis=0)
+    with console().status("measuring"):
+        rates = np.median(_measure(subjects, options.seconds), axis=0)
     lines = []
     for subject, rate in zip(subjects, rates, strict=True):
         lines.append((subject.name, f"{subject.rows:,}", f"{rate:,.0f}"))

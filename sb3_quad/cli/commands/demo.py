@@ -50,9 +50,14 @@ def run(options: Namespace) -> int:
 
     refuse_existing(options.output, options.overwrite)
     specs = parse_controllers(options.agents or DEFAULT_AGENTS)
-    page, vehicle, _ = make_page(specs, options.vehicle and load_vehicle(options.vehicle))
+    page, vehicle, rounded = make_page(specs, options.vehicle and load_vehicle(options.vehicle))
     for spec in specs:
         warn(spec.notice(vehicle))
     write_text(options.output, page)
+    if rounded:
+        print(
+            f"weights of {' and '.join(rounded)} are rounded to half precision, "
+            "to keep the page small"
+        )
     print(f"saved {options.output}; open it in a browser")
     return 0

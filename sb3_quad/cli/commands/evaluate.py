@@ -80,6 +80,7 @@ FLAGS: Flags = {
 
 def run(options: Namespace) -> int:
     """Fly, print the table and the failures. Returns the exit code."""
+    from sb3_quad.cli.commands.report import report
     from sb3_quad.cli.output import console, progress_bar, warn
     from sb3_quad.evaluation.controllers import parse_controllers
     from sb3_quad.evaluation.evaluate import evaluate
@@ -105,9 +106,7 @@ def run(options: Namespace) -> int:
         console().print(*overview(results, flown))
         print(f"results in {folder}: results.json, episodes.csv, flights/")
         if options.report:
-            from sb3_quad.report.results_page import write_report
-
-            print("saved", write_report(folder, overwrite=True))
+            report(folder, overwrite=True)
     for failure in results.failures:
         print(
             f"failed: {failure.controller}, {failure.scenario or 'every scenario'}: "

@@ -23,6 +23,7 @@ and report.html. For the keys of the file, see docs/sweeps.md.
 
 import sys
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,7 @@ def run(options: Namespace) -> int:
             for stage in planned.stages
         ]
         print(f"{planned.name}: {', then '.join(stages)}")
-    print(len(sweep.runs), "runs")
+    print(_count(sweep.runs))
     return 0
 
 
@@ -151,7 +152,7 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
                 Path(options.log_folder or "logs") / "sweep", sweep.spec.name or "sweep"
             )
             write_sweep(folder, sweep)
-        print(f"sweep {folder}: {len(sweep.runs)} runs")
+        print(f"sweep {folder}: {_count(sweep.runs)}")
         with (
             locked(folder, "sweep folder"),
             StopSignals() as signals,
@@ -173,3 +174,7 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
         print("to continue: --resume", folder)
         return signals.exit_code
     return int(bool(results.failed))
+
+
+def _count(runs: Sequence[Any]) -> str:
+    return "1 run" if len(runs) == 1 else f"{len(runs)} runs"
