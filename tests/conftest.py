@@ -10,6 +10,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -118,8 +119,14 @@ def pytest_configure():
 
 
 def pytest_sessionstart(session):
-    is_worker = hasattr(session.config, "workerinput")
-    if not is_worker and not sys.stdout.isatty():
+    if hasattr(session.config, "workerinput"):
+        return
+    if not session.config.option.collectonly:
+        # Workers would all compile the same code, and on a slow machine the first test of each
+        # would take longer than a test may.
+        compile_all = "from sb3_quad import QuadcopterVecEnv; QuadcopterVecEnv(1)"
+        subprocess.run([sys.executable, "-c", compile_all], check=True)
+    if not sys.stdout.isatty():
         plugins = session.config.pluginmanager
         plugins.register(Progress(plugins.get_plugin("terminalreporter")))
 

@@ -210,6 +210,10 @@ def test_check_vehicle_prints_the_errors(folder, capsys):
             lambda table: table.assign(imu_gyro_y=table["imu_gyro_y"].where(table.index != 8)),
             "bad.csv: row 9: imu_gyro_y is missing, or is not a finite number",
         ),
+        (
+            lambda table: table.assign(t=table["t"].where(table.index != 8, 0.01)),
+            "bad.csv: row 9: t is 0.01 after ",
+        ),
         (lambda table: table.assign(pz=0.0), "no log flies above 0.3 m for 1 s"),
         (lambda table: table.drop(columns=THRUSTS), f"lacks {', '.join(sorted(PWM))}"),
     ],

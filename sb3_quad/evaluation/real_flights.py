@@ -18,7 +18,7 @@ from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import BoolArray, FloatArray, StrPath
 from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.motions import refuse_gaps
+from sb3_quad.simulation.motions import refuse_falling_times, refuse_gaps
 from sb3_quad.simulation.physics import quaternion_product
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import (
@@ -72,7 +72,8 @@ class Log:
 def read_logs(folder: StrPath, step: float) -> list[Log]:
     """Read the logs of a folder, with rows ``step`` s apart.
 
-    :raises ConfigError: no CSV file there, or one that cannot be read or lacks columns.
+    :raises ConfigError: no CSV file there, or one that cannot be read or lacks columns, or whose
+        times do not rise.
     """
     paths = sorted(Path(folder).glob("*.csv"))
     if not paths:
@@ -93,12 +94,13 @@ def read_log(path: Path, step: float) -> Log:
         raise ConfigError(f"{path}: fewer than two rows")
     # Commands may be missing where none came, and do not count there.
     refuse_gaps(path, table[measured])
+    time = table["t"]
+    refuse_falling_times(path, time)
     # q and -q are the same attitude, but in between lie others.
     quaternions = table[CAPTURE_COLUMNS[QUATERNION]]
     cosines = (quaternions * quaternions.shift()).sum(axis=1)
     signs = np.where(cosines < 0.0, -1.0, 1.0).cumprod()
     table[CAPTURE_COLUMNS[QUATERNION]] = quaternions.mul(signs, axis=0)
-    time = table["t"]
     grid = np.arange(time.iloc[0], time.iloc[-1], step)
 
     def resampled(names: list[str], behind: float = 0.0) -> FloatArray:

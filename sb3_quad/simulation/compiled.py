@@ -40,7 +40,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     except RuntimeError:
         # Neither the package's folder nor the user's folder for caches can be written.
         print_once(
-            "compiled code cannot be cached and is compiled at every start, in about 15 s;"
+            "compiled code cannot be cached and is compiled at every start, in 15 s or more;"
             " set NUMBA_CACHE_DIR to a folder"
         )
     else:
@@ -83,7 +83,7 @@ inlined = compiled(inline="always")
 
 class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
-        print_once("compiling the simulation, once; it is kept for later runs (about 15 s)")
+        print_once("compiling the simulation, once, in 15 s or more; it is kept for later runs")
 
     def on_end(self, event: event.Event) -> None:
         pass

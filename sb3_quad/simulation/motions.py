@@ -60,13 +60,7 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     refuse_gaps(path, frame)
     numbers = frame.to_numpy()
     times = numbers[:, 0] - numbers[0, 0]
-    falling = np.flatnonzero(np.diff(times) <= 0.0)
-    if falling.size:
-        row = falling[0] + 1
-        raise ConfigError(
-            f"{path}: row {row + 1}: t is {numbers[row, 0]:g} after {numbers[row - 1, 0]:g};"
-            " it must rise from row to row"
-        )
+    refuse_falling_times(path, frame["t"])
     # Headings may be given from -π to π: between two of them is the shorter way.
     numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)
     return times, numbers[:, 1:]
@@ -82,6 +76,20 @@ def refuse_gaps(path: Path, frame: pd.DataFrame) -> None:
         row, column = unfit[0]
         raise ConfigError(
             f"{path}: row {row + 1}: {frame.columns[column]} is missing, or is not a finite number"
+        )
+
+
+def refuse_falling_times(path: Path, times: "pd.Series[float]") -> None:
+    """Refuse times that do not rise from row to row.
+
+    :raises ConfigError: names the row, counted from 1 behind the names.
+    """
+    falling = np.flatnonzero(times.diff() <= 0.0)
+    if falling.size:
+        row = falling[0]
+        raise ConfigError(
+            f"{path}: row {row + 1}: t is {times[row]:g} after {times[row - 1]:g};"
+            " it must rise from row to row"
         )
 
 
