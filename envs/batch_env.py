@@ -1,7 +1,6 @@
 """The part that all environments share: spaces, keywords, and reading and setting in flight."""
 
 import inspect
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, TypedDict
 
@@ -205,7 +204,8 @@ class BatchEnv:
         self.batch.wrench[:, rows] = make_wrench(forces, torques, force_frame, torque_frame)
 
     def set_wind(self, velocity: ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
-        """Set the velocity of the air until you set another.
+        """Set the velocity of the air until you set another; if ``randomize`` samples a wind, until
+        the next episode.
 
         It acts through drag alone, and a warning says so if no vehicle here has ``drag``.
 
@@ -214,12 +214,8 @@ class BatchEnv:
         """
         rows = self.batch.rows(indices)
         self.batch.wind[:, rows] = per_row("wind", velocity, rows.size, 3)
-        if self.batch.wind.any() and not self.batch.may_have_drag:
-            warnings.warn(
-                f"set_wind: wind acts through drag, and {self.vehicle.name} has none;"
-                " give a vehicle with drag",
-                stacklevel=2,
-            )
+        if self.batch.wind.any():
+            self.batch.warn_without_drag("set_wind")
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the observation noise until you set another.

@@ -59,6 +59,7 @@ class BatchVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; return the observations (n, ...)."""
+        refuse_options(self)
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
         return self._begin(np.arange(self.num_envs))
@@ -122,6 +123,16 @@ class BatchVecEnv(VecEnv):
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
 
+def refuse_options(env: VecEnv) -> None:
+    """Refuse options of a reset, which SB3 passes through a method of their own, before it."""
+    if any(env._options):
+        env._reset_options()
+        raise ConfigError(
+            "reset options: a batched environment takes none; "
+            "set things after reset(), by methods such as set_target"
+        )
+
+
 def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyArray:
     """Return a copy of what a method has given, as an array.
 
@@ -129,13 +140,21 @@ def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyA
     :raises ConfigError: another shape, or numbers that are not finite.
     """
     with raised_as(ConfigError, f"{what} are no numbers"):
-        array = np.array(values, dtype)
+        given = np.array(values)
+        # Integers and booleans hide what is not finite or does not fit.
+        with np.errstate(invalid="ignore"):
+            array = given.astype(dtype)
     # None, of a method without a return, would be a number of shape ().
     if values is None:
         raise ConfigError(f"{what}: None; return an array of shape {shape}")
     if array.shape != shape:
         raise ConfigError(f"{what} of shape {array.shape}: must be of shape {shape}")
-    if not np.isfinite(array).all():
-        row = np.argwhere(~np.isfinite(array))[0, 0]
-        raise ConfigError(f"{what}: row {row} has a number that is not finite")
+    unfit = ~np.isfinite(array)
+    reason = "a number that is not finite"
+    if not np.issubdtype(array.dtype, np.floating):
+        unfit = array != given
+        reason = f"a number that is no {array.dtype}"
+    if unfit.any():
+        row = np.argwhere(unfit)[0, 0]
+        raise ConfigError(f"{what}: row {row} has {reason}")
     return array

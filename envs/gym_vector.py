@@ -86,8 +86,8 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
             raise ConfigError(
                 "reset options: the batched environment takes none; call set_target after reset()"
             )
-        if isinstance(seed, (int, np.integer)):
-            seed = row_seeds(int(seed), self.num_envs)
+        if seed is not None and np.ndim(seed) == 0:
+            seed = row_seeds(seed, self.num_envs)
         if seed is not None and len(seed) != self.num_envs:
             raise ConfigError(
                 f"seed: {len(seed)} numbers for {self.num_envs} environments; "

@@ -16,9 +16,8 @@ from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.envs.rendering.window import Client, has_display, open_window
 from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.settings import ENDLESS, AsList
-from sb3_quad.simulation.state import P
+from sb3_quad.simulation.state import POSITION, P
 from sb3_quad.simulation.tasks import TaskSpec
-from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector = Annotated[tuple[float, float, float], AsList]
 Quaternion = Annotated[tuple[float, float, float, float], AsList]
@@ -202,8 +201,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `set_noise(level)` | the relative standard deviation of the observation noise |
 
     Force and torque act in the frames `force_frame="world"` and `torque_frame="body"` unless you
-    give others. If `randomize` samples them, the next episode has its own. Wind acts on vehicles
-    with `drag`.
+    give others. If `randomize` samples them or a wind, the next episode has its own. Wind acts on
+    vehicles with `drag`.
 
     `true_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`, `observation_std`,
     `task`, `task_kwargs` and `vehicle` return the current values.
@@ -257,6 +256,25 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
                 "render_mode='rgb_array' makes pictures\n"
             )
 
+    def __getstate__(self) -> StrDict:
+        """Return all but the simulation, which PyBullet can neither copy nor save."""
+        return {**vars(self), "_body": None, "_renderer": None}
+
+    def __setstate__(self, state: StrDict) -> None:
+        """Go on with the same flight in a simulation of its own."""
+        vars(self).update(state)
+        self._open()
+        if self._has_begun:
+            self._place()
+
+    def _place(self) -> None:
+        """Put the body where the batch says, and begin to draw there."""
+        # Each episode may have another vehicle.
+        self._body.become(self.batch.vehicles[:, 0])
+        self._body.place(self.true_state())
+        if self._renderer is not None:
+            self._renderer.reset(self.batch.state[:, 0])
+
     def reset(
         self, *, seed: int | None = None, options: StrDict | None = None
     ) -> tuple[Float32Array, StrDict]:
@@ -268,23 +286,26 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         """
         super().reset(seed=seed)
         # Check the options before anything changes.
-        fixed = _fixed_parts(options or {}, self.vehicle)
+        fixed = _fixed_parts(options or {})
         batch = self.batch
         if seed is not None:
             batch.seed([seed])
+        # What follows may raise, and the body is not yet where the batch is.
+        self._has_begun = False
         batch.reset()
         for name, values in fixed:
             batch.fix(name, values[:, None])
-
+        radius = batch.vehicles[P.collision_radius, 0]
+        position = batch.state[POSITION, 0]
+        if position[2] <= radius:
+            raise ConfigError(
+                f"position {position.tolist()}: touches the ground; z must exceed {radius:g} m"
+            )
         # The simulation was closed, or the user has shut its window.
         if not self._body.connected:
             self._open()
-        # Each episode may have another vehicle.
-        self._body.become(batch.vehicles[:, 0])
-        self._body.place(self.true_state())
+        self._place()
         self._has_begun = True
-        if self._renderer is not None:
-            self._renderer.reset(batch.state[:, 0])
         if self.render_mode == "human":
             self._draw()
         # The outcome that an info shows is that of the new episode.
@@ -357,7 +378,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         return np.asarray(super()._by_row(columns)[0])
 
 
-def _fixed_parts(options: StrMapping, vehicle: Vehicle) -> list[tuple[str, FloatArray]]:
+def _fixed_parts(options: StrMapping) -> list[tuple[str, FloatArray]]:
     """Return the quantities of the state that the options of a reset fix, with their values."""
     given = validate(_ResetOptions, options, "options")
     fixed = []
@@ -365,11 +386,6 @@ def _fixed_parts(options: StrMapping, vehicle: Vehicle) -> list[tuple[str, Float
         if value is None:
             continue
         values = np.array(value)
-        if name == "position" and values[2] <= vehicle.collision_radius:
-            raise ConfigError(
-                f"position {values.tolist()}: touches the ground; "
-                f"z must exceed {vehicle.collision_radius} m"
-            )
         if name == "quaternion":
             norm = np.linalg.norm(values)
             if norm < 1e-6:

@@ -10,11 +10,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from typing_extensions import Unpack
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import IntArray, StrDict
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
-from sb3_quad.envs.batch_vec_env import BatchVecEnv
+from sb3_quad.envs.batch_vec_env import BatchVecEnv, refuse_options
 from sb3_quad.simulation.tape import FlightTape
 from sb3_quad.simulation.tasks import TaskSpec
 
@@ -60,8 +60,9 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     A row that ends begins its next episode within the same step. Its info then holds
     ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``, ``l``, ``t`` as of SB3's
     Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
-    infos of other rows are empty. The list of infos is the environment's own and changes with the
-    next step; the arrays are new ones.
+    infos of other rows are empty. The list of infos and the dictionaries in it are the
+    environment's own, and it uses them again: a wrapper that writes into one should write into a
+    copy. The arrays are new ones.
 
     Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
 
@@ -100,13 +101,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
 
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; observations float32 (n, observation size)."""
-        # SB3 passes options through a method of their own, before the reset.
-        if any(self._options):
-            self._reset_options()
-            raise ConfigError(
-                "reset options: the batched environment takes none; "
-                "call set_target and the like after reset()"
-            )
+        refuse_options(self)
         if any(seed is not None for seed in self._seeds):
             self.batch.seed(self._seeds)
             self._reset_seeds()

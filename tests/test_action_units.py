@@ -201,6 +201,24 @@ class Doubled(gym.ActionWrapper):
         return np.sign(action) * np.sqrt(np.abs(action) / 8.0)
 
 
+class Speeds(gym.ActionWrapper):
+    """Takes rotor speeds, whose squares are thrusts."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = spaces.Box(0.0, 1.0, env.action_space.shape)
+
+    def action(self, action):
+        return 2.0 * np.square(action) - 1.0
+
+
+class Throttles(Speeds):
+    """Takes throttles in another order of motors."""
+
+    def action(self, action):
+        return 2.0 * action[[3, 1, 2, 0]] - 1.0
+
+
 class Below(gym.ActionWrapper):
     """Another wrapper that keeps the space."""
 
@@ -240,7 +258,7 @@ def test_a_model_that_has_learnt_without_the_wrapper_teaches_through_it():
 
 @pytest.mark.parametrize(
     "wrapper",
-    [Doubled, lambda env: rescaled(0.0, 1.0)(Doubled(env))],
+    [Doubled, Speeds, Throttles, lambda env: rescaled(0.0, 1.0)(Doubled(env))],
 )
 def test_labels_that_no_wrapper_takes_are_refused(wrapper):
     with pytest.raises(ExpertError, match="RescaleAction") as raised:

@@ -129,6 +129,7 @@ def test_its_random_numbers_follow_the_seed():
         (1, lambda gained: gained / 0.0, "advance: rewards: row 0"),
         (2, lambda failed: failed[:, None], "advance: terminated of shape"),
         (2, lambda failed: None, "advance: terminated: None"),
+        (2, lambda failed: failed + np.nan, "advance: terminated: row 0 has a number that is no"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value")
@@ -143,6 +144,22 @@ def test_what_advance_returns_is_checked(place, change, says):
     env.reset()
     with pytest.raises(ConfigError, match=says):
         env.step(np.zeros((3, 1), np.float32))
+
+
+def test_options_of_a_reset_are_refused():
+    env = Rows(3)
+    env.set_options({"start": (1, 2)})
+    with pytest.raises(ConfigError, match="reset options: a batched environment takes none"):
+        env.reset()
+    env.reset()
+
+
+def test_what_an_integer_cannot_hold_is_refused():
+    env = Rows(3)
+    env.observation_space = spaces.Box(0, 255, (2,), np.uint8)
+    env.begin = lambda rows: np.full((len(rows), 2), 300.7)
+    with pytest.raises(ConfigError, match=r"begin: .* row 0 has a number that is no uint8"):
+        env.reset()
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,13 @@ def test_pybullet_gives_the_same_flights(task, vehicle):
     same(*flights)
 
 
+def test_pybullet_flies_what_each_row_has():
+    rows = {"vehicle": ["crazyflie", "itm"], "noise": [0.1, 0.0]}
+    rows["observation_std"] = np.outer([1.0, 2.0], np.ones(18))
+    expert = load_pretrained("itm-recovery")
+    same(*(fly(expert, "state_recovery", 2, backend=b, max_steps=60, **rows) for b in BACKENDS))
+
+
 @settings(max_examples=settings().max_examples // 20)
 @given(seed=st.integers(0, 2**20), n=st.integers(1, 5))
 def test_rows_do_not_depend_on_their_number(seed, n):

@@ -121,6 +121,7 @@ def test_gymnasiums_wrappers_count_each_episode_once(mode):
     ("call", "says"),
     [
         (lambda: make(3).reset(seed=[1, 2]), "2 numbers for 3"),
+        (lambda: make(2).reset(seed=1.5), "seed 1.5 is not a whole number"),
         (lambda: make(3).reset(options={"target": (0, 0, 1)}), "reset options"),
         (lambda: make(2, autoreset_mode="NextSteps"), "did you mean 'NextStep'"),
         (lambda: make(2, render_mode="human"), "render_mode"),

@@ -2,6 +2,8 @@
 equations, bad input.
 """
 
+import copy
+import pickle
 import re
 import subprocess
 import sys
@@ -293,6 +295,12 @@ def test_bad_actions_raise(env: QuadcopterEnv, action: Any, message: str) -> Non
         ),
         (lambda env: env.reset(options={"state": {"position": (0, 0, 0.1)}}), "ground"),
         (lambda env: env.reset(options={"state": 3}), "state"),
+        (lambda env: QuadcopterEnv(task_kwargs={"start_position": (0, 0, 0.1)}), "at once"),
+        (lambda env: QuadcopterVecEnv(2, seed=-1), "seed -1 is not a whole number"),
+        (
+            lambda env: QuadcopterVecEnv(1, reference={"curve": "circle", "heading": True}),
+            "reference.heading",
+        ),
         (lambda env: env.reset(options={"target": (0, 0)}), "options: target"),
         (lambda env: env.set_target((0, 0, np.nan)), "position .*finite"),
         (lambda env: env.set_wrench(force=(1, 2)), r"force of shape \(2,\): must be \(3,\)"),
@@ -325,6 +333,21 @@ def test_bad_input_raises_and_names_the_thing(env: QuadcopterEnv, call: Any, mes
     with pytest.raises(ConfigError, match=message) as caught:
         call(env)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_flies_on_by_itself(copied: Any) -> None:
+    env = QuadcopterEnv("state_recovery", vehicles={"distribution": "raptor"})
+    env.reset(seed=1)
+    action = np.full(4, 0.1, dtype=np.float32)
+    for _ in range(20):
+        env.step(action)
+    other = copied(env)
+    ahead = [other.step(action)[0] for _ in range(20)]
+    np.testing.assert_allclose([env.step(action)[0] for _ in range(20)], ahead, atol=1e-6)
+    env.close()
+    other.step(action)
+    other.close()
 
 
 def test_closing_twice_leaves_other_environments_open() -> None:

@@ -580,6 +580,8 @@ def test_targets_wait_for_the_first_reset():
 def test_wind_without_drag_warns():
     with pytest.warns(UserWarning, match="wind acts through drag, and itm has none"):
         QuadcopterVecEnv(1).set_wind((1, 0, 0))
+    with pytest.warns(UserWarning, match="randomize: wind acts through drag"):
+        QuadcopterVecEnv(1, randomize={"wind": [0, 4]})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         QuadcopterVecEnv(1).set_wind()

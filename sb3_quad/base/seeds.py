@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from sb3_quad.base.errors import ConfigError, raised_as
+
 Purpose = Literal[
     "training",
     # Evaluations during a training.
@@ -54,7 +56,8 @@ def row_seeds(seed: int, n: int) -> list[int]:
     The seed of row i does not depend on n. All are below 2**53, which any file format and any
     language keep exactly.
     """
-    return [_hash(seed, _ROW, row) for row in range(n)]
+    with raised_as(ConfigError, f"seed {seed!r} is not a whole number of 0 or more"):
+        return [_hash(seed, _ROW, row) for row in range(n)]
 
 
 def _hash(seed: int, *key: int) -> int:

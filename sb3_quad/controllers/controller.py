@@ -115,7 +115,7 @@ class Controller:
         self._own_limits: Float32Array | None = None
         if isinstance(own, spaces.Box) and not np.allclose(limits_of(own), self._limits):
             self._own_limits = limits_of(own)
-            if not np.allclose(_limits_below(env, action_space), self._own_limits):
+            if not _is_straight(env, action_space, own):
                 way_out = "no wrapper such as RescaleAction leads straight from these to those"
                 if hasattr(source, "action_space"):
                     way_out = (
@@ -287,12 +287,22 @@ def limits_of(space: spaces.Box) -> Float32Array:
     return np.stack([space.low.ravel(), space.high.ravel()]).astype(np.float32)
 
 
-def _limits_below(env: VecEnv | None, space: spaces.Box) -> Any:
-    """Return what the outermost action wrapper makes of the limits of its actions."""
+def _is_straight(env: VecEnv | None, space: spaces.Box, own: spaces.Box) -> bool:
+    """Whether the outermost action wrapper scales the actions of ``space`` to those of ``own``,
+    component by component.
+    """
     if env is None or not env.has_attr("action"):
-        return limits_of(space)
-    made = [env.env_method("action", limit, indices=[0])[0] for limit in (space.low, space.high)]
-    return np.reshape(made, (2, -1))
+        return False
+    # Within the limits, where every component has another share, a wrapper that bends or renumbers
+    # them is seen.
+    inner = np.linspace(0.2, 0.8, space.low.size).reshape(space.shape)
+    for share in (0.0, 1.0, inner, 0.7 * inner):
+        action = space.low + share * (space.high - space.low)
+        expected = own.low + share * (own.high - own.low)
+        made = env.env_method("action", action.astype(space.dtype), indices=[0])[0]
+        if not np.allclose(made, expected, atol=1e-5):
+            return False
+    return True
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.simulation.batch import QuadcopterBatch, StepResult
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import TARGET
 
@@ -64,8 +65,15 @@ class PyBulletFleet(Fleet):
             "reference": None,
             "disable_env_checker": True,
         }
-        # By its id, since PyBullet may be missing, which matters here only.
-        self._envs: list[Any] = [gymnasium.make(ENV_ID, **keywords).unwrapped for _ in seeds]
+        self._envs: list[Any] = []
+        for row, vehicle in enumerate(self.vehicle_list):
+            scaling = self.scaling_of_rows[:, row]
+            keywords["vehicle"] = vehicle
+            keywords["observation_mean"] = scaling[:OBSERVATION_SIZE]
+            keywords["observation_std"] = scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
+            keywords["noise"] = {"relative": scaling[-2], "additive": scaling[-1]}
+            # By its id, since PyBullet may be missing, which matters here only.
+            self._envs.append(gymnasium.make(ENV_ID, **keywords).unwrapped)
 
     def begin(self, start: Mapping[str, FloatArray]) -> Float32Array:
         super().begin(start)

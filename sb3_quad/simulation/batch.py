@@ -1,5 +1,6 @@
 """n quadcopters as arrays: the part that all environments share."""
 
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
@@ -45,7 +46,7 @@ from sb3_quad.simulation.state import (
     drag_forces,
     row_slices,
 )
-from sb3_quad.simulation.tasks import resolve_tasks
+from sb3_quad.simulation.tasks import T, resolve_tasks
 from sb3_quad.simulation.threads import share_out
 from sb3_quad.simulation.tracks import COURSE_SIZE, C, complete
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
@@ -149,6 +150,7 @@ class QuadcopterBatch:
         self.course = np.zeros((COURSE_SIZE, n * (len(tracks.table) > 0)))
 
         self.task_parameters, self.task_weights = resolve_tasks(settings.task, settings.task_kwargs)
+        self._refuse_starts_on_the_ground()
         self.task_index = np.zeros(n, dtype=np.int64)
         steps = np.array(settings.max_episode_steps, dtype=np.int64, ndmin=1)
         self.max_steps = steps[repeated("max_episode_steps", steps.size, n)]
@@ -194,7 +196,18 @@ class QuadcopterBatch:
             self.distribution_numbers = self.distribution.numbers()
         for vehicle in hardest:
             self.randomize.hardest(vehicle)
+        if self.randomize.wind or self.randomize.wind_gusts:
+            self.warn_without_drag("randomize")
         return vehicles
+
+    def _refuse_starts_on_the_ground(self) -> None:
+        lowest = self.task_parameters[:, T.start_position + 2].min()
+        radius = self.base_vehicles[P.collision_radius].max()
+        if lowest <= radius:
+            raise ConfigError(
+                f"start_position: z {lowest:g} touches the ground, and every episode would end at"
+                f" once; it must exceed the collision radius, {radius:g} m"
+            )
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """Give rows new random streams, from one seed each. Their next reset begins the first
@@ -347,6 +360,15 @@ class QuadcopterBatch:
         if self.distribution is not None and self.distribution.drag is not None:
             return True
         return self.has_drag or self.randomize.drag is not None
+
+    def warn_without_drag(self, what: str) -> None:
+        """Warn of wind that does nothing, and say what has set it."""
+        if not self.may_have_drag:
+            warnings.warn(
+                f"{what}: wind acts through drag, and {self.vehicle_list[0].name} has none;"
+                " give a vehicle with drag, or randomize.drag",
+                stacklevel=3,
+            )
 
     def total_wrench(self) -> FloatArray:
         """Return the external wrench of this control step, (WRENCH_SIZE, n): the one that was set

@@ -26,6 +26,7 @@ from sb3_quad.simulation.motions import (
     sum_of_sines,
 )
 from sb3_quad.simulation.state import AHEAD, REFERENCE_PARTS, REFERENCE_SIZE, row_slices
+from sb3_quad.vehicles.vehicle import Number
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]
@@ -100,7 +101,7 @@ class Reference(Frozen):
     """random_smooth: limit of the acceleration, m/s²"""
     resting: float = Field(default=0.0, ge=0, le=1)
     """random_smooth: share of pieces that rest"""
-    heading: Literal["path", "random"] | float | None = None
+    heading: Literal["path", "random"] | Number | None = None
     """at the start, rad; path: along the velocity; random: of each piece of random_smooth its own,
     with a rate up to heading_rate; None: none is commanded"""
     heading_rate: float = Field(default=0.0, ge=-20, le=20)

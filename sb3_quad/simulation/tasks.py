@@ -39,7 +39,8 @@ class Task(Frozen):
     nearest_target: Length | None = None
     """if given, |r_T - r0| is uniform between this and target_distance, m"""
     target_clearance: Length = 0.25
-    """least height of a target above the ground, beyond the collision radius, m"""
+    """least height of a target above the ground, beyond the collision radius, where its distance
+    from the start allows it, m"""
     random_attitude: bool = False
     """start attitude uniform on SO(3), else level"""
     velocity_std: Speed = 0.0

@@ -92,6 +92,7 @@ class VehicleDistribution(Frozen):
             "name": "sampled",
             "thrust_limits": (self.least_thrust.high, self.thrust_to_weight.low),
             "motor_gain": 1.0 / fastest,
+            "motor_integration": "exact",  # as sampled vehicles have it
             "inertia": self.inertia_ratios or base.inertia,
         }
         return flyable(base, changes, "vehicles")
