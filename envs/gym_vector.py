@@ -86,7 +86,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
             raise ConfigError(
                 "reset options: the batched environment takes none; call set_target after reset()"
             )
-        if seed is not None and np.ndim(seed) == 0:
+        if not (seed is None or isinstance(seed, (Sequence, np.ndarray))):
             seed = row_seeds(seed, self.num_envs)
         if seed is not None and len(seed) != self.num_envs:
             raise ConfigError(
