@@ -318,6 +318,29 @@ def test_an_interrupted_pipeline_resumes_to_the_same_agents(tmp_path, capsys, mo
             np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.parametrize(
+    "flags",
+    [
+        [],
+        ["--thesis"],
+        ["--algo", "dagger"],
+        ["--conf-file", "value_based/two_stage.yml"],
+    ],
+)
+def test_files_in_the_working_folder_do_not_replace_the_packages(
+    tmp_path, monkeypatch, capsys, flags
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robust").mkdir()
+    for name in ("dagger.yml", "two_stage.yml", "thesis.yml", "robust/dagger.yml"):
+        (tmp_path / name).write_text("Pendulum-v1: {}")
+    assert main(["train", *flags, "--env-kwargs", "noise:-1"]) == 2
+    assert "noise" in capsys.readouterr().err
+    # A file that the user names is read.
+    assert main(["train", "--algo", "dagger", "--conf-file", "dagger.yml"]) == 2
+    assert "dagger.yml: unknown environment in this file" in capsys.readouterr().err
+
+
 def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
     pipeline = load_pipeline(
         write(tmp_path, [STAGES[0], {**STAGES[0], "name": "two", "seed_offset": 10}])

@@ -151,7 +151,17 @@ def load_pipeline(conf_file: StrPath) -> Pipeline:
 
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
     """
-    return validate(Pipeline, *SETTINGS.read(conf_file))
+    pipeline = validate(Pipeline, *SETTINGS.read(conf_file))
+    if not SETTINGS.is_packaged(conf_file):
+        return pipeline
+    # The stages of a packaged pipeline have packaged settings, whatever lies in the user's folder.
+    stages = []
+    for stage in pipeline.stages:
+        if stage.conf_file is not None:
+            settings = str(SETTINGS.packaged(stage.conf_file))
+            stage = stage.model_copy(update={"conf_file": settings})
+        stages.append(stage)
+    return Pipeline(stages=stages)
 
 
 def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
@@ -178,7 +188,7 @@ def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
     file = options.get("conf_file")
     # Without any of these, the default is a pipeline rather than a single run.
     if not options.keys() & {"algo", "env", "conf_file"}:
-        file = DEFAULT_PIPELINE
+        file = SETTINGS.packaged(DEFAULT_PIPELINE)
     if file is not None and is_pipeline(file):
         for key in KEPT_BY_STAGES:
             if key in options:
