@@ -28,6 +28,7 @@ from sb3_quad.training.config import (
     TrainingConfig,
     TrainingJob,
     as_agent,
+    build_config,
     describe,
     load_config,
     merged,
@@ -105,7 +106,7 @@ class Status(Pipeline):
     job: StrDict
     """options of every job"""
     runs: list[str]
-    """the run folders of the stages that have begun"""
+    """the run folders of the stages that have begun, in the log folder"""
 
 
 class StageResult(NamedTuple):
@@ -211,7 +212,8 @@ def run_pipeline(
     """Train the stages one after the other, each from the agent that the one before passed on.
 
     Their run folders lie where those of single runs lie.
-    ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them.
+    ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them; beside it are the settings of each
+    stage, ``stage_<number>.yml``.
 
     :param job: options of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq``
         and ``eval_episodes`` take precedence.
@@ -221,12 +223,18 @@ def run_pipeline(
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was
         missed.
     """
-    status = Status(stages=pipeline.stages, job=dict(job), runs=[])
     jobs = stage_jobs(pipeline, job)
     folder = claim_folder(Path(jobs[0].log_folder) / name, name)
-    # The stages are written, too, since the settings file may change before a resume.
+    # The settings are written, too, since the files that hold them may change before a resume.
+    stages = []
+    for number, (stage, planned) in enumerate(zip(pipeline.stages, jobs, strict=True)):
+        settings = f"stage_{number}.yml"
+        content = {stage.env: planned.config.settings}
+        write_text(folder / settings, yaml.safe_dump(content, sort_keys=False))
+        stages.append(stage.model_copy(update={"conf_file": settings, "settings": {}}))
+    status = Status(stages=stages, job=dict(job), runs=[])
     _write_status(folder, status.model_dump(mode="json", exclude_defaults=True))
-    return resume_pipeline(folder, report)
+    return resume_pipeline(folder, report, log_folder=jobs[0].log_folder)
 
 
 def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
@@ -271,20 +279,38 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     """
     content, where = SETTINGS.read(folder / STATUS_FILE)
     status = validate(Status, content, where)
-    jobs = stage_jobs(status, {**status.job, **changes})
+    # The paths are found from any folder. Those of an older version begin in the one that trained.
+    log_folder = folder.absolute().parent.parent
+    stages = []
+    for stage in status.stages:
+        settings = folder / str(stage.conf_file)
+        if settings.is_file():
+            stage = stage.model_copy(update={"conf_file": str(settings)})
+        stages.append(stage)
+    jobs = stage_jobs(
+        Pipeline(stages=stages), {**status.job, "log_folder": str(log_folder), **changes}
+    )
     runs = list(status.runs)
     results = {}
     agent = ""
 
     def note(number: int, run: RunFolder) -> None:
         """Note a stage's run folder before its training begins."""
-        runs[number:] = [str(run.path)]
+        runs[number:] = [run.path.absolute().relative_to(log_folder).as_posix()]
         _write_status(folder, {**content, "runs": runs})
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
         try:
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
-                run = open_run(runs[number]) if number < len(runs) else None
+                run = None
+                if number < len(runs):
+                    place = log_folder / runs[number]
+                    run = open_run(place if place.is_dir() else runs[number])
+                    # Files that an older version names may have changed since.
+                    config = build_config(
+                        stage.algo, stage.env, run.read_yaml()[0], str(run.config)
+                    )
+                    job = job.model_copy(update={"config": config})
                 if run and run.timesteps >= job.config.n_timesteps:
                     seconds = trained_seconds(run)
                 else:
@@ -293,7 +319,9 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
                     # A run that has a model and no snapshot cannot be resumed.
                     if run and (run.not_begun or run.resume_state.is_file()):
-                        trained = resume(runs[number], report, **changes)
+                        trained = resume(
+                            str(run.path), report, **changes, trained_agent=job.trained_agent
+                        )
                     else:
                         trained = train(job, report, on_start=partial(note, number))
                     run = trained.run
