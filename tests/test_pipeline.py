@@ -171,6 +171,10 @@ def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, messa
     [
         (["-n", "100"], "n_timesteps goes with a single run"),
         (["--conf-file", "two_stage.yml", "--algo", "dagger"], "algo goes with a single run"),
+        (
+            ["--algo", "dagger", "--hyperparams", "n_timesteps:100", "-n", "200"],
+            "n_timesteps: given by itself and in hyperparams",
+        ),
         (["--thesis", "--conf-file", "two_stage.yml"], "not allowed with argument --thesis"),
         (
             ["--algo", "dagger", "--env-kwargs", "noise:0", "--env-kwargs", "noise:1"],

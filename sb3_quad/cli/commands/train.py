@@ -56,6 +56,7 @@ from sb3_quad.training.options import (
     KEPT_BY_STAGES,
     JobOptions,
     SettingsOptions,
+    all_changes,
 )
 
 THESIS = "thesis.yml"
@@ -171,5 +172,5 @@ def plan(options: Namespace) -> Any:
 
     return plan_training(
         given(options, "conf_file", *KEPT_BY_STAGES),
-        {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)},
+        all_changes(options.hyperparams or {}, given(options, *SettingsOptions.model_fields)),
     )
