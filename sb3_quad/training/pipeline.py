@@ -4,6 +4,7 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -335,7 +336,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
             if not signals.received:
                 raise
     if signals.received:
-        report(f"to resume the whole pipeline: --resume {folder}")
+        report(f"to resume the whole pipeline: --resume {shlex.quote(str(folder))}")
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
