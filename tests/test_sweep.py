@@ -250,6 +250,18 @@ def test_a_dry_run_of_a_sweep_that_was_begun_lists_its_runs(tmp_path, capsys):
     assert "remove --log-folder" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["pid", "nominal"])
+def test_a_sweep_of_the_package_refuses_a_file_that_would_replace_its_settings(
+    tmp_path, capsys, monkeypatch, name
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nominal").mkdir()
+    for file in ("thesis.yml", "nominal/dagger.yml"):
+        (tmp_path / file).write_text("QuadStateRecovery-v0: {}")
+    assert main(["sweep", name, "--dry-run"]) == 2
+    assert "would replace the package's in the sweep" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", SWEEPS.names())
 def test_sweeps_of_the_package_make_runs(name, trained_runs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
