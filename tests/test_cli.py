@@ -156,6 +156,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
         "mean time to 0.1 m",
         "mean path",
         "trained in",
+        f"{ENV}.zip, the last one; the commands below name best_model.zip",
         str(run),
     ):
         assert part in output

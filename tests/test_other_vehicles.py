@@ -78,8 +78,10 @@ def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(
     )
     flown = load_vehicle(settings["env_kwargs"]["vehicle"])
     assert flown == load_vehicle(vehicle)
-    status = yaml.safe_load(next((here / "logs" / "stages").rglob("pipeline.yml")).read_text())
-    assert load_vehicle(status["stages"][0]["settings"]["env_kwargs"]["vehicle"]) == flown
+    (stage,) = yaml.safe_load(
+        next((here / "logs" / "stages").rglob("stage_0.yml")).read_text()
+    ).values()
+    assert load_vehicle(stage["env_kwargs"]["vehicle"]) == flown
 
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()

@@ -108,7 +108,9 @@ def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
         np.array_equal(one[key], two[key]) for key in one if key != "log_std"
     )
     status = yaml.safe_load((result.folder / "pipeline.yml").read_text(encoding="utf-8"))
-    assert status["runs"] == [entry.run for entry in result.stages.values()]
+    assert [str(tmp_path / "logs" / run) for run in status["runs"]] == [
+        entry.run for entry in result.stages.values()
+    ]
 
 
 def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
@@ -169,6 +171,10 @@ def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, messa
     [
         (["-n", "100"], "n_timesteps goes with a single run"),
         (["--conf-file", "two_stage.yml", "--algo", "dagger"], "algo goes with a single run"),
+        (
+            ["--algo", "dagger", "--hyperparams", "n_timesteps:100", "-n", "200"],
+            "n_timesteps: given by itself and in hyperparams",
+        ),
         (["--thesis", "--conf-file", "two_stage.yml"], "not allowed with argument --thesis"),
         (
             ["--algo", "dagger", "--env-kwargs", "noise:0", "--env-kwargs", "noise:1"],
@@ -285,16 +291,19 @@ def test_a_stage_gives_the_alpha_of_its_correction(tmp_path, job, monkeypatch):
     assert [line for line in lines if "steady offset 1.000 m, now 0.500 m" in line]
 
 
-def small_file(tmp_path):
-    return write(
-        tmp_path, [{**stage, "settings": {**TINY, **stage.get("settings", {})}} for stage in STAGES]
-    )
+def small_file(tmp_path, **changes):
+    """Write a pipeline whose stages have their settings from a file."""
+    settings = tmp_path / "small.yml"
+    settings.write_text(yaml.safe_dump({stage["env"]: {**TINY, **changes} for stage in STAGES}))
+    return write(tmp_path, [{**stage, "conf_file": str(settings)} for stage in STAGES])
 
 
-def test_an_interrupted_pipeline_resumes_to_the_same_agents(tmp_path, capsys, monkeypatch):
-    whole, interrupted = (str(tmp_path / name) for name in ("whole", "interrupted"))
+def test_an_interrupted_pipeline_resumes_from_anywhere_to_the_same_agents(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     arguments = ["train", "--conf-file", str(small_file(tmp_path)), "--eval-episodes", "0"]
-    assert main([*arguments, "-f", whole]) == 0
+    assert main([*arguments, "-f", "whole"]) == 0
 
     original, rollouts = PPOBC.train, []
 
@@ -305,8 +314,12 @@ def test_an_interrupted_pipeline_resumes_to_the_same_agents(tmp_path, capsys, mo
             os.kill(os.getpid(), signal.SIGINT)  # within the second stage, when the first is done
 
     monkeypatch.setattr(PPOBC, "train", train)
-    assert main([*arguments, "-f", interrupted]) == 130
+    assert main([*arguments, "-f", "interrupted"]) == 130
     folder = next((tmp_path / "interrupted" / "stages").iterdir())
+    # Neither the settings file, which has changed, nor the working folder is needed any more.
+    small_file(tmp_path, n_timesteps=512)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
     capsys.readouterr()
     assert main(["train", "--resume", str(folder)]) == 0
     assert capsys.readouterr().out.count("fresh episodes, the same for all") == 2
@@ -316,6 +329,46 @@ def test_an_interrupted_pipeline_resumes_to_the_same_agents(tmp_path, capsys, mo
         )
         for ours, theirs in zip(policy(one).values(), policy(two).values(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_a_pipeline_of_an_older_version_keeps_its_finished_stages(tmp_path, job, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stages = load_pipeline(small_file(tmp_path))
+    result = run_pipeline(stages, {**job, "log_folder": "logs"}, "stages", quiet)
+    # It named the user's files, and the runs' folders from the working folder.
+    path = result.folder / "pipeline.yml"
+    status = yaml.safe_load(path.read_text(encoding="utf-8"))
+    status["stages"] = stages.model_dump(mode="json", exclude_defaults=True)["stages"]
+    status["runs"] = [entry.run for entry in result.stages.values()]
+    path.write_text(yaml.safe_dump(status), encoding="utf-8")
+    small_file(tmp_path, n_timesteps=512)
+    monkeypatch.setattr(pipeline_module, "train", None)
+    resumed = resume_pipeline(result.folder, quiet)
+    assert [entry.run for entry in resumed.stages.values()] == status["runs"]
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        [],
+        ["--thesis"],
+        ["--algo", "dagger"],
+        ["--conf-file", "value_based/two_stage.yml"],
+    ],
+)
+def test_files_in_the_working_folder_do_not_replace_the_packages(
+    tmp_path, monkeypatch, capsys, flags
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robust").mkdir()
+    for name in ("dagger.yml", "two_stage.yml", "thesis.yml", "robust/dagger.yml"):
+        (tmp_path / name).write_text("Pendulum-v1: {}")
+    assert main(["train", *flags, "--env-kwargs", "noise:-1"]) == 2
+    assert "noise" in capsys.readouterr().err
+    # A file that the user names is read.
+    assert main(["train", "--algo", "dagger", "--conf-file", "dagger.yml"]) == 2
+    assert "dagger.yml: unknown environment in this file" in capsys.readouterr().err
 
 
 def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):

@@ -146,6 +146,12 @@ def test_the_overview_shows_published_shares_and_what_varies_has_a_table_of_succ
     assert [row.name for row in table.rows] == ["0", "0.1"]
 
 
+def test_small_print_of_cells_holds_what_they_share(parts):
+    cells = "2 flights of each controller in each of 2 cells"
+    assert parts["noise"].facts == f"{cells}, 0.5 s; seed 0."
+    assert parts["drop"].facts == f"{cells}, 3 s; observation noise 5 %; seed 0."
+
+
 def test_nothing_in_the_page_leads_outside(page):
     parsed = Page(page.read_text(encoding="utf-8"))
     assert {"table", "figure", "svg"} <= set(parsed.tags)

@@ -194,6 +194,12 @@ def test_what_is_random_in_a_scenario_is_part_of_it_and_changes_no_others():
             scenario(entry)
 
 
+def test_the_vehicle_that_is_asked_for_flies_also_where_each_episode_has_its_own():
+    changed = load_suite("quadcopters").with_changes(vehicle="crazyflie")
+    for entry in changed.scenarios:
+        assert entry.vehicle == "crazyflie" and entry.vehicles is None
+
+
 @given(
     seed=st.integers(0, 2**31),
     tilt=st.floats(0, 180),

@@ -422,6 +422,19 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
         (["pid", "-n", "0", "--no-render"], "--n-timesteps"),
         (["pid", "--speed", "0", "--no-render"], "--speed"),
         (["pid", "pid", "--no-render"], "label"),
+        (["pid", "--load-best", "--no-render"], "--load-best chooses a run's agent"),
+        (["pid", "--load-last-checkpoint", "--no-render"], "--load-last-checkpoint chooses"),
+        (["pid", "--load-checkpoint", "9", "--no-render"], "--load-checkpoint chooses"),
+        (["pid", "--exp-id", "7", "--no-render"], "--exp-id chooses"),
+        (["pid", "-f", "nowhere", "--no-render"], "--folder chooses"),
+        (
+            ["pid", "--vehicle", "itm", "--env-kwargs", "vehicle:crazyflie", "--no-render"],
+            "vehicle: given by --vehicle and by --env-kwargs",
+        ),
+        (
+            ["pid", "--reference", "circle", "--env-kwargs", "reference:line", "--no-render"],
+            "reference: given by --reference and by --env-kwargs",
+        ),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, capsys):

@@ -154,6 +154,26 @@ def test_entries_of_a_list_have_their_names_and_inherit():
         ({"eval_freq": "often"}, [], "eval_freq"),
         ({"evaluation": {"suite": "no-such"}}, [], "no-such"),
         ({"resources": {"num_cpus": -1}}, [], "num_cpus"),
+        (
+            {"configurations": [{"name": "a", "n_timesteps": 480}]},
+            ["-n", "960"],
+            "n_timesteps differs between the runs of ",
+        ),
+        (
+            {"configurations": [{"env_kwargs": {"noise": 0.1}}]},
+            ["--env-kwargs", "noise:0"],
+            "env_kwargs.noise differs between the runs of ",
+        ),
+        (
+            {"grid": {"hyperparams.learning_rate": [1e-3, 5e-3]}},
+            ["--hyperparams", "learning_rate:0.1"],
+            "hyperparams.learning_rate differs between the runs of ",
+        ),
+        (
+            {"hyperparams": {"n_timesteps": 480}, "n_timesteps": 960},
+            [],
+            "n_timesteps: given by itself and in hyperparams",
+        ),
         ({}, ["--executor", "rya"], "did you mean 'ray'"),
         ({}, ["--address", "auto"], "goes with --executor ray"),
         ({}, ["--executor", "ray"], "pip install '.[ray]'"),
@@ -217,6 +237,29 @@ def test_dry_run_lists_the_runs(tmp_path, capsys, monkeypatch):
         "2 runs",
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["s.yaml"]
+
+
+def test_a_dry_run_of_a_sweep_that_was_begun_lists_its_runs(tmp_path, capsys):
+    begun = spec(seed=[3, 4], grid={"algo": ["dagger"]})
+    write_sweep(tmp_path, Sweep(spec=begun, runs=make_runs(begun)))
+    resume = ["sweep", "--resume", str(tmp_path)]
+    assert main([*resume, "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "2 runs"
+    assert not (tmp_path / "runs").exists()
+    assert main([*resume, "-f", "elsewhere"]) == 2
+    assert "remove --log-folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["pid", "nominal"])
+def test_a_sweep_of_the_package_refuses_a_file_that_would_replace_its_settings(
+    tmp_path, capsys, monkeypatch, name
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nominal").mkdir()
+    for file in ("thesis.yml", "nominal/dagger.yml"):
+        (tmp_path / file).write_text("QuadStateRecovery-v0: {}")
+    assert main(["sweep", name, "--dry-run"]) == 2
+    assert "would replace the package's in the sweep" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", SWEEPS.names())

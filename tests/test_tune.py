@@ -4,10 +4,12 @@ never lost.
 
 import csv
 import os
+import shlex
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import optuna
@@ -23,6 +25,7 @@ from sb3_quad.cli import main
 from sb3_quad.training.algorithms import ALGORITHMS
 from sb3_quad.training.config import build_config, load_config
 from sb3_quad.tuning import search as search_module
+from sb3_quad.tuning.results import train_command
 from sb3_quad.tuning.search import score
 from sb3_quad.tuning.space import SPACES, load_space
 
@@ -165,15 +168,48 @@ def test_a_search_leaves_settings_that_train_takes_and_resumes(command, capsys):
     assert not folder(4).exists()
 
 
-def test_the_first_trial_has_the_settings_as_they_are(command):
+@pytest.mark.parametrize(
+    ("name", "value", "settings", "evaluated"),
+    [
+        ("noise", 0.4, {}, {"noise": 0.05}),
+        ("noise", 0.4, {"env_kwargs": "dict(noise=0.2)"}, {"noise": 0.2}),
+        ("noise", 0.4, {"eval_env_kwargs": {"noise": 0.1}}, {"noise": 0.1}),
+        # The agent needs these as it was trained.
+        ("history", 2, {}, {}),
+    ],
+)
+def test_trials_are_evaluated_in_the_same_environment(tmp_path, name, value, settings, evaluated):
+    path = tmp_path / "space.yml"
+    path.write_text(yaml.safe_dump({f"env_kwargs.{name}": [value]}))
+    space = load_space(build_config("dagger", ENV, {**SMALL, **settings}), path)
+    trial = space.settings({f"env_kwargs.{name}": value})
+    assert trial["env_kwargs"][name] == value
+    assert trial.get("eval_env_kwargs", {}) == evaluated
+
+
+def test_the_command_that_trains_can_be_pasted():
+    config = SimpleNamespace(algo="dagger", env_id=ENV)
+    job = SimpleNamespace(config=config, log_folder="my logs", trained_agent="my agent.zip")
+    command = shlex.split(train_command(SimpleNamespace(job=job)))
+    assert command[-3:] == [str(Path("my logs", "best.yml")), "-i", "my agent.zip"]
+
+
+def test_the_first_trial_has_the_settings_as_they_are(command, capsys):
     settings = {
         **SMALL,
         "policy_kwargs": "dict(net_arch=[8], log_std_init=-1.5)",
         "bc_loss": "huber",
+        "best_by": "survival",
     }
     Path("small.yml").write_text(yaml.safe_dump({ENV: settings}))
     assert main([*command, "--n-trials", "1"]) == 0
-    assert varied(trials()[0]) == ("lin_0.001", "huber", "-1.5")
+    (trial,) = trials()
+    assert varied(trial) == ("lin_0.001", "huber", "-1.5")
+    # The rate has its own name.
+    with np.load(Path(trial["run"]) / "evaluations.npz") as file:
+        assert float(trial["survival_rate"]) == file["survivals"][-1].mean()
+    assert "success_rate" not in trial
+    assert "trial 0 finished, survival" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -120,12 +120,24 @@ class YamlFolder(NamedTuple):
         if self.is_path(source):
             return read_text(source), str(source)
         name = str(source)
+        text = self.packaged(name).read_text(encoding="utf-8")
+        return text, name.removesuffix(self.suffix) + self.suffix
+
+    def is_packaged(self, source: StrPath) -> bool:
+        """Whether a source is a file of the package, by name or as :meth:`packaged` returns it."""
+        return not self.is_path(source) or source in self._files().values()
+
+    def packaged(self, name: str) -> Any:
+        """Return the path of a file of the package, which no file of the user's replaces.
+
+        :raises ConfigError: An unknown name.
+        """
         files = self._files()
         if name not in files:
             raise ConfigError(
                 f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file"
             )
-        return files[name].read_text(encoding="utf-8"), name.removesuffix(self.suffix) + self.suffix
+        return files[name]
 
     def read(self, source: StrPath) -> tuple[dict[Any, Any], str]:
         """Return the keys and values of a file by name or path, and its name for messages.

@@ -63,6 +63,9 @@ def close_run(result: TrainingResult) -> int:
         return result.exit_code
     if result.job.config.task:
         print_agent(result.job, result.model)
+        run = result.run
+        if run.result != run.model:
+            print(f"agent: {run.model}, the last one; the commands below name {run.result.name}")
     # A complete run without evaluations does not know how long it took.
     if result.seconds:
         print(f"trained in {result.seconds:.1f} s")

@@ -98,13 +98,26 @@ def _flights_section(
 ) -> Section:
     """The section of a scenario, or of the cells that ``vary`` makes of one."""
     first = scenarios[0]
-    flown = f"{first.episodes} flights of each controller"
+    # What differs between the cells is left out.
+    conditions = []
+    for scenario in scenarios:
+        flown = f"{scenario.episodes} flights of each controller"
+        if first.group is not None:
+            flown += f" in each of {len(scenarios)} cells"
+        conditions.append(
+            (
+                flown,
+                f", {scenario.duration:g} s",
+                f"; observation noise {in_words(scenario.noise)}",
+                f"; seed {scenario.seed}",
+            )
+        )
+    shared = [texts[0] for texts in zip(*conditions, strict=True) if len({*texts}) == 1]
     tables = []
     if first.group is None:
         tables.append(group_table(results, results.colours, heading, scenarios))
         plots = _scenario_plots(results, first, folder)
     else:
-        flown += f" in each of {len(scenarios)} cells"
         # A grid of several quantities has too many cells for a table.
         if len(first.cell) == 1:
             (key,) = first.cell
@@ -119,8 +132,7 @@ def _flights_section(
         first.description,
         tables,
         plots,
-        f"{flown}, {first.duration:g} s; observation noise {in_words(first.noise)};"
-        f" seed {first.seed}.",
+        "".join(shared).lstrip(",; ") + ".",
     )
 
 

@@ -14,7 +14,7 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import Configuration, SweepSpec
-from sb3_quad.training.options import RunOptions, SettingsOptions
+from sb3_quad.training.options import RunOptions, SettingsOptions, all_changes
 from sb3_quad.training.pipeline import Pipeline, Stage, plan_training, stage_jobs
 from sb3_quad.vehicles.vehicle import first_vehicle
 
@@ -106,7 +106,7 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
         job["trained_agent"] = agent_path(configuration.trained_agent)
         if not Path(job["trained_agent"]).is_file():
             raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
-    changes = configuration.hyperparams | configuration.given(SettingsOptions)
+    changes = all_changes(configuration.hyperparams, configuration.given(SettingsOptions))
     if configuration.vehicle is not None:
         put_key(changes, "env_kwargs.vehicle", configuration.vehicle, "vehicle")
     plan = plan_training(configuration.given(Configuration), changes)

@@ -11,11 +11,13 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.training.algorithms import as_list
+from sb3_quad.training.config import SETTINGS
 from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.vehicles.vehicle import NAME
 
@@ -85,7 +87,18 @@ class SweepSpec(Configuration):
 def load_sweep(source: StrPath) -> SweepSpec:
     """Load the sweep in a YAML file, by path or by the name of one in the package.
 
-    :raises ConfigError: an unreadable file, or a key that is unknown or does not fit.
+    :raises ConfigError: an unreadable file, or a key that is unknown or does not fit; a sweep of
+        the package where a file of the user's is called like one of its settings files.
     """
     data, where = SWEEPS.read(source)
-    return validate(SweepSpec, {"name": Path(source).stem, **data}, where)
+    spec = validate(SweepSpec, {"name": Path(source).stem, **data}, where)
+    if SWEEPS.is_path(source):
+        return spec
+    for own in ({"conf_file": spec.conf_file}, *spec.configurations):
+        file = own.get("conf_file")
+        if file and SETTINGS.is_path(file):
+            raise ConfigError(
+                f"{file} in this folder would replace the package's in the sweep {source}; "
+                "sweep in another folder"
+            )
+    return spec

@@ -335,7 +335,8 @@ def load_config(
     # A misspelt name would otherwise be reported as a missing file.
     get_algorithm(algo)
     check_environment(env_id)
-    content, where = SETTINGS.read(conf_file or f"{algo}.yml")
+    # A file of the user's that is called like the default is not meant.
+    content, where = SETTINGS.read(conf_file or SETTINGS.packaged(f"{algo}.yml"))
     if env_id not in content:
         missing = unknown("environment in this file", env_id, map(str, content))
         raise ConfigError(f"{where}: {missing}; give another with --conf-file")

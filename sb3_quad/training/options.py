@@ -11,7 +11,7 @@ from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
 from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import Seed
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import Frozen
 
 # What is trained where none of the three is given; the algorithm and the environment of a single
@@ -54,6 +54,16 @@ class SettingsOptions(Frozen):
     """environment keywords, such as noise:0"""
     eval_env_kwargs: StrDict | None = None
     """environment keywords for evaluations only"""
+
+
+def all_changes(hyperparams: StrMapping, options: StrMapping) -> StrDict:
+    """Return the changes to a settings file: hyperparameters, and keys with a flag of their own.
+
+    :raises ConfigError: a key that both give, of which one would be ignored.
+    """
+    for key in sorted(hyperparams.keys() & options.keys()):
+        raise ConfigError(f"{key}: given by itself and in hyperparams; remove it from one of them")
+    return {**hyperparams, **options}
 
 
 class RunOptions(Frozen):

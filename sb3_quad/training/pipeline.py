@@ -4,6 +4,7 @@ The two stages of the thesis (4.2) are one. A pipeline's file lists its stages i
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -28,6 +29,7 @@ from sb3_quad.training.config import (
     TrainingConfig,
     TrainingJob,
     as_agent,
+    build_config,
     describe,
     load_config,
     merged,
@@ -105,7 +107,7 @@ class Status(Pipeline):
     job: StrDict
     """options of every job"""
     runs: list[str]
-    """the run folders of the stages that have begun"""
+    """the run folders of the stages that have begun, in the log folder"""
 
 
 class StageResult(NamedTuple):
@@ -151,7 +153,17 @@ def load_pipeline(conf_file: StrPath) -> Pipeline:
 
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
     """
-    return validate(Pipeline, *SETTINGS.read(conf_file))
+    pipeline = validate(Pipeline, *SETTINGS.read(conf_file))
+    if not SETTINGS.is_packaged(conf_file):
+        return pipeline
+    # The stages of a packaged pipeline have packaged settings, whatever lies in the user's folder.
+    stages = []
+    for stage in pipeline.stages:
+        if stage.conf_file is not None:
+            settings = str(SETTINGS.packaged(stage.conf_file))
+            stage = stage.model_copy(update={"conf_file": settings})
+        stages.append(stage)
+    return Pipeline(stages=stages)
 
 
 def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
@@ -178,7 +190,7 @@ def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
     file = options.get("conf_file")
     # Without any of these, the default is a pipeline rather than a single run.
     if not options.keys() & {"algo", "env", "conf_file"}:
-        file = DEFAULT_PIPELINE
+        file = SETTINGS.packaged(DEFAULT_PIPELINE)
     if file is not None and is_pipeline(file):
         for key in KEPT_BY_STAGES:
             if key in options:
@@ -201,7 +213,8 @@ def run_pipeline(
     """Train the stages one after the other, each from the agent that the one before passed on.
 
     Their run folders lie where those of single runs lie.
-    ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them.
+    ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them; beside it are the settings of each
+    stage, ``stage_<number>.yml``.
 
     :param job: options of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq``
         and ``eval_episodes`` take precedence.
@@ -211,12 +224,18 @@ def run_pipeline(
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was
         missed.
     """
-    status = Status(stages=pipeline.stages, job=dict(job), runs=[])
     jobs = stage_jobs(pipeline, job)
     folder = claim_folder(Path(jobs[0].log_folder) / name, name)
-    # The stages are written, too, since the settings file may change before a resume.
+    # The settings are written, too, since the files that hold them may change before a resume.
+    stages = []
+    for number, (stage, planned) in enumerate(zip(pipeline.stages, jobs, strict=True)):
+        settings = f"stage_{number}.yml"
+        content = {stage.env: planned.config.settings}
+        write_text(folder / settings, yaml.safe_dump(content, sort_keys=False))
+        stages.append(stage.model_copy(update={"conf_file": settings, "settings": {}}))
+    status = Status(stages=stages, job=dict(job), runs=[])
     _write_status(folder, status.model_dump(mode="json", exclude_defaults=True))
-    return resume_pipeline(folder, report)
+    return resume_pipeline(folder, report, log_folder=jobs[0].log_folder)
 
 
 def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
@@ -261,20 +280,38 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     """
     content, where = SETTINGS.read(folder / STATUS_FILE)
     status = validate(Status, content, where)
-    jobs = stage_jobs(status, {**status.job, **changes})
+    # The paths are found from any folder. Those of an older version begin in the one that trained.
+    log_folder = folder.absolute().parent.parent
+    stages = []
+    for stage in status.stages:
+        settings = folder / str(stage.conf_file)
+        if settings.is_file():
+            stage = stage.model_copy(update={"conf_file": str(settings)})
+        stages.append(stage)
+    jobs = stage_jobs(
+        Pipeline(stages=stages), {**status.job, "log_folder": str(log_folder), **changes}
+    )
     runs = list(status.runs)
     results = {}
     agent = ""
 
     def note(number: int, run: RunFolder) -> None:
         """Note a stage's run folder before its training begins."""
-        runs[number:] = [str(run.path)]
+        runs[number:] = [run.path.absolute().relative_to(log_folder).as_posix()]
         _write_status(folder, {**content, "runs": runs})
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
         try:
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
-                run = open_run(runs[number]) if number < len(runs) else None
+                run = None
+                if number < len(runs):
+                    place = log_folder / runs[number]
+                    run = open_run(place if place.is_dir() else runs[number])
+                    # Files that an older version names may have changed since.
+                    config = build_config(
+                        stage.algo, stage.env, run.read_yaml()[0], str(run.config)
+                    )
+                    job = job.model_copy(update={"config": config})
                 if run and run.timesteps >= job.config.n_timesteps:
                     seconds = trained_seconds(run)
                 else:
@@ -283,7 +320,9 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
                     # A run that has a model and no snapshot cannot be resumed.
                     if run and (run.not_begun or run.resume_state.is_file()):
-                        trained = resume(runs[number], report, **changes)
+                        trained = resume(
+                            str(run.path), report, **changes, trained_agent=job.trained_agent
+                        )
                     else:
                         trained = train(job, report, on_start=partial(note, number))
                     run = trained.run
@@ -297,7 +336,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
             if not signals.received:
                 raise
     if signals.received:
-        report(f"to resume the whole pipeline: --resume {folder}")
+        report(f"to resume the whole pipeline: --resume {shlex.quote(str(folder))}")
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 

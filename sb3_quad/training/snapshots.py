@@ -4,6 +4,7 @@ import io
 import json
 import os
 import random
+import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -150,7 +151,7 @@ def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: A
     if not path.is_file():
         message = f"run folder {run.path}: holds no interrupted run"
         if run.result.is_file():
-            message += f"; to train its model further use -i {run.result}"
+            message += f"; to train its model further use -i {shlex.quote(str(run.result))}"
         raise ConfigError(message)
     state = read_arrays(path)
     try:

@@ -7,6 +7,7 @@ that was not interrupted; elsewhere the episodes start again.
 
 import copy
 import pickle
+import shlex
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -123,7 +124,8 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     ):
         if run.timesteps >= config.n_timesteps:
             report(
-                f"complete, {run.timesteps:,} timesteps; to train its agent further: -i {run.path}"
+                f"complete, {run.timesteps:,} timesteps; to train its agent further: "
+                f"-i {shlex.quote(str(run.path))}"
             )
             return TrainingResult(job, run, load_model(run.model, job.device), trained_seconds(run))
         if run.not_begun:
@@ -339,7 +341,7 @@ class _Training:
                 raise ConfigError(f"{error}; interrupted{where}") from error
             self._refuse_removed_folder()
         name = self.signals.name + (where or " before the first rollout")
-        self.report(f"interrupted by {name}; to resume: --resume {self.run.path}")
+        self.report(f"interrupted by {name}; to resume: --resume {shlex.quote(str(self.run.path))}")
 
     def _refuse_removed_folder(self) -> None:
         """:raises TrainingError: the run folder was removed while it was trained.

@@ -1,5 +1,6 @@
 """The files of a search: the best settings as YAML, all trials as CSV."""
 
+import shlex
 from pathlib import Path
 
 import yaml
@@ -7,7 +8,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrDict
-from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, STATES, SUCCESS, Search
+from sb3_quad.tuning.search import ERROR, INTERRUPTED, RATE, REWARD, RUN, STATES, Search
 
 BEST = "best.yml"
 TRIALS = "trials.csv"
@@ -23,12 +24,14 @@ def write_results(search: Search) -> None:
 
     folder = Path(search.job.log_folder)
     # The table is written after each trial, so that an interruption loses none.
-    columns = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds"]
+    rate = f"{search.job.config.best_by}_rate"
+    columns = ["number", "state", "value", rate, REWARD, "evaluations", "seconds"]
     columns += [*search.space.dimensions, RUN, ERROR]
     rows = []
     for trial in search.trials():
         row: StrDict = {
             **trial.user_attrs,
+            rate: trial.user_attrs.get(RATE),
             **search.space.values(trial.params),
             "number": trial.number,
             "state": trial.state.name,
@@ -60,10 +63,10 @@ def train_command(search: Search) -> str:
     config = search.job.config
     command = (
         f"sb3-quad train --algo {config.algo} --env {config.env_id} "
-        f"--conf-file {Path(search.job.log_folder, BEST)}"
+        f"--conf-file {shlex.quote(str(Path(search.job.log_folder, BEST)))}"
     )
     if search.job.trained_agent:
-        command += f" -i {search.job.trained_agent}"
+        command += f" -i {shlex.quote(search.job.trained_agent)}"
     return command
 
 
@@ -75,7 +78,7 @@ def trial_line(search: Search, trial: FrozenTrial) -> str:
         end += f": {known[ERROR]}"
     else:
         if search.job.config.task is not None:
-            end += f", success {100 * known[SUCCESS]:.1f} %"
+            end += f", {search.job.config.best_by} {100 * known[RATE]:.1f} %"
         end += f", mean reward {known[REWARD]:.2f}"
     values = " ".join(
         f"{name}:{value}" for name, value in search.space.values(trial.params).items()

@@ -57,7 +57,8 @@ STATES = {
 BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials share
 # User attributes of a trial. The owner is the machine and the process that trains it.
 OWNER = "owner"
-SUCCESS = "success_rate"
+# The rate that decides, which is that of survival where best_by says so.
+RATE = "success_rate"
 REWARD = "mean_reward"
 RUN = "run"
 ERROR = "error"
@@ -189,13 +190,13 @@ class Search:
         every = math.ceil(total / self.n_evaluations)
         values = []
 
-        def should_continue(success: float, reward: float) -> bool:
+        def should_continue(rate: float, reward: float) -> bool:
             if config.task is None:
                 values.append(reward)
             else:
-                values.append(score(success, reward, self.job.eval_episodes))
+                values.append(score(rate, reward, self.job.eval_episodes))
             trial.report(values[-1], len(values))
-            trial.set_user_attr(SUCCESS, success)
+            trial.set_user_attr(RATE, rate)
             trial.set_user_attr(REWARD, reward)
             return len(values) >= self.n_evaluations or not trial.should_prune()
 

@@ -25,6 +25,7 @@ from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.algorithms import constructor_parameters, takes_whole
 from sb3_quad.training.config import TrainingConfig, build_config
 
@@ -87,6 +88,8 @@ class SearchSpace(NamedTuple):
             outer, _, inner = name.partition(".")
             if inner:
                 value = {**_entries(changed.get(outer)), inner: value}
+            if outer == "env_kwargs":
+                self._pin(changed, inner)
             changed[outer] = value
         if MINIBATCHES in changed:
             # All of the same size, but for the last, which may be smaller.
@@ -94,6 +97,19 @@ class SearchSpace(NamedTuple):
             config = build_config(self.config.algo, self.config.env_id, changed)
             changed["batch_size"] = math.ceil(config.rollout / count)
         return changed
+
+    def _pin(self, settings: StrDict, name: str) -> None:
+        """Keep a varied keyword of the environment as it is in evaluations, so that all trials are
+        evaluated on the same episodes.
+
+        What an agent's observations and rotors depend on stays as in its training.
+        """
+        base = _entries(self.config.settings.get("env_kwargs"))
+        if self.config.task:
+            base = {**self.config.flight_settings.model_dump(mode="json"), **base}
+        evaluated = _entries(settings.get("eval_env_kwargs"))
+        if name in base and name not in FlightSettings().observed:
+            settings["eval_env_kwargs"] = {name: base[name], **evaluated}
 
     def start(self) -> StrDict | None:
         """Return the parameters that stand for the settings as they are; None if one of these lies

@@ -134,7 +134,7 @@ def _environments(sizes: list[int], n_envs: int) -> list[Subject]:
     import numpy as np
     from gymnasium.wrappers import Autoreset
 
-    from sb3_quad.training.config import build_config, load_config
+    from sb3_quad.training.config import SETTINGS, build_config, load_config
     from sb3_quad.training.environments import make_environments
 
     subjects = []
@@ -153,7 +153,8 @@ def _environments(sizes: list[int], n_envs: int) -> list[Subject]:
         add("PyBullet, one environment", 1, Autoreset(gymnasium.make(ENV_ID)))
         add_vectorised("PyBullet, DummyVecEnv", "dummy", n_envs)
         add_vectorised("PyBullet, SubprocVecEnv", "subproc", n_envs)
-    robust = load_config("dagger", TRAINED, "robust/dagger.yml").env_kwargs["randomize"]
+    settings = SETTINGS.packaged("robust/dagger.yml")
+    robust = load_config("dagger", TRAINED, settings).env_kwargs["randomize"]
     for size in sizes:
         add_vectorised("batch", "batch", size)
         add_vectorised("batch, figure eight", "batch", size, reference="figure_eight")

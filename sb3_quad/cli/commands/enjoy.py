@@ -58,6 +58,8 @@ PICTURE = ".png"
 # Width and height of the only panel, and of one of several, pixels.
 SINGLE = (640, 480)
 PANEL = (480, 480)
+# The flags that say which agent of --algo flies.
+AGENT_OF_RUN = ("folder", "exp_id", "load_best", "load_checkpoint", "load_last_checkpoint")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -74,12 +76,12 @@ def _size(text: str) -> tuple[int, int]:
 FLAGS: Flags = {
     # The run folder, and the agent in it.
     "--algo": "algorithm of a trained agent, which is looked up in the log folder",
-    "-f --folder --log-folder DIR": (str, "logs", "folder that holds the run folders (logs)"),
-    "--exp-id N": (whole, 0, "number of the run (0: the latest one that has an agent)"),
+    "-f --folder --log-folder DIR": (str, None, "folder that holds the run folders (logs)"),
+    "--exp-id N": (whole, None, "number of the run (0: the latest one that has an agent)"),
     "agent": {
-        "--load-best": (SWITCH, "fly the best agent of the evaluations"),
+        "--load-best": (SWITCH, None, "fly the best agent of the evaluations"),
         "--load-checkpoint N": (whole, "fly the checkpoint after N timesteps"),
-        "--load-last-checkpoint": (SWITCH, "fly the last checkpoint"),
+        "--load-last-checkpoint": (SWITCH, None, "fly the last checkpoint"),
     },
     "episode": {
         "--env": f"environment id ({DEFAULT_ENV})",
@@ -179,6 +181,12 @@ def _check(options: Namespace, window: bool) -> None:
         raise ConfigError(
             "no controller given: name one, such as pid or agent.zip, or a run by --algo and --env"
         )
+    if not options.algo:
+        for name in given(options, *AGENT_OF_RUN):
+            flag = name.replace("_", "-")
+            raise ConfigError(f"--{flag} chooses a run's agent, so it needs --algo; remove it")
+    for name in given(options, "vehicle", "reference", "task").keys() & options.env_kwargs.keys():
+        raise ConfigError(f"{name}: given by --{name} and by --env-kwargs; remove one of them")
     env_id = options.env or DEFAULT_ENV
     if env_id not in ENVIRONMENTS:
         raise ConfigError(
@@ -259,10 +267,11 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
     from sb3_quad.training.algorithms import get_algorithm
     from sb3_quad.training.runs import find_run
 
-    if not (Path(options.folder) / options.algo).is_dir():
+    folder = options.folder or "logs"
+    if not (Path(folder) / options.algo).is_dir():
         # Raises if there is no such algorithm.
         get_algorithm(options.algo)
-    run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
+    run = find_run(folder, options.algo, options.env or DEFAULT_ENV, options.exp_id or 0)
     if options.load_last_checkpoint:
         path = run.latest_checkpoint()
     elif options.load_best:

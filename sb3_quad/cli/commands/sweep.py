@@ -21,6 +21,7 @@ The new folder receives the run folders, results.csv, results.json, report.md
 and report.html. For the keys of the file, see docs/sweeps.md.
 """
 
+import shlex
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -85,15 +86,19 @@ def run(options: Namespace) -> int:
     from sb3_quad.sweep.runs import make_runs, suite_of
     from sb3_quad.sweep.spec import SweepSpec
 
+    folder = None
     if options.resume is not None:
-        refuse_with_resume(options, "sweep", *SweepSpec.model_fields, "suite", "episodes")
+        refuse_with_resume(
+            options, "sweep", *SweepSpec.model_fields, "suite", "episodes", "log_folder"
+        )
         folder = Path(options.resume)
-        return _execute(options, read_sweep(folder), folder)
-    spec = _spec(options)
-    import_packages(spec.gym_packages, "gym_packages:")
-    sweep = Sweep(spec=spec, runs=make_runs(spec), suite=suite_of(spec))
+        sweep = read_sweep(folder)
+    else:
+        spec = _spec(options)
+        import_packages(spec.gym_packages, "gym_packages:")
+        sweep = Sweep(spec=spec, runs=make_runs(spec), suite=suite_of(spec))
     if not options.dry_run:
-        return _execute(options, sweep, None)
+        return _execute(options, sweep, folder)
     for planned in sweep.runs:
         stages = [
             f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
@@ -108,7 +113,10 @@ def _spec(options: Namespace) -> Any:
     """Return the :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line.
 
     Flags replace the keys of the file.
+
+    :raises ConfigError: a flag whose key differs between the configurations of the file.
     """
+    from sb3_quad.base.errors import ConfigError
     from sb3_quad.base.literals import put_key
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
@@ -116,12 +124,26 @@ def _spec(options: Namespace) -> Any:
     data: StrDict = {"name": "sweep"}
     if options.sweep is not None:
         data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
+    # The entries of mappings as a grid has them, such as env_kwargs.noise.
+    varied = {*data.get("grid", {})}
+    for configuration in data.get("configurations", ()):
+        for key, value in configuration.items():
+            inner = [f"{key}.{name}" for name in value] if isinstance(value, dict) else [key]
+            varied.update(inner)
     for name, value in given(options, *SweepSpec.model_fields, "suite", "episodes").items():
         # A flag takes the place of a key of the grid, and its pairs are added to those of the file.
-        data.get("grid", {}).pop(name, None)
+        if data.get("grid", {}).pop(name, None):
+            varied.discard(name)
+        place = PLACES.get(name, name)
+        given_keys = {place}
         if isinstance(value, dict):
+            given_keys = {f"{name}.{key}" for key in value}
             value = data.get(name, {}) | value
-        put_key(data, PLACES.get(name, name), value, name)
+        for key in sorted(given_keys & varied):
+            raise ConfigError(
+                f"{key} differs between the runs of {options.sweep}; remove the flag that gives it"
+            )
+        put_key(data, place, value, name)
     return validate(SweepSpec, data, options.sweep or "command line")
 
 
@@ -171,7 +193,7 @@ def _execute(options: Namespace, sweep: Any, folder: Path | None) -> int:
     for name, message in results.failed.items():
         print(f"failed: {name}: {message}", file=sys.stderr)
     if signals.received:
-        print("to continue: --resume", folder)
+        print("to continue: --resume", shlex.quote(str(folder)))
         return signals.exit_code
     return int(bool(results.failed))
 

@@ -40,6 +40,7 @@ from sb3_quad.cli.parser import (
     PAIRS,
     PROGRESS,
     SEVERAL,
+    SWITCH,
     TRUST,
     Flags,
     field_flags,
@@ -55,6 +56,7 @@ from sb3_quad.training.options import (
     KEPT_BY_STAGES,
     JobOptions,
     SettingsOptions,
+    all_changes,
 )
 
 THESIS = "thesis.yml"
@@ -98,7 +100,7 @@ FLAGS: Flags = {
     "settings": {
         **CONF_FILE,
         "--thesis": (
-            {"action": "store_const", "dest": "conf_file", "const": THESIS},
+            SWITCH,
             f"the thesis's method: --conf-file {THESIS}",
         ),
         "--resume RUN_FOLDER": "continue an interrupted or killed run with all its settings",
@@ -117,7 +119,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.cli.closing import close_pipeline, close_run
     from sb3_quad.cli.output import shows_progress
     from sb3_quad.training import pipeline
-    from sb3_quad.training.config import TrainingJob, describe
+    from sb3_quad.training.config import SETTINGS, TrainingJob, describe
     from sb3_quad.training.trainer import resume, train
 
     if options.resume is not None:
@@ -131,6 +133,8 @@ def run(options: Namespace) -> int:
             return close_run(resume(options.resume, **job))
         result = pipeline.resume_pipeline(folder, **job)
     else:
+        if options.thesis:
+            options.conf_file = SETTINGS.packaged(THESIS)
         stages = plan(options)
         if isinstance(stages, pipeline.Stage):
             checked = validate(TrainingJob, {"config": stages.load(), **job}, "command line")
@@ -168,5 +172,5 @@ def plan(options: Namespace) -> Any:
 
     return plan_training(
         given(options, "conf_file", *KEPT_BY_STAGES),
-        {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)},
+        all_changes(options.hyperparams or {}, given(options, *SettingsOptions.model_fields)),
     )

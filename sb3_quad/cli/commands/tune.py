@@ -27,6 +27,7 @@ Ctrl-C keeps the finished trials. Needs Optuna: pip install '.[tune]' from a
 clone.
 """
 
+import shlex
 from argparse import Namespace
 from contextlib import suppress
 from pathlib import Path
@@ -159,5 +160,5 @@ def _print_results(search: Any) -> None:
         print("to train:", train_command(search))
     print(
         f"saved in {search.job.log_folder}; to continue, run the same command with "
-        f"--storage {search.storage} --study-name {search.name}"
+        f"--storage {shlex.quote(str(search.storage))} --study-name {shlex.quote(search.name)}"
     )

@@ -293,8 +293,9 @@ class Suite(Frozen):
         """Return a suite of some of these scenarios, with other numbers, seeds or another vehicle.
 
         :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
-        :param vehicle: name, or path of a YAML file, that flies all scenarios. Forces and torques
-            stay the same, in N and N m; published metrics, of another vehicle, are removed.
+        :param vehicle: name, or path of a YAML file, that flies all scenarios, also those
+            with ``vehicles``. Forces and torques stay the same, in N and N m; published metrics, of
+            another vehicle, are removed.
         :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible
             for the vehicle.
         """
@@ -302,7 +303,7 @@ class Suite(Frozen):
         changes = {key: value for key, value in chosen.items() if value is not None}
         flown_by = ""
         if vehicle is not None:
-            changes["published"] = {}
+            changes |= {"vehicles": None, "published": {}}
             flown_by = f", flown by {vehicle}"
         known = set[str]()
         changed = []
