@@ -277,7 +277,7 @@ def warn_of_vehicle(source: Any, vehicles: Sequence[Any]) -> None:
                 f"{name}: is made for the vehicle {known.name} and flies"
                 f" {name_beside(known, flown)}; make it for this one: {name}(vehicle), or give a"
                 " privileged expert, which knows the vehicle of each row",
-                stacklevel=3,
+                stacklevel=4,
             )
             return
 

@@ -18,7 +18,11 @@ from sb3_quad.base.errors import ControllerError, raised_as, refuse_unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
-from sb3_quad.controllers.agent_settings import settings_of_model, unlike_trained
+from sb3_quad.controllers.agent_settings import (
+    settings_of_model,
+    unlike_trained,
+    warn_of_observation,
+)
 from sb3_quad.controllers.controller import Controller, warn_of_vehicle
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.batch_env import quadcopter_spaces
@@ -178,8 +182,8 @@ def fly(
         true state; an SB3 model, its zip or the name of a shipped one, asked by
         ``predict(observation, deterministic=True)``; or a function from observations
         (n, observation size) to actions (n, 4). An agent does not bring the vehicle and the
-        observations that it was trained with: give them by :func:`~sb3_quad.env_kwargs`, or call
-        :func:`~sb3_quad.evaluation.compare.compare`.
+        observations that it was trained with, and you are warned if they differ: give them by
+        :func:`~sb3_quad.env_kwargs`, or call :func:`~sb3_quad.evaluation.compare.compare`.
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
         ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
@@ -209,17 +213,27 @@ def fly(
         environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", max_steps)
     settings = FlightSettings().with_changes(task=task, vehicle=vehicle, noise=noise, **environment)
-    # A distribution has no particular vehicle.
-    if settings.vehicles is None:
-        warn_of_vehicle(controller, settings.load_vehicles())
-        if own is not None:
-            name = type(controller).__name__
-            notice = unlike_trained(name, own, first_vehicle(settings.vehicle))
-            if notice:
-                warnings.warn(f"{notice}; give **env_kwargs(the agent)", stacklevel=2)
+    warn_of_differences(type(controller).__name__, controller, settings)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
+
+
+def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
+    """Warn of a controller that flies another vehicle than it knows, or observes something else.
+
+    :param name: what the warning calls it.
+    """
+    warn_of_observation(name, controller, settings)
+    # A distribution has no particular vehicle.
+    if settings.vehicles is not None:
+        return
+    warn_of_vehicle(controller, settings.load_vehicles())
+    own = settings_of_model(controller)
+    if own is not None:
+        notice = unlike_trained(name, own, first_vehicle(settings.vehicle))
+        if notice:
+            warnings.warn(f"{notice}; sb3_quad.env_kwargs(agent) gives its own", stacklevel=3)
 
 
 def episode_seeds(seed: int, n_flights: int) -> list[int]:
