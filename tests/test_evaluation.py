@@ -170,6 +170,9 @@ def test_an_own_reward_that_does_not_fit_is_named(reward, message):
         ({"seed": -1}, "seed -1: must be a whole number of 0 to"),
         ({"seed": 0.5}, "seed 0.5"),
         ({"tolerances": "near"}, "tolerances 'near': must be numbers"),
+        ({"tolerances": -1.0}, r"tolerances \[-1.0\]: must be greater than 0 m"),
+        ({"tolerances": [0.1, 0.0]}, "must be greater than 0 m"),
+        ({"max_episode_steps": [100, 300]}, r"max_episode_steps \[100, 300\]: must be one number"),
     ],
 )
 def test_numbers_that_do_not_fit_are_named(keywords, message):

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ControllerError, raised_as, refuse_unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
@@ -205,6 +205,8 @@ def fly(
     """
     seeds = episode_seeds(seed, n_flights)
     limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
+    if min(limits, default=1.0) <= 0.0:
+        raise ConfigError(f"tolerances {limits}: must be greater than 0 m")
     layout = environment.get("rotor_layout")
     controller = resolve_expert(controller, vehicle, "controller", layout)
     own = settings_of_model(controller)
@@ -264,6 +266,11 @@ def fly_settings(
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
     refuse_unknown("backend", [backend], FLEETS)
+    if isinstance(settings.max_episode_steps, list):
+        raise ConfigError(
+            f"max_episode_steps {settings.max_episode_steps}: must be one number, the limit of all"
+            " flights"
+        )
     plan = plan or Plan()
     if isinstance(reward, type):
         # A reward that remembers, such as the last actions, begins afresh with these episodes.
@@ -297,7 +304,7 @@ def fly_settings(
         for hook in hooks:
             hook.on_start(state, vehicle)
 
-        for step in range(1, settings.longest_episode + 1):
+        for step in range(1, settings.max_episode_steps + 1):
             time = step * vehicle.control_step
             # Disturbances of the plan begin and end between two control steps.
             if step - 1 in plan.wrenches:
