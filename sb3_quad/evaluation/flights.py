@@ -341,11 +341,13 @@ def fly_settings(
                 following.update(step, state, flying)
             for hook in hooks:
                 hook.after_step(step, state, actions, flying)
+            # The outcome of the last step is that of the target until then.
+            on_last = course.on_last
             if not flying.any():
                 break
             # Whoever has reached a waypoint sees the next one from the next step on.
             onward = course.update(time, distance, flying)
-            if onward.size:
+            if onward.size and step < settings.max_episode_steps:
                 fleet.state[TARGET, onward] = plan.waypoints[course.next[onward]].T
                 observation = fleet.observe()
 
@@ -359,7 +361,7 @@ def fly_settings(
         # Neither a course nor a target that moves has a straight line to deviate from.
         has_no_line = following.moves | (plan.waypoints.size > 0)
         return Flights(
-            success=outcome["success"] & course.on_last,
+            success=outcome["success"] & on_last,
             survival=flying,
             collision=outcome["collision"],
             reward=total,
