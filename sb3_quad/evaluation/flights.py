@@ -327,7 +327,7 @@ def fly_settings(
             outcome[flying] = fleet.outcome[flying]
             total += np.where(flying, rewards, 0.0)
             if reward is not None:
-                own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
+                own_total += _ask_reward(reward, state, actions, flying)
             way = np.linalg.norm(state.position - position, axis=1)
             path_length += np.where(flying, way, 0.0)
             position = state.position.copy()
@@ -385,17 +385,22 @@ def fly_settings(
         )
 
 
-def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -> FloatArray:
-    """Return the rewards of a function of the user's, which may do anything, as (n,) numbers."""
+def _ask_reward(
+    reward: Reward, state: QuadcopterState, actions: Float32Array, flying: BoolArray
+) -> FloatArray:
+    """Return the rewards of a function of the user's, which may do anything, as (n,) numbers.
+
+    :param flying: (n,), the flights of which they are asked; those of the others are 0.
+    """
     name = f"reward {reward_name(reward)}"
     with raised_as(ControllerError, f"{name}: fails"):
         values = np.asarray(reward(state, actions), dtype=np.float64)
     if values.shape != (state.n,):
         raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
-    wrong = np.flatnonzero(~np.isfinite(values))
+    wrong = np.flatnonzero(flying & ~np.isfinite(values))
     if wrong.size:
         raise ControllerError(f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite")
-    return values
+    return np.where(flying, values, 0.0)
 
 
 def reward_name(reward: OwnReward) -> str:
