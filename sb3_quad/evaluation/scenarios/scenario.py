@@ -130,7 +130,8 @@ class Scenario(Frozen):
             raise ValueError(f"duration: must be a control step, {step:g} s, or longer")
         for number, wrench in enumerate(self.wrenches):
             is_short = wrench.duration is not None and wrench.duration < step * (1 - 1e-9)
-            if is_short or wrench.start >= self.duration:
+            # It begins and ends between two control steps.
+            if is_short or round(wrench.start / step) >= self.steps:
                 raise ValueError(
                     f"wrenches.{number}: must start within the episode of {self.duration:g} s, and"
                     f" last for a control step, {step:g} s, or longer"
