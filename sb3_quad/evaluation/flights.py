@@ -40,8 +40,8 @@ from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance where it is not one
 ACTIONS = quadcopter_spaces()[1]
-# A vehicle is stable while its tilt (rad) and its roll and pitch rate (rad/s) are below these for
-# at least HOLD (s).
+# A vehicle is stable while its tilt (rad) and its rate of roll and pitch together (rad/s) are below
+# these for at least HOLD (s).
 TILT = np.radians(45.0)
 RATE = 2.0
 HOLD = 0.2
@@ -484,8 +484,9 @@ class Waypoints:
 class Motion:
     """Tracks when n flights become stable and how far they deviate from their line.
 
-    ``recovery_time`` (n,): s until the tilt has come below 45° and the body rates about x and y
-    below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never was. The thesis
+    ``recovery_time`` (n,): s until the tilt has come below 45° and the body rate across z, of roll
+    and pitch together, below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never
+    was. The thesis
     reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from the
     straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1; NaN
     where both are one point.
