@@ -50,6 +50,36 @@ def test_each_flies_as_it_was_trained_through_the_same_episodes():
     assert "other flies itm" in result.tables[0].caption
 
 
+def scaled(vehicle):
+    """A factory's agent that observed in a scaling of its own."""
+    model = load_pretrained("crazyflie-recovery")
+    scaling = np.linspace(1.0, 3.0, 18)
+    FlightSettings(vehicle="crazyflie", observation_std=scaling).write_into(model)
+    return model
+
+
+def test_an_agent_of_a_factory_observes_as_it_was_trained(capsys):
+    agent = scaled(None)
+    result = compare(
+        {"model": agent, "made": f"{__name__}:scaled"}, ["state_recovery"], 4, max_episode_steps=50
+    )
+    assert result["made"] == result["model"]
+    assert not capsys.readouterr().err
+    fly(agent, n_flights=2, max_steps=2, vehicle="crazyflie")
+    warning = capsys.readouterr().err
+    assert "another observation (observation_std); sb3_quad.env_kwargs(agent)" in warning
+
+
+def test_those_that_fly_another_vehicle_are_named(recwarn):
+    controllers = {"PID": PIDExpert("crazyflie"), "agent": "crazyflie-recovery"}
+    compare(controllers, ["state_recovery"], 2, max_episode_steps=2)
+    assert not recwarn.list
+    compare(controllers, ["state_recovery"], 2, vehicle="itm", max_episode_steps=2)
+    messages = [str(warning.message) for warning in recwarn.list]
+    assert "PIDExpert: is made for the vehicle crazyflie and flies itm" in messages[0]
+    assert "agent: was trained on the vehicle crazyflie and flies itm" in messages[1]
+
+
 def test_settings_for_all_override_those_of_the_agents():
     controllers = {"agent": "crazyflie-recovery", "PID": "pid"}
     result = compare(

@@ -125,7 +125,7 @@ def test_labels_are_clipped_to_the_action_space():
     assert labels.dtype == np.float32
 
 
-def test_labels_in_another_unit_are_warned_of_once(recwarn):
+def test_actions_in_another_unit_are_warned_of_once(recwarn):
     env = make_vec_env("Pendulum-v1", 2, seed=0)
     observation = env.reset()
     labeller = Controller.for_env(lambda observation: np.array([[9.0], [-2.5]]), env)
@@ -133,6 +133,8 @@ def test_labels_in_another_unit_are_warned_of_once(recwarn):
         labeller.labels(observation)
     labeller.labels(observation)
     assert not recwarn.list
+    with pytest.warns(UserWarning, match="such as 4.24, which are clipped; are they newtons"):
+        fly(lambda observation: np.full((len(observation), 4), 4.24), n_flights=2, max_steps=2)
 
 
 def test_an_expert_of_another_vehicle_is_warned_of(recwarn):

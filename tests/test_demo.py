@@ -394,6 +394,53 @@ KINDS = {
 }
 
 
+NAMES = """
+const { vehicles, added } = JSON.parse((await import("node:fs")).readFileSync(0, "utf8"));
+console.log(JSON.stringify(added.map((vehicle) => addVehicle(vehicles, vehicle))));
+"""
+
+
+def test_a_vehicle_of_a_name_that_is_taken_gets_another(tmp_path):
+    heavy = load_vehicle("itm").model_copy(update={"mass": 2.0})
+    model = PPO.load(pretrained("itm-recovery"), device="cpu")
+    FlightSettings(vehicle=heavy).write_into(model)
+    model.save(tmp_path / "heavy.zip")
+    page, first, _ = make_page(
+        parse_controllers([f"{label}={tmp_path}/heavy.zip" for label in ("one", "two")])
+    )
+    data = json.loads(page.split('id="data">')[1].split("</script>")[0])
+    assert {agent["vehicle"] for agent in data["agents"]} == {first.name} == {"itm′"}
+    if NODE is not None:
+        vehicles = [load_vehicle("itm").model_dump(mode="json")]
+        added = [*vehicles, *2 * [heavy.model_dump(mode="json")]]
+        names = in_node(tmp_path, NAMES, vehicles=vehicles, added=added)
+        assert names == ["itm", "itm′", "itm′"]
+
+
+LIMITS = """
+const job = JSON.parse((await import("node:fs")).readFileSync(0, "utf8"));
+const fleet = new Fleet([], [], job.vehicle);
+fleet.start = job.start;
+const limits = job.worlds.map((world) => {
+  fleet.set({ mass: 1, delay: fleet.vehicle.delay, gusts: 0, noise: 0, ...world });
+  return physicalLimit(fleet);
+});
+console.log(JSON.stringify(limits));
+"""
+
+
+@node
+def test_the_physical_limit_is_that_of_the_vehicle_that_flies(tmp_path):
+    vehicle = load_vehicle("itm")
+    home = {"position": [0, 0, 15], "quaternion": [1, 0, 0, 0], "target": [10, 0, 15]}
+    start = {**home, "velocity": [0, 0, 0], "body_rates": [0, 0, 0]}
+    worlds = [{}, {"mass": 0.6}, {"delay": vehicle.delay + 1}, {"gusts": 0.1}, {"noise": 0.1}]
+    job = {"vehicle": vehicle.model_dump(mode="json"), "start": start, "worlds": worlds}
+    limit = vehicle.time_optimal[10.0]
+    harness = script(["fleet"]) + LIMITS
+    assert in_node(tmp_path, harness, **job) == [limit, None, None, None, limit]
+
+
 @node
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)

@@ -53,6 +53,7 @@ scenarios:
 """
 FACTORIES = """
 import numpy as np
+from stable_baselines3 import PPO
 
 calls = 0
 
@@ -64,6 +65,9 @@ def broken(vehicle):
 
 def fails_in_flight(vehicle):
     return lambda observation: observation
+
+def telling(vehicle):
+    return PPO.load("telling.zip", device="cpu")
 
 def interrupted(vehicle):
     global calls
@@ -443,13 +447,15 @@ def test_an_agent_sees_its_own_scaling(here, capsys):
     FlightSettings(observation_std=std).write_into(model)
     model.save("telling.zip")
     arguments = ["--scenario", "tracking", "--episodes", "3"]
-    assert evaluate("silent.zip", "telling.zip", *arguments) == 0
+    assert evaluate("silent.zip", "telling.zip", "made=my_controllers:telling", *arguments) == 0
     (warning,) = capsys.readouterr().err.splitlines()
     assert "silent.zip does not say how its agent flies; it flies itm" in warning
     results = load_results("out")
     rewards = {
-        name: results.entry(name, "tracking").metrics.reward.value for name in ("silent", "telling")
+        name: results.entry(name, "tracking").metrics.reward.value
+        for name in ("silent", "telling", "made")
     }
+    assert rewards["made"] == rewards["telling"]
     (tracking,) = load_suite("small.yaml").with_changes(["tracking"], 3).scenarios
     for name, scaling in (("silent", {}), ("telling", {"observation_std": std})):
         settings = tracking.flown_as.with_changes(**scaling)

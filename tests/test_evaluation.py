@@ -142,7 +142,21 @@ def test_an_own_reward_is_summed_over_the_control_steps_of_each_flight():
         expected = sum(values[row] for values in hook.seen[:length])
         assert flights.own_reward[row] == pytest.approx(expected, rel=1e-12)
     assert np.isnan(fly(fall, "state_recovery", 4).own_reward).all()
+    # Nobody asks about a flight that was lost before, and is below ground or far away now.
+    lost = fly(fall, "state_recovery", 4, reward=Height(flights.length))
+    assert np.isfinite(lost.own_reward).all()
     assert (fly(fall, n_flights=2, max_steps=3, reward=Changes).own_reward == [1.0, 1.0]).all()
+
+
+class Height:
+    """A reward that is none where the flight is over, by its length."""
+
+    def __init__(self, length):
+        self.left = length.copy()
+
+    def __call__(self, state, actions):
+        self.left -= 1
+        return np.where(self.left >= 0, 1.0, np.nan)
 
 
 class Changes:
@@ -177,6 +191,9 @@ def test_an_own_reward_that_does_not_fit_is_named(reward, message):
         ({"seed": -1}, "seed -1: must be a whole number of 0 to"),
         ({"seed": 0.5}, "seed 0.5"),
         ({"tolerances": "near"}, "tolerances 'near': must be numbers"),
+        ({"tolerances": -1.0}, r"tolerances \[-1.0\]: must be greater than 0 m"),
+        ({"tolerances": [0.1, 0.0]}, "must be greater than 0 m"),
+        ({"max_episode_steps": [100, 300]}, r"max_episode_steps \[100, 300\]: must be one number"),
     ],
 )
 def test_numbers_that_do_not_fit_are_named(keywords, message):
@@ -233,6 +250,14 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
         leaves.append(first != last)
     assert 0 < sum(leaves) < 24 or all(flights.overshoot <= 0.1)
     assert summarise(flights).arrivals[0].overshoot_rate.value == np.mean(leaves)
+
+
+@pytest.mark.parametrize("suite", ["thesis", "robustness", "trajectories"])
+def test_an_own_reward_stands_in_the_table_of_every_scenario(suite):
+    flights = fly(hover, n_flights=2, max_steps=2, reward=lambda state, actions: state.distance)
+    cells = metric_cells(summarise(flights))
+    for scenario in load_suite(suite).scenarios:
+        assert "mean own reward" in [row.name for row in metric_rows(scenario, [cells])]
 
 
 def table_of(metrics, name, beside):

@@ -172,6 +172,14 @@ def test_waypoints_are_flown_one_after_the_other():
     assert metrics.course.completed.value == 1.0 and metrics.course.reached.value == 3.0
 
 
+def test_a_course_that_ends_at_its_last_but_one_waypoint_is_no_success():
+    entry = "target: {waypoints: [[1, 0, 15], [6, 0, 15]], radius: 0.09}, noise: 0, episodes: 1"
+    reached = fly_scenario(PIDExpert(), scenario(entry)).waypoint_times[0, 0]
+    flights = fly_scenario(PIDExpert(), scenario(f"{entry}, duration: {reached}"))
+    assert flights.waypoint_times[0, 0] == reached and not flights.success.any()
+    assert np.linalg.norm(flights.final_offset, axis=1) == pytest.approx(flights.final_error)
+
+
 def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_path):
     flights, log = recorded(
         lambda observation: hover(observation) - 1, scenario("episodes: 2, duration: 5"), 2

@@ -19,7 +19,7 @@ from sb3_quad.simulation.settings import KEY
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
-# Labels this far beyond the limits of the action space, in half ranges, are in some other unit.
+# Actions this far beyond the limits of the action space, in half ranges, are in some other unit.
 FAR = 0.5
 
 
@@ -54,7 +54,7 @@ class Controller:
 
     # A VecNormalize whose raw observations the source sees instead of those that it is asked about.
     _raw: Any = None
-    # Whether it has warned of labels outside of the action space.
+    # Whether it has warned of actions outside of the action space.
     _warned = False
 
     def __init__(
@@ -215,6 +215,7 @@ class Controller:
                 f"{self._who}: gives {actions[row].tolist()} in row {row}; "
                 "every number must be finite"
             )
+        self._warn_of_units(actions)
         return actions
 
     def labels(self, observation: Any, episode_start: BoolArray | None = None) -> Float32Array:
@@ -227,17 +228,20 @@ class Controller:
         if self._own_limits is not None:
             least, most = self._own_limits
             actions = low + (actions - least) * ((high - low) / (most - least))
-        clipped = actions.clip(low, high)
-        beyond = np.abs(actions - clipped)
+        return actions.clip(low, high)
+
+    def _warn_of_units(self, actions: Float32Array) -> None:
+        """Warn once of actions that are far outside of the limits that the source knows."""
+        low, high = self._limits if self._own_limits is None else self._own_limits
+        beyond = np.abs(actions - actions.clip(low, high))
         if not self._warned and (beyond > FAR * (0.5 * high - 0.5 * low)).any():
             self._warned = True
             warnings.warn(
                 f"{self._who}: gives actions far outside of the action space, such as"
                 f" {actions.flat[beyond.argmax()]:.4g}, which are clipped; are they newtons or PWM"
                 f" rather than actions from {low.min():g} to {high.max():g}?",
-                stacklevel=2,
+                stacklevel=3,
             )
-        return clipped
 
     def _ask(self, observation: Any, episode_start: BoolArray | None) -> Any:
         """Return the controller's own answer, unchecked."""
@@ -277,7 +281,7 @@ def warn_of_vehicle(source: Any, vehicles: Sequence[Any]) -> None:
                 f"{name}: is made for the vehicle {known.name} and flies"
                 f" {name_beside(known, flown)}; make it for this one: {name}(vehicle), or give a"
                 " privileged expert, which knows the vehicle of each row",
-                stacklevel=3,
+                stacklevel=4,
             )
             return
 

@@ -14,7 +14,12 @@ from sb3_quad.controllers.agent_settings import settings_of_model
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
-from sb3_quad.evaluation.flights import OwnReward, episode_seeds, fly_settings
+from sb3_quad.evaluation.flights import (
+    OwnReward,
+    episode_seeds,
+    fly_settings,
+    warn_of_differences,
+)
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
@@ -60,7 +65,9 @@ def compare(
 
     Each agent flies as it was trained: with the vehicle, the noise and the observation that its zip
     or ``model.flight_settings`` names. Experts, functions and agents that name none fly the vehicle
-    and the noise of the first agent that names them. Experts see the true state.
+    and the noise of the first agent that names them. So does what a factory makes; a model keeps
+    its own observation. Experts see the true state. A warning names those that fly another vehicle
+    than they know.
 
     >>> from sb3_quad.evaluation.compare import compare
     >>> result = compare({"PID": "pid", "agent": "itm-recovery"}, ["state_recovery"], n_flights=48)
@@ -111,10 +118,16 @@ def compare(
     refuse_unknown("thesis column", thesis_columns, {*published})
     own_reward = load_reward(reward)
     settings = _settings(controllers, env_kwargs)
-    pilots = {
-        label: resolve_expert(controllers[label], how.vehicle, "controller", how.rotor_layout)
-        for label, how in settings.items()
-    }
+    pilots = {}
+    for label, how in settings.items():
+        pilot = resolve_expert(controllers[label], how.vehicle, "controller", how.rotor_layout)
+        own = settings_of_model(pilot)
+        # A model from a factory says only now what it observes.
+        if own is not None:
+            observed = {**own.observed, "rotor_layout": own.layout}
+            settings[label] = how.with_changes(**{**observed, **env_kwargs})
+        warn_of_differences(label, pilot, settings[label])
+        pilots[label] = pilot
 
     comparison = Comparison()
     comparison.tables = []

@@ -14,6 +14,7 @@ from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays
 from sb3_quad.base.types import Arrays, Report, StrMapping
+from sb3_quad.controllers.agent_settings import settings_of_model
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
@@ -253,11 +254,14 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
     try:
         scenario = job.scenario.flown_by(own and own.vehicle)
         controller = resolve_expert(job.spec.spec, scenario.nominal_vehicle(), "controller")
+        observed = job.spec.observed
+        # A model from a factory says only now what it observes.
+        known = settings_of_model(controller)
+        if known is not None:
+            observed = {**known.observed, "rotor_layout": known.layout}
         recorder = Recorder(RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM)
         reward = load_reward(job.reward)
-        flights = fly_scenario(
-            controller, scenario, job.backend, [recorder], job.spec.observed, reward
-        )
+        flights = fly_scenario(controller, scenario, job.backend, [recorder], observed, reward)
     except SB3QuadError as error:
         return _failure(job.name, error)
     entry = Entry(

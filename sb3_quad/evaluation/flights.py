@@ -14,11 +14,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ControllerError, raised_as, refuse_unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
-from sb3_quad.controllers.agent_settings import settings_of_model, unlike_trained
+from sb3_quad.controllers.agent_settings import (
+    settings_of_model,
+    unlike_trained,
+    warn_of_observation,
+)
 from sb3_quad.controllers.controller import Controller, warn_of_vehicle
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.batch_env import quadcopter_spaces
@@ -36,8 +40,8 @@ from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance where it is not one
 ACTIONS = quadcopter_spaces()[1]
-# A vehicle is stable while its tilt (rad) and its roll and pitch rate (rad/s) are below these for
-# at least HOLD (s).
+# A vehicle is stable while its tilt (rad) and its rate of roll and pitch together (rad/s) are below
+# these for at least HOLD (s).
 TILT = np.radians(45.0)
 RATE = 2.0
 HOLD = 0.2
@@ -178,8 +182,8 @@ def fly(
         true state; an SB3 model, its zip or the name of a shipped one, asked by
         ``predict(observation, deterministic=True)``; or a function from observations
         (n, observation size) to actions (n, 4). An agent does not bring the vehicle and the
-        observations that it was trained with: give them by :func:`~sb3_quad.env_kwargs`, or call
-        :func:`~sb3_quad.evaluation.compare.compare`.
+        observations that it was trained with, and you are warned if they differ: give them by
+        :func:`~sb3_quad.env_kwargs`, or call :func:`~sb3_quad.evaluation.compare.compare`.
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
         ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
@@ -201,6 +205,8 @@ def fly(
     """
     seeds = episode_seeds(seed, n_flights)
     limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
+    if min(limits, default=1.0) <= 0.0:
+        raise ConfigError(f"tolerances {limits}: must be greater than 0 m")
     layout = environment.get("rotor_layout")
     controller = resolve_expert(controller, vehicle, "controller", layout)
     own = settings_of_model(controller)
@@ -209,17 +215,27 @@ def fly(
         environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", max_steps)
     settings = FlightSettings().with_changes(task=task, vehicle=vehicle, noise=noise, **environment)
-    # A distribution has no particular vehicle.
-    if settings.vehicles is None:
-        warn_of_vehicle(controller, settings.load_vehicles())
-        if own is not None:
-            name = type(controller).__name__
-            notice = unlike_trained(name, own, first_vehicle(settings.vehicle))
-            if notice:
-                warnings.warn(f"{notice}; give **env_kwargs(the agent)", stacklevel=2)
+    warn_of_differences(type(controller).__name__, controller, settings)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
+
+
+def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
+    """Warn of a controller that flies another vehicle than it knows, or observes something else.
+
+    :param name: what the warning calls it.
+    """
+    warn_of_observation(name, controller, settings)
+    # A distribution has no particular vehicle.
+    if settings.vehicles is not None:
+        return
+    warn_of_vehicle(controller, settings.load_vehicles())
+    own = settings_of_model(controller)
+    if own is not None:
+        notice = unlike_trained(name, own, first_vehicle(settings.vehicle))
+        if notice:
+            warnings.warn(f"{notice}; sb3_quad.env_kwargs(agent) gives its own", stacklevel=3)
 
 
 def episode_seeds(seed: int, n_flights: int) -> list[int]:
@@ -250,6 +266,11 @@ def fly_settings(
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
     refuse_unknown("backend", [backend], FLEETS)
+    if isinstance(settings.max_episode_steps, list):
+        raise ConfigError(
+            f"max_episode_steps {settings.max_episode_steps}: must be one number, the limit of all"
+            " flights"
+        )
     plan = plan or Plan()
     if isinstance(reward, type):
         # A reward that remembers, such as the last actions, begins afresh with these episodes.
@@ -283,7 +304,7 @@ def fly_settings(
         for hook in hooks:
             hook.on_start(state, vehicle)
 
-        for step in range(1, settings.longest_episode + 1):
+        for step in range(1, settings.max_episode_steps + 1):
             time = step * vehicle.control_step
             # Disturbances of the plan begin and end between two control steps.
             if step - 1 in plan.wrenches:
@@ -306,7 +327,7 @@ def fly_settings(
             outcome[flying] = fleet.outcome[flying]
             total += np.where(flying, rewards, 0.0)
             if reward is not None:
-                own_total += np.where(flying, _ask_reward(reward, state, actions), 0.0)
+                own_total += _ask_reward(reward, state, actions, flying)
             way = np.linalg.norm(state.position - position, axis=1)
             path_length += np.where(flying, way, 0.0)
             position = state.position.copy()
@@ -320,11 +341,13 @@ def fly_settings(
                 following.update(step, state, flying)
             for hook in hooks:
                 hook.after_step(step, state, actions, flying)
+            # The outcome of the last step is that of the target until then.
+            on_last = course.on_last
             if not flying.any():
                 break
             # Whoever has reached a waypoint sees the next one from the next step on.
             onward = course.update(time, distance, flying)
-            if onward.size:
+            if onward.size and step < settings.max_episode_steps:
                 fleet.state[TARGET, onward] = plan.waypoints[course.next[onward]].T
                 observation = fleet.observe()
 
@@ -338,7 +361,7 @@ def fly_settings(
         # Neither a course nor a target that moves has a straight line to deviate from.
         has_no_line = following.moves | (plan.waypoints.size > 0)
         return Flights(
-            success=outcome["success"] & course.on_last,
+            success=outcome["success"] & on_last,
             survival=flying,
             collision=outcome["collision"],
             reward=total,
@@ -362,17 +385,22 @@ def fly_settings(
         )
 
 
-def _ask_reward(reward: Reward, state: QuadcopterState, actions: Float32Array) -> FloatArray:
-    """Return the rewards of a function of the user's, which may do anything, as (n,) numbers."""
+def _ask_reward(
+    reward: Reward, state: QuadcopterState, actions: Float32Array, flying: BoolArray
+) -> FloatArray:
+    """Return the rewards of a function of the user's, which may do anything, as (n,) numbers.
+
+    :param flying: (n,), the flights of which they are asked; those of the others are 0.
+    """
     name = f"reward {reward_name(reward)}"
     with raised_as(ControllerError, f"{name}: fails"):
         values = np.asarray(reward(state, actions), dtype=np.float64)
     if values.shape != (state.n,):
         raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
-    wrong = np.flatnonzero(~np.isfinite(values))
+    wrong = np.flatnonzero(flying & ~np.isfinite(values))
     if wrong.size:
         raise ControllerError(f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite")
-    return values
+    return np.where(flying, values, 0.0)
 
 
 def reward_name(reward: OwnReward) -> str:
@@ -456,8 +484,9 @@ class Waypoints:
 class Motion:
     """Tracks when n flights become stable and how far they deviate from their line.
 
-    ``recovery_time`` (n,): s until the tilt has come below 45° and the body rates about x and y
-    below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never was. The thesis
+    ``recovery_time`` (n,): s until the tilt has come below 45° and the body rate across z, of roll
+    and pitch together, below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never
+    was. The thesis
     reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from the
     straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1; NaN
     where both are one point.

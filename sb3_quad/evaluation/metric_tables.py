@@ -259,15 +259,15 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 def _rows_of(scenario: Scenario) -> list[Row]:
     """The rows that mean something in a scenario."""
     shares = [SUCCESS, SURVIVAL, CUT, LOW_FORCE]
-    if scenario.target.waypoints is not None:
-        return [*shares, REACHED, COMPLETED, COURSE_TIME]
-    if len(scenario.cell) > 1:
-        return [SUCCESS]
-    if scenario.reference is not None:
-        return [*shares, REWARD, OWN_REWARD, *FOLLOWING]
-    if scenario.group is not None:
-        return [*shares, MEDIAN]
     rewards = [REWARD, OWN_REWARD]
+    if scenario.target.waypoints is not None:
+        return [*shares, OWN_REWARD, REACHED, COMPLETED, COURSE_TIME]
+    if len(scenario.cell) > 1:
+        return [SUCCESS, OWN_REWARD]
+    if scenario.reference is not None:
+        return [*shares, *rewards, *FOLLOWING]
+    if scenario.group is not None:
+        return [*shares, OWN_REWARD, MEDIAN]
     if scenario.target.distance == 0.0:
         # An episode that starts at its target has no way to it.
         flown = [FLOWN] if scenario.is_fixed else []

@@ -28,7 +28,7 @@ class Arrival(Moment):
     settling: Moment
     """settling time: flights that end within the tolerance, and when they leave it no more"""
     overshoot_rate: Estimate | None
-    """share of the flights that arrived and left the tolerance again"""
+    """share of the flights that arrived and then left the tolerance again, or were lost"""
 
 
 class Course(Frozen):

@@ -134,6 +134,13 @@ class Target(OneOf):
     radius: PositiveFloat = 0.5
     """a waypoint counts as reached within this, m"""
 
+    @model_validator(mode="after")
+    def _radius_of_waypoints(self) -> "Target":
+        # A scenario that was read before gives the default.
+        if self.waypoints is None and self.radius != Target.model_fields["radius"].default:
+            raise ValueError("radius: is that of waypoints; remove it, or give tolerances")
+        return self
+
     @property
     def points(self) -> tuple[Vector, ...]:
         """The fixed targets, in order; none if the target is random."""

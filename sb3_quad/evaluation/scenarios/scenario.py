@@ -114,6 +114,7 @@ class Scenario(Frozen):
         vehicle = self.flown_vehicle()
         # Of a distribution, the vehicle that can do least decides.
         if self.vehicles is not None:
+            self._refuse_nominal()
             vehicle = self.vehicles.hardest(vehicle)
         self._check_way(vehicle)
         # The task checks the ranges of its own fields.
@@ -129,12 +130,28 @@ class Scenario(Frozen):
             raise ValueError(f"duration: must be a control step, {step:g} s, or longer")
         for number, wrench in enumerate(self.wrenches):
             is_short = wrench.duration is not None and wrench.duration < step * (1 - 1e-9)
-            if is_short or wrench.start >= self.duration:
+            # It begins and ends between two control steps.
+            if is_short or round(wrench.start / step) >= self.steps:
                 raise ValueError(
                     f"wrenches.{number}: must start within the episode of {self.duration:g} s, and"
                     f" last for a control step, {step:g} s, or longer"
                 )
         return self
+
+    def _refuse_nominal(self) -> None:
+        """Refuse what is about the nominal vehicle where each episode has another one."""
+        # The delay is the nominal vehicle's in all episodes.
+        if self.vehicle_changes != VehicleChanges(delay=self.vehicle_changes.delay):
+            raise ValueError(
+                "vehicle_changes: mass, inertia and motor_gain are sampled by vehicles; give ranges"
+                " there, or factors in randomize"
+            )
+        for number, wrench in enumerate(self.wrenches):
+            if wrench.unit == "weight":
+                raise ValueError(
+                    f"wrenches.{number}: unit: weight is that of one vehicle, and vehicles samples"
+                    " many; give randomize: {force: {magnitude: …, unit: weight}}"
+                )
 
     def nominal_vehicle(self) -> Vehicle:
         """The vehicle before the changes: the one that experts are made for.

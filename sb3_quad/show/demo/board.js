@@ -77,7 +77,7 @@ export class Board {
       row.classList.toggle("off", !entry.active || !entry.flight);
       row.classList.toggle("lost", entry.active && Boolean(entry.flight?.lost));
     });
-    const limit = physicalLimit(this.fleet.vehicle, this.fleet.start);
+    const limit = physicalLimit(this.fleet);
     $("limit").hidden = limit === null;
     $("limit-time").textContent = inSeconds(limit ?? undefined);
     $("hover").hidden = this.fleet.canHover;

@@ -7,6 +7,7 @@
  */
 import { $, Board } from "./board.js";
 import { STARTS } from "./fleet.js";
+import { addVehicle } from "./vehicle.js";
 import { readAgent } from "./weights.js";
 
 const SPEEDS = [1, 0.25, 0.1];
@@ -175,7 +176,7 @@ export class Controls {
   async take(file) {
     try {
       const { agent, vehicle } = await readAgent(file.name.replace(/\.zip$/, ""), await file.arrayBuffer());
-      if (vehicle && agent.vehicle && !this.vehicles.some(({ name }) => name === vehicle.name)) this.vehicles.push(vehicle);
+      if (vehicle && agent.vehicle) agent.vehicle = addVehicle(this.vehicles, vehicle);
       while (this.fleet.entries.some((entry) => entry.agent.label === agent.label)) agent.label += "′";
       const entry = this.join(agent);
       const trained = agent.vehicle || (vehicle ? "random quadcopters" : "a vehicle that it does not name");

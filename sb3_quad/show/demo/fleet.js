@@ -279,11 +279,13 @@ export class Fleet {
 
 /**
  * The least time to within 0.1 m that the vehicle's physics allow from a start, s, where its file holds such times.
- * @param {Vehicle} vehicle
- * @param {Start} start
+ * @param {Pick<Fleet, "vehicle" | "start" | "settings">} fleet
  * @returns {number | null}
  */
-export function physicalLimit(vehicle, start) {
+export function physicalLimit({ vehicle, start, settings }) {
+  // It is known of the nominal vehicle, undisturbed.
+  const { mass, motors, battery, delay, force, gusts } = settings;
+  if (mass !== 1 || motors !== 1 || battery !== 1 || delay !== vehicle.delay || force || gusts) return null;
   const times = vehicle.time_optimal;
   const level = start.quaternion[0] === 1 && ![...start.velocity, ...start.body_rates].some(Boolean);
   const distance = Math.hypot(...start.target.map((each, k) => each - start.position[k]));

@@ -110,6 +110,7 @@ def make_page(
         agents.append({"label": spec.label, "colour": colours[spec.label], **describe(spec)})
         if spec.own and not spec.own.vehicles:
             own = _add(vehicles, first_vehicle(spec.own.vehicle))
+            agents[-1]["vehicle"] = own.name
             first = first or own
     first = first or vehicles["itm"]
     rounded = [agent["label"] for agent in agents if agent.get("bits") == 16]
@@ -137,10 +138,10 @@ def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
     """Add a vehicle to others unless one of them flies the same. It gets another name if its own
     is taken.
     """
-    for known in vehicles.values():
-        if known.name == vehicle.name and known.flies_as(vehicle):
-            return known
     while vehicle.name in vehicles:
+        known = vehicles[vehicle.name]
+        if known.flies_as(vehicle):
+            return known
         vehicle = vehicle.model_copy(update={"name": f"{vehicle.name}′"})
     return vehicles.setdefault(vehicle.name, vehicle)
 

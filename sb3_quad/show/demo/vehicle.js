@@ -134,6 +134,22 @@ export function parametersOf(v, world = CALM) {
 }
 
 /**
+ * Add a vehicle to others unless one of them flies the same, and return its name: another one if its own is taken; page.py's _add.
+ * @param {Vehicle[]} vehicles
+ * @param {Vehicle} vehicle
+ */
+export function addVehicle(vehicles, vehicle) {
+  const flies = (/** @type {Vehicle} */ v) => JSON.stringify(parametersOf(v));
+  let { name } = vehicle;
+  for (;;) {
+    const known = vehicles.find((each) => each.name === name);
+    if (!known) vehicles.push({ ...vehicle, name });
+    if (!known || flies(known) === flies(vehicle)) return name;
+    name += "′";
+  }
+}
+
+/**
  * From a vehicle's own axes and rotors to those of a layout; layout.py's find_turn.
  *
  * @typedef {object} Turn
