@@ -1,11 +1,14 @@
-"""Your own vehicle: a YAML file with its parameters, from which experts derive their gains.
+r"""Your own vehicle: a YAML file with its parameters, from which experts derive their gains.
 
 An agent then learns to fly it from the geometric expert.
 
     python examples/own_vehicle.py
     python examples/own_vehicle.py --vehicle path/to/yours.yaml
 
-The same by command: `sb3-quad train --env-kwargs vehicle:examples/my_quadcopter.yaml`.
+By command you imitate the same expert on more tasks, for 6,000,000 timesteps:
+
+    sb3-quad train --algo dagger --env QuadStateRecovery-v0 --conf-file nominal/dagger.yml \
+        --env-kwargs vehicle:examples/my_quadcopter.yaml
 """
 
 import argparse

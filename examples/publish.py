@@ -85,7 +85,7 @@ FLAGS: Flags = {
     "model MODEL": (
         agent_path,
         None,
-        "an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy: "
+        "an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC, APG) with MlpPolicy: "
         "a zip or a run folder",
     ),
     "--name NAME": ({"required": True}, None, "name of the files, NAME.zip and NAME.md"),

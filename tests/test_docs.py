@@ -120,14 +120,28 @@ def check_output(output):
     assert agent >= 90.0 and agent - 20.0 > max(pid, imitation)
 
 
+def remarked(page, start):
+    """The numbers in the remark behind a line of a page, by how the line begins."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    (remark,) = re.findall(rf"^ *{re.escape(start)}.*  # (.*)$", text, flags=re.MULTILINE)
+    return [float(number) for number in re.findall(r"-?\d+\.\d+", remark)]
+
+
 def check_readme(scope):
-    assert -5.5 < scope["mean"] < -4.0
+    assert [scope["mean"]] == pytest.approx(remarked("README.md", 'print(f"mean'), abs=0.1)
+    check_output(scope["printed"])
     assert scope["agent"].num_timesteps == 3_000_000
 
 
 def check_dagger(scope):
     assert scope["agent"] > scope["expert"] - 1.0  # mean rewards of 48 episodes
     assert len(scope["model"].dataset) == scope["model"].num_timesteps
+
+
+def check_domain_randomization(scope):
+    printed = [float(line.removesuffix(" m")) for line in scope["printed"].splitlines()]
+    page = "docs/domain_randomization.md"
+    assert printed == pytest.approx(remarked(page, "print(f"), abs=6e-4)
 
 
 def check_dynamics(scope):
@@ -150,6 +164,7 @@ def check_vehicles(scope):
 CHECKS = {
     "README.md": check_readme,
     "docs/dagger.md": check_dagger,
+    "docs/domain_randomization.md": check_domain_randomization,
     "docs/environments.md": check_environments,
     "docs/research/dynamics.md": check_dynamics,
     "docs/research/vehicles.md": check_vehicles,
@@ -166,9 +181,9 @@ def test_a_page_runs_with_trainings_of_one_rollout(page, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", CHECKS)
 def test_a_page_gives_what_it_says(page, capsys):
-    CHECKS[page](run(page))
-    if page == "README.md":
-        check_output(capsys.readouterr().out)
+    scope = run(page)
+    scope["printed"] = capsys.readouterr().out
+    CHECKS[page](scope)
 
 
 @pytest.mark.slow

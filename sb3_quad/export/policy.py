@@ -62,8 +62,8 @@ def export_policy(
     n_observations: int = N_OBSERVATIONS,
     half: bool = False,
 ) -> Export:
-    """Make a file that flies by itself of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC;
-    ``MlpPolicy``).
+    """Make a file that flies by itself of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC,
+    APG; ``MlpPolicy``).
 
     It takes the features of an observation in physical units, see ``metadata["observation"]``,
     relative to a reference that moves, see ``metadata["reference"]``. It gives the four rotors'

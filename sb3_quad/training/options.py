@@ -43,7 +43,7 @@ class SettingsOptions(Frozen):
     """Keys of a settings file that have a flag of their own; None keeps the file's value."""
 
     n_timesteps: Number | None = None
-    """timesteps, in whole rollouts; fewer than one shorten it"""
+    """timesteps, rounded up to whole rollouts; fewer than one rollout shorten the rollout"""
     n_envs: Number | None = None
     """number of parallel environments"""
     vec_env: str | None = None
@@ -82,7 +82,8 @@ class RunOptions(Frozen):
     save_freq: Number = -1
     """timesteps between checkpoints; below 1: none"""
     snapshot_every: NonNegativeFloat = 60.0
-    """seconds between snapshots, from which --resume continues after a crash; 0: none"""
+    """seconds between snapshots, from which --resume continues after a crash; 0: only when a signal
+    ends it"""
 
 
 class JobOptions(RunOptions):

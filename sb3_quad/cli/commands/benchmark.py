@@ -72,7 +72,10 @@ FLAGS: Flags = {
         "algorithms of the training loops (dagger ppo_bc apg)",
     ),
     "-conf --conf-file FILE": "settings of the training loops (ALGO.yml)",
-    "--training": (YES_OR_NO, "measure only, or no, training loops (both)"),
+    "--training": (
+        YES_OR_NO,
+        "--training: only training loops; --no-training: only environments (default: both)",
+    ),
 }
 
 
