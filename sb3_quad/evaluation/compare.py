@@ -18,6 +18,7 @@ from sb3_quad.evaluation.flights import (
     OwnReward,
     episode_seeds,
     fly_settings,
+    refuse_several_limits,
     warn_of_differences,
 )
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
@@ -126,6 +127,7 @@ def compare(
         if own is not None:
             observed = {**own.observed, "rotor_layout": own.layout}
             settings[label] = how.with_changes(**{**observed, **env_kwargs})
+        refuse_several_limits(settings[label])
         warn_of_differences(label, pilot, settings[label])
         pilots[label] = pilot
 

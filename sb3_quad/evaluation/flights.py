@@ -215,10 +215,20 @@ def fly(
         environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", max_steps)
     settings = FlightSettings().with_changes(task=task, vehicle=vehicle, noise=noise, **environment)
+    refuse_several_limits(settings)
     warn_of_differences(type(controller).__name__, controller, settings)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
+
+
+def refuse_several_limits(settings: FlightSettings) -> None:
+    """Refuse a limit for each row: flights end together."""
+    if isinstance(settings.max_episode_steps, list):
+        raise ConfigError(
+            f"max_episode_steps {settings.max_episode_steps}: must be one number, the limit of all"
+            " flights"
+        )
 
 
 def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
@@ -266,11 +276,6 @@ def fly_settings(
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
     refuse_unknown("backend", [backend], FLEETS)
-    if isinstance(settings.max_episode_steps, list):
-        raise ConfigError(
-            f"max_episode_steps {settings.max_episode_steps}: must be one number, the limit of all"
-            " flights"
-        )
     plan = plan or Plan()
     if isinstance(reward, type):
         # A reward that remembers, such as the last actions, begins afresh with these episodes.
@@ -304,7 +309,7 @@ def fly_settings(
         for hook in hooks:
             hook.on_start(state, vehicle)
 
-        for step in range(1, settings.max_episode_steps + 1):
+        for step in range(1, settings.longest_episode + 1):
             time = step * vehicle.control_step
             # Disturbances of the plan begin and end between two control steps.
             if step - 1 in plan.wrenches:
@@ -347,7 +352,7 @@ def fly_settings(
                 break
             # Whoever has reached a waypoint sees the next one from the next step on.
             onward = course.update(time, distance, flying)
-            if onward.size and step < settings.max_episode_steps:
+            if onward.size and step < settings.longest_episode:
                 fleet.state[TARGET, onward] = plan.waypoints[course.next[onward]].T
                 observation = fleet.observe()
 
