@@ -501,7 +501,7 @@ def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tm
         return TransformObservation(gym.make("QuadTargetTracking-v0"), lambda x: -x, box)
 
     assert flights_of(PPOBC("MlpPolicy", make_vec_env(turned, 1))) is None
-    normalised.set_env(make_vec_env(turned, 2))
+    normalised.set_env(VecNormalize(make_vec_env(turned, 2)))
     assert flights_of(normalised) is None
 
 

@@ -228,6 +228,16 @@ def test_dagger_keeps_raw_rows_and_normalises_them_by_the_present_statistics(mon
         stacked.learn(80)
 
 
+def test_statistics_go_on_in_an_environment_that_is_set_later(run):
+    model = DAgger.load(run.model, device="cpu", expert="pid")
+    count = model.vec_normalize.obs_rms.count
+    with pytest.raises(ConfigError, match="must both have it, or neither"):
+        model.set_env(QuadcopterVecEnv(8))
+    model.set_env(VecNormalize(QuadcopterVecEnv(8)))
+    assert model.get_vec_normalize_env().obs_rms.count == count
+    assert model.vec_normalize is model.get_vec_normalize_env()
+
+
 def test_best_model_freezes_and_synchronises_the_environments_of_a_user(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env: Any = VecNormalize(QuadcopterVecEnv(4, seed=0))

@@ -137,8 +137,12 @@ class ExpertMixin(BaseAlgorithm):
         """Learn in another environment from now on; see SB3's ``set_env``.
 
         The model's zips say from then on that its agent flies as this environment does, or nothing
-        of how it flies where that cannot be read.
+        of how it flies where that cannot be read. Its statistics of VecNormalize go on there.
+
+        :raises ConfigError: only one of the agent and the environment normalises observations.
         """
+        if hasattr(self, STATISTICS):
+            share_statistics(getattr(self, STATISTICS), env, training=True)
         super().set_env(env, force_reset)
         self._note_flight_settings()
 
