@@ -94,6 +94,22 @@ def test_a_training_in_other_units_is_the_one_with_unit_actions(
     np.testing.assert_allclose(stds[1] / half, stds[0], rtol=0.01)
 
 
+def test_actions_of_two_dimensions_are_cloned():
+    def stacked():
+        return gym.wrappers.TransformAction(
+            Height(), np.ravel, spaces.Box(-1.0, 1.0, (2, 1), np.float32)
+        )
+
+    def expert(observation):
+        return throttle(-1.0, 1.0)(observation)[:, :, None]
+
+    env = make_vec_env(stacked, 8, seed=0)
+    flat = trained(PPOBC, -1.0, 1.0)
+    model = PPOBC("MlpPolicy", env, expert=expert, **SIZES).learn(800)
+    for mine, theirs in zip(model.policy.parameters(), flat.policy.parameters(), strict=True):
+        assert th.equal(mine, theirs)
+
+
 @pytest.mark.parametrize("box", BOXES)
 @pytest.mark.parametrize("algorithm", [DAgger, PPOBC])
 def test_the_agent_becomes_the_expert_in_any_units(box, algorithm):

@@ -152,6 +152,35 @@ def test_labels_belong_to_the_state_before_the_step():
         np.testing.assert_allclose(label, np.clip(swing_back(observation), -2, 2), rtol=1e-6)
 
 
+class Swing:
+    """:func:`swing_back` for the true state of the pendulums, (angle, angular velocity)."""
+
+    def actions(self, state):
+        return -0.5 * state[:, 1:2]
+
+
+def test_a_callback_that_calls_the_policy_leaves_the_labels_alone():
+    class Calls(BaseCallback):
+        def _on_step(self):
+            observations = th.from_numpy(self.locals["new_obs"])
+            with th.no_grad():
+                self.model.policy(observations)
+                self.model.policy(observations, deterministic=True)
+            return True
+
+        def _on_rollout_end(self):
+            self._on_step()
+
+    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    env.true_state = lambda: np.array([pendulum.unwrapped.state for pendulum in env.envs])
+    model = PPOBC("MlpPolicy", env, expert=Swing(), bc_coef=1.0, **SMALL)
+    seen = []
+    model.train = lambda: seen.append(model.rollout_buffer)
+    model.learn(128, callback=Calls())
+    expected = np.clip(swing_back(seen[0].observations.reshape(-1, 3)), -2, 2)
+    np.testing.assert_allclose(seen[0].expert_actions.reshape(-1, 1), expected, atol=1e-6)
+
+
 def test_critic_warmup_moves_the_critic_only():
     changes = {**SMALL, "critic_warmup": 1}
     model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **changes)

@@ -286,15 +286,23 @@ class PPOBC(ExpertMixin, PPO):
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
 
         network = network_of(self.policy)
-        sample: Any = self.policy.forward
+        stock: Any = self.policy.forward
+        sample = stock
         if isinstance(network, Perceptrons):
             sample = partial(act, network)
 
-        def forward(observations: th.Tensor) -> Any:
-            output = sample(observations)
+        labelled = -1
+
+        def forward(observations: th.Tensor, deterministic: bool = False) -> Any:
+            nonlocal labelled
+            # Callbacks, too, may call the policy, and after the step.
+            if deterministic or buffer.full or buffer.pos == labelled:
+                return stock(observations, deterministic)
+            labelled = buffer.pos
+            actions, values, log_prob = sample(observations)
             # Label the state before the step.
-            buffer.expert_actions[buffer.pos] = self._labels(env)
-            return output
+            buffer.expert_actions[labelled] = self._labels(env)
+            return actions.reshape(-1, *self.action_space.shape), values, log_prob
 
         self.policy.forward = forward
         try:
