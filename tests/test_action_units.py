@@ -94,6 +94,19 @@ def test_a_training_in_other_units_is_the_one_with_unit_actions(
     np.testing.assert_allclose(stds[1] / half, stds[0], rtol=0.01)
 
 
+def test_a_cloning_weight_that_ends_leaves_the_units(tmp_path):
+    models = []
+    for low, high in ((-1.0, 1.0), BOXES["torque"]):
+        model = trained(PPOBC, low, high, critic_warmup=0, bc_filter="none")
+        model.set_bc_coef(0.0)
+        model.save(tmp_path / "agent.zip")
+        model = PPOBC.load(tmp_path / "agent.zip", env=model.get_env(), device="cpu")
+        models.append(model.learn(400, reset_num_timesteps=False))
+    seen = np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)
+    plain, other = (unit_actions(model, seen) for model in models)
+    np.testing.assert_allclose(other, plain, atol=0.02)
+
+
 def test_actions_of_two_dimensions_are_cloned():
     def stacked():
         return gym.wrappers.TransformAction(

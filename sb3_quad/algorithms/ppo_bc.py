@@ -68,7 +68,8 @@ class PPOBC(ExpertMixin, PPO):
     equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model
     loads with ``PPO.load``, even where this package is not installed.
 
-    Where it clones, errors of actions and log_std are those of actions scaled to [-1, 1].
+    Where it clones or has cloned, errors of actions and log_std are those of actions scaled to
+    [-1, 1].
 
     :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
     :param policy_kwargs: unless it holds ``log_std_init``, that is -0.9. ``log_std_init=None``:
@@ -185,6 +186,7 @@ class PPOBC(ExpertMixin, PPO):
         self.critic_warmup = critic_warmup
         self.shuffle = shuffle
         self._n_rollouts_trained = 0
+        self._has_cloned = False
 
         if _init_setup_model:
             self._set_up(initial)
@@ -236,9 +238,11 @@ class PPOBC(ExpertMixin, PPO):
         self.bc_coef = FloatSchedule(float(bc_coef))
 
     def _scale_actions(self, inverse: bool = False) -> None:
-        # Without a cloning term it is PPO, which counts actions as they are.
-        may_clone = self.will_clone() or self.rollout_buffer.bc_coef
-        if isinstance(self.action_space, spaces.Box) and may_clone:
+        # Without a cloning term it is PPO, which counts actions as they are. An agent that has had
+        # one keeps the units that its steps are made for.
+        if self.will_clone() or self.rollout_buffer.bc_coef:
+            self._has_cloned = True
+        if isinstance(self.action_space, spaces.Box) and self._has_cloned:
             super()._scale_actions(inverse)
 
     def _check_cloning(self) -> None:
