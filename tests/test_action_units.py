@@ -148,6 +148,15 @@ def test_state_dependent_exploration_in_other_units():
     np.testing.assert_allclose(unit_actions(other, seen), unit_actions(plain, seen), atol=0.02)
 
 
+@pytest.mark.parametrize("policy_kwargs", [{"use_expln": True}, {"full_std": False}])
+def test_deviations_that_cannot_be_scaled_are_refused_in_other_units_alone(policy_kwargs):
+    keywords = {"use_sde": True, "policy_kwargs": policy_kwargs, **SIZES}
+    PPOBC("MlpPolicy", Height(), **keywords)
+    with pytest.raises(ConfigError, match="RescaleAction") as raised:
+        PPOBC("MlpPolicy", Height(0.0, 3.0), **keywords)
+    assert "\n" not in str(raised.value)
+
+
 def test_a_stock_ppo_flies_the_zip_in_the_units_of_the_environment(tmp_path):
     model = trained(DAgger, 1000.0, 2000.0)
     model.save(tmp_path / "agent.zip")

@@ -181,6 +181,16 @@ def test_a_callback_that_calls_the_policy_leaves_the_labels_alone():
     np.testing.assert_allclose(seen[0].expert_actions.reshape(-1, 1), expected, atol=1e-6)
 
 
+def test_weight_decay_leaves_the_deviation_of_state_dependent_exploration_alone():
+    once = {"batch_size": 64, "n_epochs": 1, "learning_rate": 1e-12, "max_grad_norm": math.inf}
+    changes = {**SMALL, **once, "policy_kwargs": {"log_std_init": -1.0}, "use_sde": True}
+    gradients = []
+    for l2_coef in (0.0, 5.0):
+        model = PPOBC("MlpPolicy", "Pendulum-v1", l2_coef=l2_coef, bc_coef=0.0, **changes)
+        gradients.append(model.learn(64).policy.log_std.grad.clone())
+    th.testing.assert_close(*gradients)
+
+
 def test_critic_warmup_moves_the_critic_only():
     changes = {**SMALL, "critic_warmup": 1}
     model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **changes)

@@ -264,6 +264,8 @@ class ExpertMixin(BaseAlgorithm):
         scale = th.as_tensor(factor, device=policy.device)
         unfit = f"action space {self.action_space}: wrap it in RescaleAction(env, -1, 1)"
         with raised_as(ConfigError, unfit), th.no_grad():
+            if getattr(policy.action_dist, "use_expln", False):
+                raise ValueError("use_expln: log_std is no logarithm of a deviation")
             policy.action_net.weight *= scale[:, None]
             policy.action_net.bias.mul_(scale).add_(th.as_tensor(offset, device=policy.device))
             policy.log_std += scale.log()

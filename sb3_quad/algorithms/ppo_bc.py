@@ -437,7 +437,10 @@ class PPOBC(ExpertMixin, PPO):
                         loss = loss + bc_coef * losses["bc_loss"]
                     # + Weight decay as a term of the loss (Eq. 2.25)
                     if l2_coef != 0.0:
-                        losses["l2_loss"] = l2_loss([*self.policy.parameters()])
+                        parameters = dict(self.policy.named_parameters())
+                        # That of gSDE is a matrix.
+                        parameters.pop("log_std", None)
+                        losses["l2_loss"] = l2_loss([*parameters.values()])
                         loss = loss + l2_coef * losses["l2_loss"]
 
                     # Calculate approximate form of reverse KL Divergence for early stopping
