@@ -16,6 +16,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
@@ -179,6 +180,31 @@ def test_a_callback_that_calls_the_policy_leaves_the_labels_alone():
     model.learn(128, callback=Calls())
     expected = np.clip(swing_back(seen[0].observations.reshape(-1, 3)), -2, 2)
     np.testing.assert_allclose(seen[0].expert_actions.reshape(-1, 1), expected, atol=1e-6)
+
+
+class Raised(BaseFeaturesExtractor):
+    """A features extractor without parameters, which no state dict shows."""
+
+    def __init__(self, space):
+        super().__init__(space, 3)
+
+    def forward(self, observations):
+        return 2.0 * observations + 1.0
+
+
+@pytest.mark.parametrize(("teacher", "algorithm"), [(PPO, PPOBC), (PPO, DAgger), (SAC, SACBC)])
+def test_an_initial_policy_hands_on_how_its_networks_compute(teacher, algorithm):
+    settings = {"net_arch": [8], "features_extractor_class": Raised}
+    agent = teacher("MlpPolicy", "Pendulum-v1", policy_kwargs=settings, seed=0, device="cpu")
+    model = algorithm("MlpPolicy", "Pendulum-v1", initial_policy=agent, seed=1, device="cpu")
+    observations = np.random.default_rng(0).normal(size=(64, 3)).astype(np.float32)
+    np.testing.assert_array_equal(
+        model.predict(observations, deterministic=True)[0],
+        agent.predict(observations, deterministic=True)[0],
+    )
+    other = {"features_extractor_class": FlattenExtractor}
+    with pytest.raises(ConfigError, match="its weights give other actions here"):
+        algorithm("MlpPolicy", "Pendulum-v1", initial_policy=agent, policy_kwargs=other)
 
 
 def test_weight_decay_leaves_the_deviation_of_state_dependent_exploration_alone():

@@ -97,6 +97,25 @@ def test_dict_observations_are_cloned_as_sac_takes_them():
         SACBC("MultiInputPolicy", make_vec_env(make, 4), n_steps=3)
 
 
+def test_an_agent_of_other_networks_cannot_be_imitated_from_dict_observations():
+    observed = spaces.Dict(all=spaces.Box(-8.0, 8.0, (3,)))
+
+    def make():
+        return TransformObservation(gym.make("Pendulum-v1"), lambda o: {"all": o}, observed)
+
+    agent = PPO("MultiInputPolicy", make_vec_env(make, 1), device="cpu")
+    with pytest.raises(ConfigError, match="FlattenObservation") as raised:
+        SACBC("MultiInputPolicy", make_vec_env(make, 1), initial_policy=agent, **SMALL)
+    assert "\n" not in str(raised.value)
+
+
+def test_normalised_critics_are_not_handed_on_to_plain_ones():
+    agent = SACBC("MlpPolicy", "Pendulum-v1", critic_layer_norm=True, **SMALL)
+    SACBC("MlpPolicy", "Pendulum-v1", critic_layer_norm=True, initial_policy=agent, **SMALL)
+    with pytest.raises(ConfigError, match="give critic_layer_norm=True"):
+        SACBC("MlpPolicy", "Pendulum-v1", initial_policy=agent, **SMALL)
+
+
 def test_labels_lie_beside_the_actions_of_the_same_state():
     """Sampling takes as many global random numbers as SB3's buffer does, and no others."""
     buffer = pendulum(bc_coef=0.5).learn(1200).replay_buffer  # the episodes end after 800

@@ -68,6 +68,19 @@ _OF_NEW_MODELS = {
     "initial_policy": "a zip holds its policy; give the other one to a new model",
     "demonstrations": "a loaded model of DAgger takes them by model.dataset.load(...)",
 }
+# What of an agent's ``policy_kwargs`` says how its networks compute.
+_OF_NETWORKS = (
+    "net_arch",
+    "activation_fn",
+    "features_extractor_class",
+    "features_extractor_kwargs",
+    "share_features_extractor",
+    "normalize_images",
+    "squash_output",
+    "use_expln",
+    "full_std",
+    "n_critics",
+)
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 # A limit further than this from the middle of the range is none at all.
@@ -385,13 +398,13 @@ def policy_arguments(
     """Return the ``policy_kwargs`` of a new model.
 
     :param given: what the user gives; it holds. ``log_std_init=None`` there: no default.
-    :param initial: the model that it starts from. Where that is of the same ``family``, its
-        ``net_arch`` and ``activation_fn`` are taken.
+    :param initial: the model that it starts from. Where that is of the same ``family``, what says
+        how its networks compute is taken, such as its ``net_arch`` and its features extractor.
     :param log_std_init: the default.
     """
     arguments: StrDict = {}
     if isinstance(initial, family):
-        for name in ("net_arch", "activation_fn"):
+        for name in _OF_NETWORKS:
             if name in initial.policy_kwargs:
                 arguments[name] = initial.policy_kwargs[name]
     arguments |= {"log_std_init": log_std_init} | (given or {})

@@ -100,8 +100,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         YAML takes it, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
         :meth:`set_expert`, before learning continues
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. Its policy and critic are taken; so are its ``net_arch`` and
-        ``activation_fn`` where ``policy_kwargs`` does not give them
+        shipped agent. Its policy and critic are taken; so are its ``net_arch``,
+        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them
     :param gradient_steps: Optimiser steps after each rollout, at most one for each row of
         ``n_epochs`` passes over it. Each takes ``batch_size`` pairs of the dataset. None:
         ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The critic takes part in as

@@ -78,8 +78,8 @@ class PPOBC(ExpertMixin, PPO):
         state of our environments, an SB3 model, or a callable from observations to actions; or a
         name as YAML takes it, such as ``"pid"``. Needed when learning starts with a cloning weight.
     :param initial_policy: the agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. Its policy and critic are taken; so are its ``net_arch`` and
-        ``activation_fn`` where ``policy_kwargs`` does not give them.
+        shipped agent. Its policy and critic are taken; so are its ``net_arch``,
+        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them.
     :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining
         progress (SB3's ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum
