@@ -182,6 +182,12 @@ def test_a_callback_that_calls_the_policy_leaves_the_labels_alone():
     np.testing.assert_allclose(seen[0].expert_actions.reshape(-1, 1), expected, atol=1e-6)
 
 
+def test_the_cloning_weight_is_not_negative_where_the_last_rollout_ends_late():
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=lambda p: p, **SMALL)
+    model.learn(100)
+    assert model.rollout_buffer.bc_coef == 0.0
+
+
 class Raised(BaseFeaturesExtractor):
     """A features extractor without parameters, which no state dict shows."""
 

@@ -11,6 +11,7 @@ from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import PPO, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import SACBC, PIDExpert
 from sb3_quad.algorithms import transfer
@@ -107,6 +108,25 @@ def test_an_agent_of_other_networks_cannot_be_imitated_from_dict_observations():
     with pytest.raises(ConfigError, match="FlattenObservation") as raised:
         SACBC("MultiInputPolicy", make_vec_env(make, 1), initial_policy=agent, **SMALL)
     assert "\n" not in str(raised.value)
+
+
+def test_a_weight_that_comes_after_the_model_was_built_without_one_is_refused():
+    model = SACBC("MlpPolicy", "Pendulum-v1", expert=swing_up, **SMALL)
+    model.bc_coef = LinearSchedule(5.0, 1.0, 1.0)
+    with pytest.raises(ConfigError, match=r"bc_coef .*built without cloning"):
+        model.learn(150)
+
+
+def test_the_weight_is_not_negative_where_the_last_flight_ends_late():
+    model = SACBC(
+        "MlpPolicy",
+        make_vec_env("Pendulum-v1", 4, seed=0),
+        expert=swing_up,
+        bc_coef=lambda progress: progress,
+        **SMALL,
+    ).learn(150)
+    assert model.num_timesteps > 150
+    assert model.logger.name_to_value["train/bc_coef"] == 0.0
 
 
 def test_normalised_critics_are_not_handed_on_to_plain_ones():

@@ -283,7 +283,8 @@ class PPOBC(ExpertMixin, PPO):
         # The update comes at the end of this rollout and takes the weight of that time.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
-        buffer.bc_coef = self.bc_coef(1.0 - end / self._total_timesteps)
+        # The last rollout may end after the last timestep.
+        buffer.bc_coef = self.bc_coef(max(1.0 - end / self._total_timesteps, 0.0))
         if buffer.bc_coef == 0.0:
             # A recurrent expert that does not see this rollout begins again.
             self._labeller = None

@@ -284,7 +284,12 @@ class SACBC(ExpertMixin, SAC):
             optimizers += [self.ent_coef_optimizer]
         self._update_learning_rate(optimizers)
         # + Weight of the cloning term in this update
-        bc_coef = self.bc_coef(self._current_progress_remaining)
+        bc_coef = self.bc_coef(max(self._current_progress_remaining, 0.0))
+        if bc_coef > 0.0 and not self._clones:
+            raise ConfigError(
+                f"bc_coef {bc_coef:g}: this model was built without cloning, and its replay buffer"
+                " holds no actions of an expert; build or load it with a bc_coef above 0"
+            )
         # The terms of each gradient step, by name
         history: History = {}
 
