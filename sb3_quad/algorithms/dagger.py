@@ -45,7 +45,7 @@ from sb3_quad.algorithms.networks.losses import (
 )
 from sb3_quad.algorithms.networks.perceptron import Batch
 from sb3_quad.algorithms.transfer import model_of
-from sb3_quad.base.errors import ConfigError, refuse_unknown
+from sb3_quad.base.errors import ConfigError, ExpertError, refuse_unknown
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.controller import limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
@@ -209,6 +209,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if _init_setup_model:
             self._set_up(initial)
             if demonstrations is not None:
+                if expert is not None and dataset_capacity == 0:
+                    raise ConfigError(
+                        "demonstrations: with dataset_capacity=0 the expert's first labels would"
+                        " replace them; remove one of the two, or give a capacity"
+                    )
                 self.dataset.load(demonstrations)
 
     def _setup_model(self) -> None:
@@ -315,6 +320,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
+        if beta > 0.0 and self.expert is None:
+            raise ExpertError(f"beta {beta:g}: no expert to fly; call set_expert, or set_beta(0)")
         # + The dataset holds raw observations: the statistics of VecNormalize go on changing.
         normalize = statistics_of(self)
         if normalize and normalize.observation_space.shape != self.observation_space.shape:
