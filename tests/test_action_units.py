@@ -94,6 +94,35 @@ def test_a_training_in_other_units_is_the_one_with_unit_actions(
     np.testing.assert_allclose(stds[1] / half, stds[0], rtol=0.01)
 
 
+def test_a_cloning_weight_that_ends_leaves_the_units(tmp_path):
+    models = []
+    for low, high in ((-1.0, 1.0), BOXES["torque"]):
+        model = trained(PPOBC, low, high, critic_warmup=0, bc_filter="none")
+        model.set_bc_coef(0.0)
+        model.save(tmp_path / "agent.zip")
+        model = PPOBC.load(tmp_path / "agent.zip", env=model.get_env(), device="cpu")
+        models.append(model.learn(400, reset_num_timesteps=False))
+    seen = np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)
+    plain, other = (unit_actions(model, seen) for model in models)
+    np.testing.assert_allclose(other, plain, atol=0.02)
+
+
+def test_actions_of_two_dimensions_are_cloned():
+    def stacked():
+        return gym.wrappers.TransformAction(
+            Height(), np.ravel, spaces.Box(-1.0, 1.0, (2, 1), np.float32)
+        )
+
+    def expert(observation):
+        return throttle(-1.0, 1.0)(observation)[:, :, None]
+
+    env = make_vec_env(stacked, 8, seed=0)
+    flat = trained(PPOBC, -1.0, 1.0)
+    model = PPOBC("MlpPolicy", env, expert=expert, **SIZES).learn(800)
+    for mine, theirs in zip(model.policy.parameters(), flat.policy.parameters(), strict=True):
+        assert th.equal(mine, theirs)
+
+
 @pytest.mark.parametrize("box", BOXES)
 @pytest.mark.parametrize("algorithm", [DAgger, PPOBC])
 def test_the_agent_becomes_the_expert_in_any_units(box, algorithm):
@@ -117,6 +146,15 @@ def test_state_dependent_exploration_in_other_units():
     other = trained(PPOBC, 1000.0, 2000.0, **keywords)
     seen = np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)
     np.testing.assert_allclose(unit_actions(other, seen), unit_actions(plain, seen), atol=0.02)
+
+
+@pytest.mark.parametrize("policy_kwargs", [{"use_expln": True}, {"full_std": False}])
+def test_deviations_that_cannot_be_scaled_are_refused_in_other_units_alone(policy_kwargs):
+    keywords = {"use_sde": True, "policy_kwargs": policy_kwargs, **SIZES}
+    PPOBC("MlpPolicy", Height(), **keywords)
+    with pytest.raises(ConfigError, match="RescaleAction") as raised:
+        PPOBC("MlpPolicy", Height(0.0, 3.0), **keywords)
+    assert "\n" not in str(raised.value)
 
 
 def test_a_stock_ppo_flies_the_zip_in_the_units_of_the_environment(tmp_path):

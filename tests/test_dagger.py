@@ -437,6 +437,28 @@ def test_flights_of_a_file_are_held_beside_new_labels_of_an_expert(tmp_path):
     assert len(model.dataset) == 100 + ROLLOUT
 
 
+def test_an_expert_that_is_to_fly_but_missing_is_noticed(tmp_path):
+    class Later(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            self.model.set_beta(0.5)
+
+    recorded(tmp_path / "flights.npz", 2)
+    model = build(expert=None, beta=0, demonstrations=tmp_path / "flights.npz")
+    with pytest.raises(ExpertError, match=r"beta 0\.5: no expert"):
+        model.learn(2 * ROLLOUT, callback=Later())
+
+
+def test_demonstrations_that_the_first_labels_would_replace_are_refused(tmp_path):
+    recorded(tmp_path / "flights.npz", 1)
+    given = {"demonstrations": tmp_path / "flights.npz", "dataset_capacity": 0}
+    with pytest.raises(ConfigError, match="dataset_capacity=0"):
+        build(**given)
+    build(expert=None, beta=0, **given)
+
+
 def test_flights_of_another_range_of_actions_are_refused(tmp_path):
     np.savez(tmp_path / "rpm.npz", obs=np.zeros((3, 3)), acts=np.full((3, 1), 1500.0))
     with pytest.raises(ConfigError, match=r"rpm\.npz: .*actions from 1500 to 1500"):

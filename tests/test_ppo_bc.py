@@ -16,6 +16,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
@@ -150,6 +151,76 @@ def test_labels_belong_to_the_state_before_the_step():
     assert len(seen) == 64
     for observation, label in seen:
         np.testing.assert_allclose(label, np.clip(swing_back(observation), -2, 2), rtol=1e-6)
+
+
+class Swing:
+    """:func:`swing_back` for the true state of the pendulums, (angle, angular velocity)."""
+
+    def actions(self, state):
+        return -0.5 * state[:, 1:2]
+
+
+def test_a_callback_that_calls_the_policy_leaves_the_labels_alone():
+    class Calls(BaseCallback):
+        def _on_step(self):
+            observations = th.from_numpy(self.locals["new_obs"])
+            with th.no_grad():
+                self.model.policy(observations)
+                self.model.policy(observations, deterministic=True)
+            return True
+
+        def _on_rollout_end(self):
+            self._on_step()
+
+    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    env.true_state = lambda: np.array([pendulum.unwrapped.state for pendulum in env.envs])
+    model = PPOBC("MlpPolicy", env, expert=Swing(), bc_coef=1.0, **SMALL)
+    seen = []
+    model.train = lambda: seen.append(model.rollout_buffer)
+    model.learn(128, callback=Calls())
+    expected = np.clip(swing_back(seen[0].observations.reshape(-1, 3)), -2, 2)
+    np.testing.assert_allclose(seen[0].expert_actions.reshape(-1, 1), expected, atol=1e-6)
+
+
+def test_the_cloning_weight_is_not_negative_where_the_last_rollout_ends_late():
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=lambda p: p, **SMALL)
+    model.learn(100)
+    assert model.rollout_buffer.bc_coef == 0.0
+
+
+class Raised(BaseFeaturesExtractor):
+    """A features extractor without parameters, which no state dict shows."""
+
+    def __init__(self, space):
+        super().__init__(space, 3)
+
+    def forward(self, observations):
+        return 2.0 * observations + 1.0
+
+
+@pytest.mark.parametrize(("teacher", "algorithm"), [(PPO, PPOBC), (PPO, DAgger), (SAC, SACBC)])
+def test_an_initial_policy_hands_on_how_its_networks_compute(teacher, algorithm):
+    settings = {"net_arch": [8], "features_extractor_class": Raised}
+    agent = teacher("MlpPolicy", "Pendulum-v1", policy_kwargs=settings, seed=0, device="cpu")
+    model = algorithm("MlpPolicy", "Pendulum-v1", initial_policy=agent, seed=1, device="cpu")
+    observations = np.random.default_rng(0).normal(size=(64, 3)).astype(np.float32)
+    np.testing.assert_array_equal(
+        model.predict(observations, deterministic=True)[0],
+        agent.predict(observations, deterministic=True)[0],
+    )
+    other = {"features_extractor_class": FlattenExtractor}
+    with pytest.raises(ConfigError, match="its weights give other actions here"):
+        algorithm("MlpPolicy", "Pendulum-v1", initial_policy=agent, policy_kwargs=other)
+
+
+def test_weight_decay_leaves_the_deviation_of_state_dependent_exploration_alone():
+    once = {"batch_size": 64, "n_epochs": 1, "learning_rate": 1e-12, "max_grad_norm": math.inf}
+    changes = {**SMALL, **once, "policy_kwargs": {"log_std_init": -1.0}, "use_sde": True}
+    gradients = []
+    for l2_coef in (0.0, 5.0):
+        model = PPOBC("MlpPolicy", "Pendulum-v1", l2_coef=l2_coef, bc_coef=0.0, **changes)
+        gradients.append(model.learn(64).policy.log_std.grad.clone())
+    th.testing.assert_close(*gradients)
 
 
 def test_critic_warmup_moves_the_critic_only():
@@ -501,7 +572,7 @@ def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tm
         return TransformObservation(gym.make("QuadTargetTracking-v0"), lambda x: -x, box)
 
     assert flights_of(PPOBC("MlpPolicy", make_vec_env(turned, 1))) is None
-    normalised.set_env(make_vec_env(turned, 2))
+    normalised.set_env(VecNormalize(make_vec_env(turned, 2)))
     assert flights_of(normalised) is None
 
 

@@ -11,6 +11,7 @@ from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import PPO, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import SACBC, PIDExpert
 from sb3_quad.algorithms import transfer
@@ -95,6 +96,44 @@ def test_dict_observations_are_cloned_as_sac_takes_them():
     assert model.logger.name_to_value["train/bc_loss"] > 0.0
     with pytest.raises(ConfigError, match=r"n_steps 3: .*Dict"):
         SACBC("MultiInputPolicy", make_vec_env(make, 4), n_steps=3)
+
+
+def test_an_agent_of_other_networks_cannot_be_imitated_from_dict_observations():
+    observed = spaces.Dict(all=spaces.Box(-8.0, 8.0, (3,)))
+
+    def make():
+        return TransformObservation(gym.make("Pendulum-v1"), lambda o: {"all": o}, observed)
+
+    agent = PPO("MultiInputPolicy", make_vec_env(make, 1), device="cpu")
+    with pytest.raises(ConfigError, match="FlattenObservation") as raised:
+        SACBC("MultiInputPolicy", make_vec_env(make, 1), initial_policy=agent, **SMALL)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_weight_that_comes_after_the_model_was_built_without_one_is_refused():
+    model = SACBC("MlpPolicy", "Pendulum-v1", expert=swing_up, **SMALL)
+    model.bc_coef = LinearSchedule(5.0, 1.0, 1.0)
+    with pytest.raises(ConfigError, match=r"bc_coef .*built without cloning"):
+        model.learn(150)
+
+
+def test_the_weight_is_not_negative_where_the_last_flight_ends_late():
+    model = SACBC(
+        "MlpPolicy",
+        make_vec_env("Pendulum-v1", 4, seed=0),
+        expert=swing_up,
+        bc_coef=lambda progress: progress,
+        **SMALL,
+    ).learn(150)
+    assert model.num_timesteps > 150
+    assert model.logger.name_to_value["train/bc_coef"] == 0.0
+
+
+def test_normalised_critics_are_not_handed_on_to_plain_ones():
+    agent = SACBC("MlpPolicy", "Pendulum-v1", critic_layer_norm=True, **SMALL)
+    SACBC("MlpPolicy", "Pendulum-v1", critic_layer_norm=True, initial_policy=agent, **SMALL)
+    with pytest.raises(ConfigError, match="give critic_layer_norm=True"):
+        SACBC("MlpPolicy", "Pendulum-v1", initial_policy=agent, **SMALL)
 
 
 def test_labels_lie_beside_the_actions_of_the_same_state():

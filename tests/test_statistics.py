@@ -11,9 +11,10 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_quad import DAgger
+from sb3_quad.algorithms.networks.gradients import Perceptrons
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
@@ -196,6 +197,45 @@ def test_an_agent_goes_on_with_its_statistics_or_is_refused(run, tmp_path):
     model = PPO("MlpPolicy", VecNormalize(QuadcopterVecEnv(2)), policy_kwargs={"net_arch": [16]})
     with pytest.raises(ConfigError, match="must both have it, or neither"):
         transfer_policy(PPO("MlpPolicy", QuadcopterVecEnv(2)), model)
+
+
+def test_dagger_keeps_raw_rows_and_normalises_them_by_the_present_statistics(monkeypatch, tmp_path):
+    env: Any = VecNormalize(make_vec_env("Pendulum-v1", 4, seed=0))
+    learnt_from = []
+    gradients = Perceptrons.gradients
+
+    def spy(self, loss, actor, critic):
+        learnt_from.append(actor.observations)
+        return gradients(self, loss, actor, critic)
+
+    def expert(observation):
+        return -env.get_original_obs()[:, 1:2]
+
+    monkeypatch.setattr(Perceptrons, "gradients", spy)
+    settings = {"n_steps": 20, "batch_size": 40, "gradient_steps": 2, "seed": 0, "device": "cpu"}
+    model = DAgger("MlpPolicy", env, expert=expert, **settings).learn(240)
+    rows = model.dataset.pairs["observations"]
+    np.testing.assert_allclose(model.dataset.pairs["actions"], -rows[:, 1:2], atol=1e-6)
+    np.testing.assert_array_equal(learnt_from[-1], env.normalize_obs(rows))
+    # The rows of a file are raw, too.
+    model.dataset.save(tmp_path / "flights.npz")
+    given = {"demonstrations": tmp_path / "flights.npz", "beta": 0.0, **settings}
+    clone = DAgger("MlpPolicy", env, **given).learn(80)
+    np.testing.assert_array_equal(learnt_from[-1], env.normalize_obs(rows))
+    assert len(clone.dataset) == len(rows)
+    stacked = DAgger("MlpPolicy", VecFrameStack(env, 2), expert=expert, **settings)
+    with pytest.raises(ConfigError, match="make VecNormalize the outermost wrapper"):
+        stacked.learn(80)
+
+
+def test_statistics_go_on_in_an_environment_that_is_set_later(run):
+    model = DAgger.load(run.model, device="cpu", expert="pid")
+    count = model.vec_normalize.obs_rms.count
+    with pytest.raises(ConfigError, match="must both have it, or neither"):
+        model.set_env(QuadcopterVecEnv(8))
+    model.set_env(VecNormalize(QuadcopterVecEnv(8)))
+    assert model.get_vec_normalize_env().obs_rms.count == count
+    assert model.vec_normalize is model.get_vec_normalize_env()
 
 
 def test_best_model_freezes_and_synchronises_the_environments_of_a_user(tmp_path, monkeypatch):

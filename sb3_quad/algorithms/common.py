@@ -68,6 +68,19 @@ _OF_NEW_MODELS = {
     "initial_policy": "a zip holds its policy; give the other one to a new model",
     "demonstrations": "a loaded model of DAgger takes them by model.dataset.load(...)",
 }
+# What of an agent's ``policy_kwargs`` says how its networks compute.
+_OF_NETWORKS = (
+    "net_arch",
+    "activation_fn",
+    "features_extractor_class",
+    "features_extractor_kwargs",
+    "share_features_extractor",
+    "normalize_images",
+    "squash_output",
+    "use_expln",
+    "full_std",
+    "n_critics",
+)
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 # A limit further than this from the middle of the range is none at all.
@@ -137,8 +150,12 @@ class ExpertMixin(BaseAlgorithm):
         """Learn in another environment from now on; see SB3's ``set_env``.
 
         The model's zips say from then on that its agent flies as this environment does, or nothing
-        of how it flies where that cannot be read.
+        of how it flies where that cannot be read. Its statistics of VecNormalize go on there.
+
+        :raises ConfigError: only one of the agent and the environment normalises observations.
         """
+        if hasattr(self, STATISTICS):
+            share_statistics(getattr(self, STATISTICS), env, training=True)
         super().set_env(env, force_reset)
         self._note_flight_settings()
 
@@ -260,6 +277,8 @@ class ExpertMixin(BaseAlgorithm):
         scale = th.as_tensor(factor, device=policy.device)
         unfit = f"action space {self.action_space}: wrap it in RescaleAction(env, -1, 1)"
         with raised_as(ConfigError, unfit), th.no_grad():
+            if getattr(policy.action_dist, "use_expln", False):
+                raise ValueError("use_expln: log_std is no logarithm of a deviation")
             policy.action_net.weight *= scale[:, None]
             policy.action_net.bias.mul_(scale).add_(th.as_tensor(offset, device=policy.device))
             policy.log_std += scale.log()
@@ -379,13 +398,13 @@ def policy_arguments(
     """Return the ``policy_kwargs`` of a new model.
 
     :param given: what the user gives; it holds. ``log_std_init=None`` there: no default.
-    :param initial: the model that it starts from. Where that is of the same ``family``, its
-        ``net_arch`` and ``activation_fn`` are taken.
+    :param initial: the model that it starts from. Where that is of the same ``family``, what says
+        how its networks compute is taken, such as its ``net_arch`` and its features extractor.
     :param log_std_init: the default.
     """
     arguments: StrDict = {}
     if isinstance(initial, family):
-        for name in ("net_arch", "activation_fn"):
+        for name in _OF_NETWORKS:
             if name in initial.policy_kwargs:
                 arguments[name] = initial.policy_kwargs[name]
     arguments |= {"log_std_init": log_std_init} | (given or {})

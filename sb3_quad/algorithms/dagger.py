@@ -45,10 +45,11 @@ from sb3_quad.algorithms.networks.losses import (
 )
 from sb3_quad.algorithms.networks.perceptron import Batch
 from sb3_quad.algorithms.transfer import model_of
-from sb3_quad.base.errors import ConfigError, refuse_unknown
+from sb3_quad.base.errors import ConfigError, ExpertError, refuse_unknown
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.controller import limits_of
 from sb3_quad.controllers.expert_like import ExpertLike
+from sb3_quad.controllers.statistics import statistics_of
 
 # Observations that the critic evaluates at once after a rollout
 _VALUE_CHUNK = 16384
@@ -99,8 +100,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         YAML takes it, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
         :meth:`set_expert`, before learning continues
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. Its policy and critic are taken; so are its ``net_arch`` and
-        ``activation_fn`` where ``policy_kwargs`` does not give them
+        shipped agent. Its policy and critic are taken; so are its ``net_arch``,
+        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them
     :param gradient_steps: Optimiser steps after each rollout, at most one for each row of
         ``n_epochs`` passes over it. Each takes ``batch_size`` pairs of the dataset. None:
         ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The critic takes part in as
@@ -208,11 +209,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if _init_setup_model:
             self._set_up(initial)
             if demonstrations is not None:
-                normalize = self._vec_normalize_env
-                if normalize is not None and normalize.norm_obs:
+                if expert is not None and dataset_capacity == 0:
                     raise ConfigError(
-                        "demonstrations: their observations are raw, those of VecNormalize are not;"
-                        " remove it, or give norm_obs=False"
+                        "demonstrations: with dataset_capacity=0 the expert's first labels would"
+                        " replace them; remove one of the two, or give a capacity"
                     )
                 self.dataset.load(demonstrations)
 
@@ -320,6 +320,16 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         network = network_of(self.policy)
         rng = self._generator(0)
         beta = self.current_beta  # +
+        if beta > 0.0 and self.expert is None:
+            raise ExpertError(f"beta {beta:g}: no expert to fly; call set_expert, or set_beta(0)")
+        # + The dataset holds raw observations: the statistics of VecNormalize go on changing.
+        normalize = statistics_of(self)
+        if normalize and normalize.observation_space.shape != self.observation_space.shape:
+            raise ConfigError(
+                "VecNormalize: DAgger keeps its raw observations, and a wrapper around it changes"
+                " their shape; make VecNormalize the outermost wrapper"
+            )
+        raw = np.empty_like(buffer.observations)
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
         not_yet = th.zeros(env.num_envs)
@@ -335,6 +345,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
             # + The expert's action flies with probability β, else a sample of the agent's.
             observations = self._last_obs
+            raw[step] = normalize.get_original_obs() if normalize else observations
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta
@@ -372,7 +383,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if self.expert is not None:
             if self.dataset_capacity == 0:
                 self.dataset.clear()
-            self.dataset.add(flown, buffer.expert_actions.reshape(len(flown), -1))
+            labels = buffer.expert_actions.reshape(len(flown), -1)
+            self.dataset.add(raw.reshape(flown.shape), labels)
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
@@ -410,9 +422,13 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         )
         actor_parameters, critic_parameters = actor_and_critic_parameters(self.policy)
 
-        # + Labels in [-1, 1], and rows of the dataset for the actor
+        # + Labels in [-1, 1] and normalised observations, and rows of the dataset for the actor
         factor, offset = unit_action_transform(self.action_space)
         labels = self.dataset.filled["actions"] * factor + offset
+        seen = self.dataset.filled["observations"]
+        normalize = statistics_of(self)
+        if normalize:
+            seen = normalize.normalize_obs(seen)
         buffer = self.rollout_buffer
         rng = self._generator(1)
         n_rows = buffer.buffer_size * buffer.n_envs
@@ -430,7 +446,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         history: History = {}
 
         for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
-            actor_batch = self.dataset.batch(rows)._replace(targets=labels)
+            actor_batch = self.dataset.batch(rows)._replace(observations=seen, targets=labels)
             critic_batch = None
             if (i + 1) * n_critic // n_batches > i * n_critic // n_batches:
                 critic_batch = Batch(next(critic_batches), flown, targets)

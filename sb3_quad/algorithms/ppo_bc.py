@@ -68,7 +68,8 @@ class PPOBC(ExpertMixin, PPO):
     equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model
     loads with ``PPO.load``, even where this package is not installed.
 
-    Where it clones, errors of actions and log_std are those of actions scaled to [-1, 1].
+    Where it clones or has cloned, errors of actions and log_std are those of actions scaled to
+    [-1, 1].
 
     :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
     :param policy_kwargs: unless it holds ``log_std_init``, that is -0.9. ``log_std_init=None``:
@@ -77,8 +78,8 @@ class PPOBC(ExpertMixin, PPO):
         state of our environments, an SB3 model, or a callable from observations to actions; or a
         name as YAML takes it, such as ``"pid"``. Needed when learning starts with a cloning weight.
     :param initial_policy: the agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. Its policy and critic are taken; so are its ``net_arch`` and
-        ``activation_fn`` where ``policy_kwargs`` does not give them.
+        shipped agent. Its policy and critic are taken; so are its ``net_arch``,
+        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them.
     :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining
         progress (SB3's ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum
@@ -185,6 +186,7 @@ class PPOBC(ExpertMixin, PPO):
         self.critic_warmup = critic_warmup
         self.shuffle = shuffle
         self._n_rollouts_trained = 0
+        self._has_cloned = False
 
         if _init_setup_model:
             self._set_up(initial)
@@ -236,9 +238,11 @@ class PPOBC(ExpertMixin, PPO):
         self.bc_coef = FloatSchedule(float(bc_coef))
 
     def _scale_actions(self, inverse: bool = False) -> None:
-        # Without a cloning term it is PPO, which counts actions as they are.
-        may_clone = self.will_clone() or self.rollout_buffer.bc_coef
-        if isinstance(self.action_space, spaces.Box) and may_clone:
+        # Without a cloning term it is PPO, which counts actions as they are. An agent that has had
+        # one keeps the units that its steps are made for.
+        if self.will_clone() or self.rollout_buffer.bc_coef:
+            self._has_cloned = True
+        if isinstance(self.action_space, spaces.Box) and self._has_cloned:
             super()._scale_actions(inverse)
 
     def _check_cloning(self) -> None:
@@ -279,22 +283,31 @@ class PPOBC(ExpertMixin, PPO):
         # The update comes at the end of this rollout and takes the weight of that time.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
-        buffer.bc_coef = self.bc_coef(1.0 - end / self._total_timesteps)
+        # The last rollout may end after the last timestep.
+        buffer.bc_coef = self.bc_coef(max(1.0 - end / self._total_timesteps, 0.0))
         if buffer.bc_coef == 0.0:
             # A recurrent expert that does not see this rollout begins again.
             self._labeller = None
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
 
         network = network_of(self.policy)
-        sample: Any = self.policy.forward
+        stock: Any = self.policy.forward
+        sample = stock
         if isinstance(network, Perceptrons):
             sample = partial(act, network)
 
-        def forward(observations: th.Tensor) -> Any:
-            output = sample(observations)
+        labelled = -1
+
+        def forward(observations: th.Tensor, deterministic: bool = False) -> Any:
+            nonlocal labelled
+            # Callbacks, too, may call the policy, and after the step.
+            if deterministic or buffer.full or buffer.pos == labelled:
+                return stock(observations, deterministic)
+            labelled = buffer.pos
+            actions, values, log_prob = sample(observations)
             # Label the state before the step.
-            buffer.expert_actions[buffer.pos] = self._labels(env)
-            return output
+            buffer.expert_actions[labelled] = self._labels(env)
+            return actions.reshape(-1, *self.action_space.shape), values, log_prob
 
         self.policy.forward = forward
         try:
@@ -425,7 +438,10 @@ class PPOBC(ExpertMixin, PPO):
                         loss = loss + bc_coef * losses["bc_loss"]
                     # + Weight decay as a term of the loss (Eq. 2.25)
                     if l2_coef != 0.0:
-                        losses["l2_loss"] = l2_loss([*self.policy.parameters()])
+                        parameters = dict(self.policy.named_parameters())
+                        # That of gSDE is a matrix.
+                        parameters.pop("log_std", None)
+                        losses["l2_loss"] = l2_loss([*parameters.values()])
                         loss = loss + l2_coef * losses["l2_loss"]
 
                     # Calculate approximate form of reverse KL Divergence for early stopping

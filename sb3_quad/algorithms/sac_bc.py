@@ -57,9 +57,9 @@ class SACBC(ExpertMixin, SAC):
         environments, an SB3 model, or a function from observations to actions; or a name as YAML
         takes it, such as ``"pid"``. It is never saved. Needed when learning starts with cloning.
     :param initial_policy: the agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. One of SAC hands on all its weights, and its ``net_arch`` and
-        ``activation_fn`` where ``policy_kwargs`` does not give them. Any other is imitated by the
-        actor.
+        shipped agent. One of SAC hands on all its weights, and its ``net_arch``,
+        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them. Any
+        other is imitated by the actor.
     :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a
         schedule of the remaining progress.
     :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear
@@ -121,6 +121,10 @@ class SACBC(ExpertMixin, SAC):
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
+        if getattr(initial, "critic_layer_norm", False) and not critic_layer_norm:
+            raise ConfigError(
+                "initial_policy: its critics normalise their layers; give critic_layer_norm=True"
+            )
         super().__init__(
             policy,
             env,
@@ -280,7 +284,12 @@ class SACBC(ExpertMixin, SAC):
             optimizers += [self.ent_coef_optimizer]
         self._update_learning_rate(optimizers)
         # + Weight of the cloning term in this update
-        bc_coef = self.bc_coef(self._current_progress_remaining)
+        bc_coef = self.bc_coef(max(self._current_progress_remaining, 0.0))
+        if bc_coef > 0.0 and not self._clones:
+            raise ConfigError(
+                f"bc_coef {bc_coef:g}: this model was built without cloning, and its replay buffer"
+                " holds no actions of an expert; build or load it with a bc_coef above 0"
+            )
         # The terms of each gradient step, by name
         history: History = {}
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
@@ -54,7 +55,7 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
     :param source: a model of any algorithm, or what names one: the path of a zip or of a run
         folder, or a shipped agent's name.
     :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ;
-        the message names them.
+        the message names them. An agent that computes something else with these layers.
     """
     name = str(source)
     if isinstance(source, BaseAlgorithm):
@@ -92,6 +93,18 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
             f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
             " train takes them from it unless --conf-file is given"
         ) from None
+    # Other functions may have parameters of the same names and shapes.
+    if teacher.observation_space != model.observation_space:
+        return
+    for _ in range(8):
+        observation = model.observation_space.sample()
+        wanted, _ = teacher.policy.predict(observation, deterministic=True)
+        actions, _ = model.policy.predict(observation, deterministic=True)
+        if not np.allclose(actions, wanted, 0.01, 0.01 * np.abs(wanted).max(), equal_nan=True):
+            raise ConfigError(
+                f"{name}: its weights give other actions here; give the policy and policy_kwargs"
+                " that it has, such as activation_fn or features_extractor_class"
+            )
 
 
 # A clone flies at least this many states, and at least this many steps in each environment.
@@ -119,10 +132,17 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     learning.
 
     :param teacher: a source of :class:`~sb3_quad.controllers.controller.Controller`.
+    :raises ConfigError: Dict observations.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.
     """
     env = model.get_env()
     assert env is not None
+    space: Any = env.observation_space
+    if isinstance(space, spaces.Dict):
+        raise ConfigError(
+            "initial_policy: an agent of other networks cannot be imitated from Dict observations;"
+            " wrap the environments in gymnasium.wrappers.FlattenObservation"
+        )
     policy: Any = model.policy
     actor = policy.actor
     n = env.num_envs
@@ -132,7 +152,6 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
     # The states flown, and the teacher's actions there as the actor gives them
-    space: Any = env.observation_space
     dataset = AggregatedDataset(
         steps * n, space.shape, get_action_dim(env.action_space), space.dtype
     )
