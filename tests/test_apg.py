@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor
 
-from sb3_quad import APG, DAgger, QuadcopterVecEnv, fly, load_pretrained
+from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv, fly, load_pretrained
 from sb3_quad.algorithms.flight_cost import flight_cost
+from sb3_quad.algorithms.networks.gradients import RecordedPolicy
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.simulation.random import STEP
@@ -214,6 +217,42 @@ def test_a_cost_of_another_shape_or_without_a_gradient_is_refused(cost):
     model = APG("MlpPolicy", QuadcopterVecEnv(2, seed=0), n_steps=5, cost=cost)
     with pytest.raises(ConfigError, match=r"cost: returned .* \(steps, n\) = \(5, 2\)"):
         model.learn(10)
+
+
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ELU])
+def test_a_tape_may_reuse_its_array_and_gets_gradients_of_its_shape(activation_fn):
+    """PyTorch computes the second policy."""
+    policy = ActorCriticPolicy(
+        spaces.Box(-np.inf, np.inf, (2, 1), np.float32),
+        spaces.Box(-1.0, 1.0, (1,), np.float32),
+        lambda _: 0.0,
+        net_arch=[8],
+        activation_fn=activation_fn,
+    )
+    flown = np.random.default_rng(0).normal(size=(3, 5, 2, 1)).astype(np.float32)
+    results = []
+    for reused in (False, True):
+        array = flown[0].copy()
+        recorded = RecordedPolicy(policy, n_steps=3, n=5)
+        for step in range(3):
+            if not reused:
+                array = array.copy()
+            array[:] = flown[step]
+            recorded.forward(step, array)
+        policy.zero_grad()
+        results.append([recorded.backward(step, np.ones((5, 1))) for step in (2, 1, 0)])
+    np.testing.assert_array_equal(*results)
+    assert np.shape(results) == (2, 3, 5, 2, 1)
+
+
+def test_its_zip_leaves_other_algorithms_their_own_critic(tmp_path):
+    env = QuadcopterVecEnv(4, seed=0)
+    APG("MlpPolicy", env, n_steps=5, seed=0).save(tmp_path / "agent.zip")
+    for loader in (PPO, PPOBC, DAgger, APG):
+        loaded = loader.load(tmp_path / "agent.zip", env=env, device="cpu")
+        new = loader("MlpPolicy", env)
+        for name in ("gamma", "gae_lambda", "ent_coef", "vf_coef"):
+            assert getattr(loaded, name) == getattr(new, name), name
 
 
 def test_an_own_cost_must_be_given_again(tmp_path):

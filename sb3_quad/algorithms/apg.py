@@ -123,7 +123,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
-    _not_saved = ("cost", "_tape", "_recorded_policy")
+    # Algorithms that have a critic would take its own values for theirs.
+    _not_saved = ("cost", "_tape", "_recorded_policy", "gamma", "gae_lambda", "ent_coef", "vf_coef")
     _tape: Tape
 
     def __init__(

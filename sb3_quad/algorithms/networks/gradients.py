@@ -164,7 +164,8 @@ class RecordedPolicy:
                 self._actor.pack()
                 self._sums.fill(0.0)
             return self._actor(observations, self._activations[step])
-        self._activations[step] = observations
+        # A tape may write the next step's observations into the same array.
+        self._activations[step] = observations.copy()
         return mean_actions(self._policy, observations)
 
     def backward(self, step: int, grad_actions: FloatArray) -> Float32Array:
@@ -179,7 +180,8 @@ class RecordedPolicy:
             grad_observations = self._actor.pullback(self._activations[step], given, self._sums)
             if step == 0:
                 self._actor.set_gradients(self._sums)
-            return grad_observations
+            shape: Any = self._policy.observation_space.shape
+            return grad_observations.reshape(-1, *shape)
         inputs: Any = th.as_tensor(self._activations[step], device=self._policy.device)
         inputs.requires_grad_()
         means = self._policy.get_distribution(inputs).mode()
