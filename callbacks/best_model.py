@@ -39,6 +39,8 @@ Score = tuple[float, float]
 class BestModel(EveryTimesteps):
     """Evaluates the deterministic policy every ``every`` timesteps, and after the last update.
 
+    There is no evaluation at the end if a callback has ended the training earlier.
+
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's
     EvalCallback keeps the model of the highest mean reward; here a model that succeeds more often
     is better, and reward decides between equals. An evaluation that is due at the last timestep is
