@@ -12,10 +12,11 @@ from stable_baselines3 import PPO, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad import SACBC, PIDExpert
 from sb3_quad.algorithms import transfer
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.algorithms.transfer import clone_policy, transfer_policy
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.envs import QuadcopterVecEnv
 
@@ -108,6 +109,31 @@ def test_an_agent_of_other_networks_cannot_be_imitated_from_dict_observations():
     with pytest.raises(ConfigError, match="FlattenObservation") as raised:
         SACBC("MultiInputPolicy", make_vec_env(make, 1), initial_policy=agent, **SMALL)
     assert "\n" not in str(raised.value)
+
+
+def test_an_agent_is_imitated_by_the_present_statistics(monkeypatch):
+    monkeypatch.setattr(transfer, "CLONE_ROWS", 400)
+    monkeypatch.setattr(transfer, "CLONE_STEPS", 20)
+    env = VecNormalize(make_vec_env("Pendulum-v1", 4, seed=0))
+    model = SACBC("MlpPolicy", env, **SMALL)
+    flown = []
+    learnt_from = []
+    step = env.venv.step_wait
+    predict = model.policy._predict
+
+    def step_wait():
+        flown.append(env.get_original_obs())
+        return step()
+
+    def spy(observations, deterministic=False):
+        learnt_from.append(observations.numpy())
+        return predict(observations, deterministic)
+
+    monkeypatch.setattr(env.venv, "step_wait", step_wait)
+    monkeypatch.setattr(model.policy, "_predict", spy)
+    clone_policy(PPO("MlpPolicy", "Pendulum-v1", device="cpu"), model)
+    rows = {row.tobytes() for row in env.normalize_obs(np.concatenate(flown))}
+    assert all(row.tobytes() in rows for row in learnt_from[-1])
 
 
 def test_a_weight_that_comes_after_the_model_was_built_without_one_is_refused():

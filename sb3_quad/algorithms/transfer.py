@@ -151,6 +151,8 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     flown_by_teacher = (np.arange(n) % 2 == 0)[:, None]
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
+    # Rows are raw, since the statistics of VecNormalize go on changing.
+    normalize = statistics_of(model)
     # The states flown, and the teacher's actions there as the actor gives them
     dataset = AggregatedDataset(
         steps * n, space.shape, get_action_dim(env.action_space), space.dtype
@@ -161,7 +163,8 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     for step in range(steps):
         labels = expert.labels(observation, begins)
         scaled = policy.scale_action(labels.reshape(n, *actor.action_space.shape))
-        dataset.add(observation, scaled.reshape(n, -1))
+        seen = normalize.get_original_obs() if normalize else observation
+        dataset.add(seen, scaled.reshape(n, -1))
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
@@ -174,6 +177,9 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
             update_learning_rate(optimiser, rate)
             batch = dataset.batch(rng.integers(len(dataset), size=CLONE_BATCH))
             inputs, outputs = batch.tensors(model.device)
+            if normalize:
+                normalized = normalize.normalize_obs(inputs.cpu().numpy())
+                inputs = th.as_tensor(normalized, device=model.device)
             predicted = policy._predict(inputs, deterministic=True)
             loss = (predicted - outputs).square().mean()
             optimiser.zero_grad()
