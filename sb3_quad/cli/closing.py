@@ -35,6 +35,7 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     :param job: of an environment of this package.
     """
     how = dict(job.flight_settings)
+    how["max_episode_steps"] = job.flight_settings.longest_episode
     return compare(
         {"agent": model, "expert": job.for_evaluation().make_expert()},
         [how.pop("task")],

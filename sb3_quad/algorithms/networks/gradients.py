@@ -180,13 +180,8 @@ class RecordedPolicy:
             grad_observations = self._actor.pullback(self._activations[step], given, self._sums)
             if step == 0:
                 self._actor.set_gradients(self._sums)
-<<<<<<< HEAD
             shape: Any = self._policy.observation_space.shape
             return grad_observations.reshape(-1, *shape)
-=======
-            shape: Any = self._policy.observation_space.shape
-            return grad_observations.reshape(-1, *shape)
->>>>>>> algo
         inputs: Any = th.as_tensor(self._activations[step], device=self._policy.device)
         inputs.requires_grad_()
         means = self._policy.get_distribution(inputs).mode()
