@@ -1,6 +1,7 @@
 """DAgger: who flies, what is labelled, what is learnt, and what survives an interruption."""
 
 import math
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -443,7 +444,8 @@ def test_an_expert_that_is_to_fly_but_missing_is_noticed(tmp_path):
             return True
 
         def _on_rollout_end(self):
-            self.model.set_beta(0.5)
+            model: Any = self.model
+            model.set_beta(0.5)
 
     recorded(tmp_path / "flights.npz", 2)
     model = build(expert=None, beta=0, demonstrations=tmp_path / "flights.npz")

@@ -229,7 +229,7 @@ def test_dagger_keeps_raw_rows_and_normalises_them_by_the_present_statistics(mon
 
 
 def test_statistics_go_on_in_an_environment_that_is_set_later(run):
-    model = DAgger.load(run.model, device="cpu", expert="pid")
+    model: Any = DAgger.load(run.model, device="cpu", expert="pid")
     count = model.vec_normalize.obs_rms.count
     with pytest.raises(ConfigError, match="must both have it, or neither"):
         model.set_env(QuadcopterVecEnv(8))
