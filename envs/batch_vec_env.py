@@ -140,7 +140,7 @@ def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyA
     :raises ConfigError: another shape, or numbers that are not finite.
     """
     with raised_as(ConfigError, f"{what} are no numbers"):
-        given = np.array(values)
+        given = np.asarray(values)
         # Integers and booleans hide what is not finite or does not fit.
         with np.errstate(invalid="ignore"):
             array = given.astype(dtype)
@@ -149,9 +149,10 @@ def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyA
         raise ConfigError(f"{what}: None; return an array of shape {shape}")
     if array.shape != shape:
         raise ConfigError(f"{what} of shape {array.shape}: must be of shape {shape}")
-    unfit = ~np.isfinite(array)
-    reason = "a number that is not finite"
-    if not np.issubdtype(array.dtype, np.floating):
+    if np.issubdtype(array.dtype, np.floating):
+        unfit = ~np.isfinite(array)
+        reason = "a number that is not finite"
+    else:
         unfit = array != given
         reason = f"a number that is no {array.dtype}"
     if unfit.any():

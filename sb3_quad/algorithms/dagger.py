@@ -329,12 +329,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 "VecNormalize: DAgger keeps its raw observations, and a wrapper around it changes"
                 " their shape; make VecNormalize the outermost wrapper"
             )
-        raw = np.empty_like(buffer.observations)
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
         not_yet = th.zeros(env.num_envs)
 
         buffer.reset()
+        raw = np.empty_like(buffer.observations) if normalize else buffer.observations
         callback.on_rollout_start()
 
         for step in range(n_rollout_steps):
@@ -345,7 +345,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
             # + The expert's action flies with probability β, else a sample of the agent's.
             observations = self._last_obs
-            raw[step] = normalize.get_original_obs() if normalize else observations
+            if normalize:
+                raw[step] = normalize.get_original_obs()
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta

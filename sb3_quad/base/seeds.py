@@ -5,7 +5,8 @@ two share numbers: seeds 0 and 1 of a training are as independent as a training 
 """
 
 import typing
-from typing import Annotated, Literal
+from contextlib import AbstractContextManager
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -56,8 +57,13 @@ def row_seeds(seed: int, n: int) -> list[int]:
     The seed of row i does not depend on n. All are below 2**53, which any file format and any
     language keep exactly.
     """
-    with raised_as(ConfigError, f"seed {seed!r} is not a whole number of 0 or more"):
+    with seed_errors(seed):
         return [_hash(seed, _ROW, row) for row in range(n)]
+
+
+def seed_errors(seed: Any) -> AbstractContextManager[None]:
+    """Return a context that names a seed which NumPy refuses."""
+    return raised_as(ConfigError, f"seed {seed!r} is not a whole number of 0 or more")
 
 
 def _hash(seed: int, *key: int) -> int:

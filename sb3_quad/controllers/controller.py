@@ -232,9 +232,11 @@ class Controller:
 
     def _warn_of_units(self, actions: Float32Array) -> None:
         """Warn once of actions that are far outside of the limits that the source knows."""
+        if self._warned:
+            return
         low, high = self._limits if self._own_limits is None else self._own_limits
         beyond = np.abs(actions - actions.clip(low, high))
-        if not self._warned and (beyond > FAR * (0.5 * high - 0.5 * low)).any():
+        if (beyond > FAR * (0.5 * high - 0.5 * low)).any():
             self._warned = True
             warnings.warn(
                 f"{self._who}: gives actions far outside of the action space, such as"

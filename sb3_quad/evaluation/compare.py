@@ -125,8 +125,7 @@ def compare(
         own = settings_of_model(pilot)
         # A model from a factory says only now what it observes.
         if own is not None:
-            observed = {**own.observed, "rotor_layout": own.layout}
-            settings[label] = how.with_changes(**{**observed, **env_kwargs})
+            settings[label] = how.with_changes(**{**own.carried, **env_kwargs})
         refuse_several_limits(settings[label])
         warn_of_differences(label, pilot, settings[label])
         pilots[label] = pilot

@@ -58,13 +58,10 @@ class ControllerSpec:
 
     @property
     def observed(self) -> StrDict:
-        """Settings that go with the agent wherever it flies.
-
-        These are :attr:`FlightSettings.observed` and the layout of the rotors that it knows.
-        """
+        """Settings that go with the agent wherever it flies, see :attr:`FlightSettings.carried`."""
         if self.own is None:
             return FlightSettings().observed
-        return {**self.own.observed, "rotor_layout": self.own.layout}
+        return self.own.carried
 
     def notice(self, vehicle: VehicleSource) -> str:
         """Return a warning if the agent was trained on another vehicle, or does not say on which.

@@ -258,7 +258,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         # A model from a factory says only now what it observes.
         known = settings_of_model(controller)
         if known is not None:
-            observed = {**known.observed, "rotor_layout": known.layout}
+            observed = known.carried
         recorder = Recorder(RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM)
         reward = load_reward(job.reward)
         flights = fly_scenario(controller, scenario, job.backend, [recorder], observed, reward)

@@ -491,10 +491,9 @@ class Motion:
 
     ``recovery_time`` (n,): s until the tilt has come below 45° and the body rate across z, of roll
     and pitch together, below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never
-    was. The thesis
-    reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from the
-    straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1; NaN
-    where both are one point.
+    was. The thesis reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest
+    distance from the straight line through start and target, m, on the way and beyond: the
+    oscillations of 4.3.1; NaN where both are one point.
 
     :param state: at the start.
     :param control_step: s.

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import float32, int32, uint32, uint64
 
-from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.seeds import seed_errors
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
 from sb3_quad.simulation.vectors import polynomial
 
@@ -68,7 +68,7 @@ def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     """
     streams = np.zeros((4, len(seeds)), dtype=np.uint32)
     for row, seed in enumerate(seeds):
-        with raised_as(ConfigError, f"seed {seed!r} is not a whole number of 0 or more"):
+        with seed_errors(seed):
             key = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
         streams[KEY_LO : KEY_HI + 1, row] = divmod(int(key), 2**32)[::-1]
     return streams

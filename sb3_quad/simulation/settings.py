@@ -139,6 +139,13 @@ class FlightSettings(ObservationSettings):
         return self.model_dump(mode="json", include=needed)
 
     @property
+    def carried(self) -> dict[str, Any]:
+        """The settings that go with an agent wherever it flies: :attr:`observed`, and the layout of
+        the rotors that it knows, also where that is its own vehicle's.
+        """
+        return {**self.observed, "rotor_layout": self.layout}
+
+    @property
     def layout(self) -> Vehicle:
         """The vehicle whose axes and rotor order an agent with these settings knows."""
         return first_vehicle(self.rotor_layout or self.vehicle)
