@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
@@ -71,8 +72,9 @@ class BestModel(EveryTimesteps):
     >>> PPO.load("best_model.zip", device="cpu").num_timesteps in (800, 1600)
     True
 
-    :param env: the environments to evaluate in, not those of the training; you close them. A
-        VecNormalize there gets the training's statistics, and neither learns nor scales rewards.
+    :param env: the environment or environments to evaluate in, not those of the training; you close
+        them. A VecNormalize there gets the training's statistics, and neither learns nor scales
+        rewards.
     :param every: timesteps between evaluations.
     :param n_episodes: episodes in each.
     :param seed: of the evaluation's episodes.
@@ -94,14 +96,14 @@ class BestModel(EveryTimesteps):
 
     def __init__(
         self,
-        env: VecEnv,
+        env: GymEnv,
         every: int,
         n_episodes: int,
         seed: int,
         best_model: StrPath = "best_model.zip",
         evaluations: StrPath = "evaluations.npz",
         report: Report = lambda line: None,
-        others: Mapping[str, VecEnv] | None = None,
+        others: Mapping[str, GymEnv] | None = None,
         should_continue: ShouldContinue = lambda success, reward: True,
         by: str = "success",
         verbose: int = 0,
@@ -117,18 +119,19 @@ class BestModel(EveryTimesteps):
         self._should_continue = should_continue
         self._by = RATES[by]
         path = Path(evaluations)
-        self._own = _Evaluations(env, path)
+        self._own = _Evaluations(_vectorised(env), path)
         # By the prefix of their part of a report.
         self._evaluations = {"": self._own}
         for name, other in (others or {}).items():
             self._evaluations[f"{name}: "] = _Evaluations(
-                other, path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}"
+                _vectorised(other), path.with_name(f"{path.stem}_{name}.npz"), f"eval_{name}"
             )
         self.stopped = False  # by ``should_continue``
         self.best: Score = (-np.inf, -np.inf)
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
+        self.stopped = False
         for evaluations in self._evaluations.values():
             share_statistics(self.model.get_vec_normalize_env(), evaluations.env)
             evaluations.read(self._n_episodes)
@@ -237,6 +240,10 @@ class _Evaluations:
             nothing = np.full(np.shape(value), np.nan)
             arrays[name] = [row.get(name, nothing) for row in self.rows]
         write_arrays(self.path, **arrays)
+
+
+def _vectorised(env: GymEnv) -> VecEnv:
+    return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
 
 
 def score(row: StrDict, by: str) -> Score:

@@ -41,6 +41,7 @@ _COUNTS = (
     "target_update_interval",
     "substeps",
 )
+_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "bc_coef")
 _SHARES = ("learning_rate", "gamma", "gae_lambda", "tau", "beta", "beta_final")
 _WEIGHTS = (
     "max_grad_norm",
@@ -186,8 +187,8 @@ class ExpertMixin(BaseAlgorithm):
                 setattr(self, name, value.item())
         for name, (least, _) in LIMITS.items():
             value = getattr(self, name, None)
-            if callable(value):
-                value = value(1.0)  # a schedule, at its start
+            if callable(value) and name in _SCHEDULES:
+                value = float(value(1.0))  # at its start
             # Some arguments can be None, and train_freq a tuple.
             if value is None or isinstance(value, tuple):
                 continue

@@ -366,7 +366,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             for row in np.flatnonzero(dones):
                 last = infos[row].get("terminal_observation")
                 if last is not None and infos[row].get("TimeLimit.truncated"):
-                    rewards[row] += self.gamma * state_values(network, last[None])[0]
+                    # As the environment returned it: an int or a tuple, perhaps.
+                    last = np.asarray(last, observations.dtype)[None]
+                    rewards[row] += self.gamma * state_values(network, last)[0]
 
             buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)
             self._last_obs = new_obs

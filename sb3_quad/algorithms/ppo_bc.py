@@ -49,6 +49,36 @@ N_MINIBATCHES = 16
 LEAST_ROWS = 64
 
 
+class _LabellingForward:
+    """The policy's forward pass of a rollout: once a step it also labels the state."""
+
+    def __init__(self, model: "PPOBC", env: VecEnv, buffer: ExpertRolloutBuffer) -> None:
+        self._model = model
+        self._env = env
+        self._buffer = buffer
+        self._labelled = -1
+        self._stock: Any = model.policy.forward
+        self._sample = self._stock
+        network = network_of(model.policy)
+        if isinstance(network, Perceptrons):
+            self._sample = partial(act, network)
+
+    def __call__(self, observations: th.Tensor, deterministic: bool = False) -> Any:
+        buffer = self._buffer
+        # Callbacks, too, may call the policy, and after the step.
+        if deterministic or buffer.full or buffer.pos == self._labelled:
+            return self._stock(observations, deterministic)
+        self._labelled = buffer.pos
+        actions, values, log_prob = self._sample(observations)
+        # Label the state before the step.
+        buffer.expert_actions[buffer.pos] = self._model._labels(self._env)
+        return actions.reshape(-1, *self._model.action_space.shape), values, log_prob
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        # A callback may copy or save the policy, which then has its own forward pass.
+        return self._stock.__reduce_ex__(protocol)
+
+
 class PPOBC(ExpertMixin, PPO):
     """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
 
@@ -290,26 +320,7 @@ class PPOBC(ExpertMixin, PPO):
             self._labeller = None
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
 
-        network = network_of(self.policy)
-        stock: Any = self.policy.forward
-        sample = stock
-        if isinstance(network, Perceptrons):
-            sample = partial(act, network)
-
-        labelled = -1
-
-        def forward(observations: th.Tensor, deterministic: bool = False) -> Any:
-            nonlocal labelled
-            # Callbacks, too, may call the policy, and after the step.
-            if deterministic or buffer.full or buffer.pos == labelled:
-                return stock(observations, deterministic)
-            labelled = buffer.pos
-            actions, values, log_prob = sample(observations)
-            # Label the state before the step.
-            buffer.expert_actions[labelled] = self._labels(env)
-            return actions.reshape(-1, *self.action_space.shape), values, log_prob
-
-        self.policy.forward = forward
+        self.policy.forward = _LabellingForward(self, env, buffer)
         try:
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
         finally:

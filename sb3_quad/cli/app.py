@@ -120,8 +120,7 @@ def _parse(arguments: list[str]) -> Namespace | None:
         return None
     # A missing file is refused at once, since the imports of a command take seconds.
     agent = getattr(options, "trained_agent", None)
-    # SB3 adds the suffix, too.
-    if agent and not (Path(agent).is_file() or Path(f"{agent}.zip").is_file()):
+    if agent and not Path(agent).is_file():
         raise ConfigError(f"-i {agent}: no such file, and no folder of a run with an agent")
     return options
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
@@ -110,12 +109,16 @@ class Controller:
         # The source may speak of other limits: a model of those that it has learnt with, an expert
         # of the true state of those that a quadcopter has under all wrappers.
         own = getattr(source, "action_space", None)
+        through_wrapper = False
         if self._true_state is not None and env is not None and env.has_attr(KEY):
             own = spaces.Box(-1.0, 1.0, action_space.shape)
+            through_wrapper = env.has_attr("action")
         self._own_limits: Float32Array | None = None
-        if isinstance(own, spaces.Box) and not np.allclose(limits_of(own), self._limits):
-            self._own_limits = limits_of(own)
-            if not _is_straight(env, action_space, own):
+        if isinstance(own, spaces.Box):
+            if not np.allclose(limits_of(own), self._limits):
+                self._own_limits = limits_of(own)
+                through_wrapper = True
+            if through_wrapper and not _is_straight(env, action_space, own):
                 way_out = "no wrapper such as RescaleAction leads straight from these to those"
                 if hasattr(source, "action_space"):
                     way_out = (
@@ -133,8 +136,8 @@ class Controller:
     ) -> "Controller":
         """Return the controller that labels the states of a vector environment.
 
-        With ``VecNormalize`` an SB3 model sees the raw observations, which it normalises as in its
-        own training. Other experts see the normalised ones.
+        With ``VecNormalize`` experts see the raw observations. An SB3 model normalises them as in
+        its own training.
 
         :param expert: the expert. A name is resolved for the vehicle of row 0.
         :param present: the controller so far. It is returned, with its state, if it was made for
@@ -165,8 +168,13 @@ class Controller:
         )
         if env.has_attr(KEY):
             warn_of_observation(controller._who, source, env.get_attr(KEY, [0])[0])
-        if isinstance(source, BaseAlgorithm):
+        if controller._true_state is None:
             controller._raw = unwrap_vec_normalize(env)
+            if controller._raw and controller._raw.observation_space != env.observation_space:
+                raise ExpertError(
+                    f"{controller._who}: sees raw observations, and a wrapper around VecNormalize"
+                    " changes them; make VecNormalize the outermost wrapper"
+                )
         controller.made_for = (expert, env)
         return controller
 

@@ -85,12 +85,10 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[str, StrDict]]:
             cell = dict(zip(spec.grid, values, strict=True))
             data = spec.given(Configuration)
             # The entries of mappings are merged, such as those of env_kwargs.
-            for key, value in own.items():
+            for key, value in [*own.items(), *cell.items()]:
                 if isinstance(value, dict) and isinstance(data.get(key), dict):
                     value = data[key] | value
-                data[key] = copy.deepcopy(value)
-            for key, value in cell.items():
-                put_key(data, key, value, f"grid: {key}")
+                put_key(data, key, copy.deepcopy(value), f"configuration: {key}")
             # A named configuration keeps its name in each cell of the grid.
             label = [str(own.get("name") or _in_words(own)), _in_words(cell)]
             # Where nothing differs, the file or the algorithm says what is trained.
@@ -108,6 +106,8 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
             raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
     changes = all_changes(configuration.hyperparams, configuration.given(SettingsOptions))
     if configuration.vehicle is not None:
+        if "vehicle" in changes.get("env_kwargs", {}):
+            raise ConfigError(f"vehicle {configuration.vehicle}: env_kwargs have one, too")
         put_key(changes, "env_kwargs.vehicle", configuration.vehicle, "vehicle")
     plan = plan_training(configuration.given(Configuration), changes)
     # A single run is a pipeline of one stage.

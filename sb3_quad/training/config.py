@@ -29,6 +29,7 @@ from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
+from sb3_quad.controllers.pretrained import pretrained_names
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
@@ -381,7 +382,7 @@ def build_config(
     algorithm = get_algorithm(algo)
     parameters = constructor_parameters(algorithm)
     check_environment(env_id)
-    settings = with_absolute_paths(settings)
+    settings = with_absolute_paths(env_id, settings)
     # The default is written out, so that config.yml names the expert. Flights of a file need none.
     needs_expert = takes_expert(algorithm) and not settings.get("demonstrations")
     if needs_expert and settings.get("expert") is None:
@@ -406,18 +407,22 @@ def build_config(
     return validate(TrainingConfig, fields, source)
 
 
-def with_absolute_paths(settings: StrDict) -> StrDict:
-    """Return the settings with absolute paths of the files that keywords of environments name.
+def with_absolute_paths(env_id: str, settings: StrDict) -> StrDict:
+    """Return the settings with absolute paths of the files that they name.
 
-    A run may be flown and resumed later, from another folder.
+    A run may be flown and resumed later, from another folder. What keywords of other packages'
+    environments mean is not known.
     """
     settings = dict(settings)
-    for key in ENV_KEYS & settings.keys():
-        if isinstance(settings[key], dict):
-            settings[key] = {
-                name: _absolute(value) if name in FILE_KEYS else value
-                for name, value in settings[key].items()
-            }
+    for key in ENV_KEYS & settings.keys() if env_id in ENVIRONMENTS else ():
+        settings[key] = {
+            name: _absolute(value) if name in FILE_KEYS else value
+            for name, value in parse_mapping(settings[key], key).items()
+        }
+    for key in {"expert", "demonstrations"} & settings.keys():
+        path = settings[key]
+        if isinstance(path, str) and path not in pretrained_names() and Path(path).exists():
+            settings[key] = str(Path(path).absolute())
     return settings
 
 

@@ -112,9 +112,9 @@ def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
     """
     if config.vec_env == "subproc":
         ignore_interrupts()
-    # One environment flies one vehicle, where the batched one takes a list.
+    # One environment takes one value, where the batched one takes a list.
     keywords = dict(config.env_kwargs)
-    for name in keywords.keys() & {"vehicle", "max_episode_steps"}:
+    for name in keywords.keys() & {"vehicle", "noise", "max_episode_steps"}:
         values = as_list(keywords[name]) or [None]
         keywords[name] = values[row % len(values)]
     env: Env = gymnasium.make(config.env_id, **keywords)

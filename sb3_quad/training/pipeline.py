@@ -174,7 +174,7 @@ def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
     stages = []
     for stage in pipeline.stages:
         # The pipeline may be resumed from another folder.
-        settings = with_absolute_paths(merged(stage.settings, changes, stage.name))
+        settings = with_absolute_paths(stage.env, merged(stage.settings, changes, stage.name))
         stages.append(stage.model_copy(update={"settings": settings}))
     return pipeline.model_copy(update={"stages": stages})
 
@@ -266,7 +266,9 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
             raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
-        made = validate(TrainingJob, {**job, **own, "config": config}, where)
+        made = validate(TrainingJob, {**own, **job, "config": config}, where)
+        if stage.require.success_rate > 0.0 and made.eval_episodes == 0:
+            raise ConfigError(f"{where}: require: needs evaluations; give --eval-episodes")
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
 
@@ -312,7 +314,9 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                         stage.algo, stage.env, run.read_yaml()[0], str(run.config)
                     )
                     job = job.model_copy(update={"config": config})
-                if run and run.timesteps >= job.config.n_timesteps:
+                # A callback may end a stage early. It had ended if the next one has a run.
+                later = number + 1 < len(runs)
+                if run and (later or run.timesteps >= job.config.n_timesteps):
                     seconds = trained_seconds(run)
                 else:
                     if agent:

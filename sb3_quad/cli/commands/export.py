@@ -98,6 +98,8 @@ def run(options: Namespace) -> int:
         model, options.format, options.output, options.vehicle, name=name, half=options.half
     )
     files = exported.files or {"": exported.content}
+    for path in files:
+        refuse_existing(file / path, options.overwrite)
     for path, content in files.items():
         write_bytes(file / path, content)
     print("settings:", exported.settings or "in neither the zip nor its folder")

@@ -120,25 +120,30 @@ def _spec(options: Namespace) -> Any:
     from sb3_quad.base.literals import put_key
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
+    from sb3_quad.training.algorithms import as_list
 
     data: StrDict = {"name": "sweep"}
     if options.sweep is not None:
         data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
     # The entries of mappings as a grid has them, such as env_kwargs.noise.
-    varied = {*data.get("grid", {})}
-    for configuration in data.get("configurations", ()):
+    varied = set()
+    cells = [
+        {key: value} for key, values in data.get("grid", {}).items() for value in as_list(values)
+    ]
+    for configuration in [*data.get("configurations", ()), *cells]:
         for key, value in configuration.items():
             inner = [f"{key}.{name}" for name in value] if isinstance(value, dict) else [key]
             varied.update(inner)
     for name, value in given(options, *SweepSpec.model_fields, "suite", "episodes").items():
-        # A flag takes the place of a key of the grid, and its pairs are added to those of the file.
-        if data.get("grid", {}).pop(name, None):
-            varied.discard(name)
         place = PLACES.get(name, name)
-        given_keys = {place}
+        # A flag takes the place of a key of the grid, and its pairs are added to those of the file.
         if isinstance(value, dict):
             given_keys = {f"{name}.{key}" for key in value}
             value = data.get(name, {}) | value
+        else:
+            given_keys = {name}
+            if data.get("grid", {}).pop(name, None):
+                varied.discard(name)
         for key in sorted(given_keys & varied):
             raise ConfigError(
                 f"{key} differs between the runs of {options.sweep}; remove the flag that gives it"

@@ -76,17 +76,29 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     scenarios = []
     for number, entry in enumerate(entries):
         place = f"{where}: scenario {entry.get('name', number)}"
-        vehicle = entry.get("vehicle")
-        if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
-            entry["vehicle"] = str(folder / vehicle)
+        if "vehicle" in entry:
+            entry["vehicle"] = _beside(folder, entry["vehicle"])
         reference = entry.get("reference")
         if isinstance(reference, dict) and "file" in reference:
             entry["reference"] = {**reference, "file": folder / str(reference["file"])}
         elif str(reference).endswith(".csv"):
             entry["reference"] = folder / str(reference)
+        vehicles = entry.get("vehicles")
+        if isinstance(vehicles, dict) and "distribution" in vehicles:
+            distribution = _beside(folder, vehicles["distribution"])
+            entry["vehicles"] = {**vehicles, "distribution": distribution}
+        elif vehicles is not None:
+            entry["vehicles"] = _beside(folder, vehicles)
         # A cell of a grid is a scenario like any other.
         scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)
+
+
+def _beside(folder: Path, source: object) -> object:
+    """Return the path of a file that is named relative to a folder; a name is returned as it is."""
+    if isinstance(source, str) and VEHICLES.is_path(source):
+        return str(folder / source)
+    return source
 
 
 def grid(entry: StrMapping, where: str) -> list[StrDict]:
