@@ -257,6 +257,13 @@ class Throttles(Speeds):
         return 2.0 * action[[3, 1, 2, 0]] - 1.0
 
 
+class Renumbered(gym.ActionWrapper):
+    """Keeps the space and takes the rotors in another order."""
+
+    def action(self, action):
+        return action[[1, 0, 3, 2]]
+
+
 class Below(gym.ActionWrapper):
     """Another wrapper that keeps the space."""
 
@@ -296,7 +303,7 @@ def test_a_model_that_has_learnt_without_the_wrapper_teaches_through_it():
 
 @pytest.mark.parametrize(
     "wrapper",
-    [Doubled, Speeds, Throttles, lambda env: rescaled(0.0, 1.0)(Doubled(env))],
+    [Doubled, Speeds, Throttles, Renumbered, lambda env: rescaled(0.0, 1.0)(Doubled(env))],
 )
 def test_labels_that_no_wrapper_takes_are_refused(wrapper):
     with pytest.raises(ExpertError, match="RescaleAction") as raised:

@@ -18,9 +18,11 @@ from torch import nn
 from sb3_quad.algorithms.apg import APG
 from sb3_quad.algorithms.flight_cost import FlownStates, flight_cost
 from sb3_quad.algorithms.networks.gradients import Perceptrons, RecordedPolicy, network_of
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.simulation.adjoint import MOVING
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import FEATURE_SIZES
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
 from sb3_quad.simulation.tape import FlightTape
@@ -251,6 +253,12 @@ def test_gradients_go_through_a_battery_that_limits_every_rotor_and_stops_some(s
     actions = random_actions(12, batch.n, 0)
     record_and_compare(tape, actions, 0)
     assert (batch.queue == 0.0).any() == (saturation == "shared")
+
+
+def test_a_feature_without_a_gradient_is_refused(monkeypatch):
+    monkeypatch.setitem(FEATURE_SIZES, "rotor_speeds", 4)
+    with pytest.raises(ConfigError, match="features rotor_speeds: have no gradient"):
+        FlightTape(new_batch(2, 0), 4)
 
 
 def test_rows_of_different_noise_have_the_gradients_of_their_own():

@@ -285,3 +285,18 @@ def test_random_numbers_can_be_repeated():
     first = sample()
     set_random_state(state)
     assert sample() == first
+
+
+def test_a_best_model_that_ended_a_training_does_not_end_the_next(tmp_path):
+    verdicts = iter([False, True, True])
+    best = make_best(tmp_path, 40, should_continue=lambda success, reward: next(verdicts))
+    model = make_model().learn(80, callback=best)
+    assert best.stopped and model.num_timesteps == 40
+    model.learn(40, callback=best, reset_num_timesteps=False)
+    assert not best.stopped and np.load(best._own.path)["timesteps"].tolist() == [40, 80]
+
+
+def test_an_environment_that_is_not_vectorised_is_evaluated_too(tmp_path):
+    best = BestModel(Walk(), 40, 2, 5, tmp_path / "best.zip", tmp_path / "evaluations.npz")
+    make_model().learn(40, callback=best)
+    assert np.load(tmp_path / "evaluations.npz")["results"].shape == (1, 2)

@@ -387,6 +387,7 @@ def check_on_arm(folder, exported, tmp_path):
         (["--vehicle", "itm"], "more than any Crazyflie gives"),
         (["--vehicle", "slow.yaml"], "the Crazyflie's firmware calls every 0.001 s"),
         ([], "--overwrite"),
+        (["-o", "kept"], "--overwrite"),
     ],
 )
 def test_what_no_crazyflie_flies_is_one_line(
@@ -398,6 +399,8 @@ def test_what_no_crazyflie_flies_is_one_line(
     Path("slow.yaml").write_text("\n".join(f"{key}: {value}" for key, value in lines.items()))
     Path("app", "src").mkdir(parents=True)
     Path("app", HEADER).touch()
+    Path("kept").mkdir()
+    Path("kept", "Makefile").touch()
     folder = "app" if not arguments else "other"
     model = str(apps["small"][0].parent / "small.zip")
     assert main(["export", model, "--format", "crazyflie", "-o", folder, *arguments]) == 2

@@ -465,3 +465,28 @@ def test_flights_of_another_range_of_actions_are_refused(tmp_path):
     np.savez(tmp_path / "rpm.npz", obs=np.zeros((3, 3)), acts=np.full((3, 1), 1500.0))
     with pytest.raises(ConfigError, match=r"rpm\.npz: .*actions from 1500 to 1500"):
         build(expert=None, beta=0, demonstrations=tmp_path / "rpm.npz")
+
+
+class Ladder(gym.Env):
+    """Observes a Python int, as a Discrete space allows."""
+
+    observation_space = spaces.Discrete(5)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.rung = self.steps = 0
+        return self.rung, {}
+
+    def step(self, action):
+        self.steps += 1
+        self.rung = min(self.rung + int(action[0] > 0.0), 4)
+        return self.rung, 0.0, False, self.steps == 4, {}
+
+
+def test_an_observation_may_be_a_python_int_where_a_time_limit_ends_an_episode():
+    def climb(observation):
+        return np.ones((len(observation), 1))
+
+    model = DAgger("MlpPolicy", Ladder(), expert=climb, n_steps=16, batch_size=8, seed=0)
+    assert model.learn(32).num_timesteps == 32

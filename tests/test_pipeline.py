@@ -379,6 +379,37 @@ def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
     assert all(0 <= job.seed < LARGEST for job in stage_jobs(pipeline, {"seed": LARGEST - 1}))
 
 
+def test_flags_of_evaluations_hold_for_all_stages(tmp_path):
+    own = {**STAGES[0], "eval_episodes": 60}
+    pipeline = load_pipeline(write(tmp_path, [own, STAGES[1]]))
+    assert [job.eval_episodes for job in stage_jobs(pipeline, {"eval_episodes": 4})] == [4, 4]
+    assert stage_jobs(pipeline, {})[0].eval_episodes == 60
+    asks = load_pipeline(write(tmp_path, [{**own, "require": {"success_rate": 0.9}}]))
+    with pytest.raises(ConfigError, match="require: needs evaluations"):
+        stage_jobs(asks, {"eval_episodes": 0})
+
+
+def test_a_stage_that_a_callback_ended_early_is_not_trained_again(tmp_path, job, monkeypatch):
+    stops = "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes"
+    ends = {"callback": [{stops: {"max_episodes": 1}}]}
+    stages = [{**STAGES[0], "settings": ends}, STAGES[1]]
+    original = PPOBC.train
+
+    def killed(self):
+        raise SystemExit
+
+    monkeypatch.setattr(PPOBC, "train", killed)
+    with pytest.raises(SystemExit):
+        run_pipeline(tiny(tmp_path, stages), job, "stages", quiet)
+    (model,) = (tmp_path / "logs" / "dagger").rglob("Quad*.zip")
+    before = model.stat().st_mtime_ns
+    monkeypatch.setattr(PPOBC, "train", original)
+    folder = tmp_path / "logs" / "stages" / "stages_1"
+    result = resume_pipeline(folder, quiet)
+    assert [stage.timesteps for stage in result.stages.values()] == [96, 256]
+    assert model.stat().st_mtime_ns == before
+
+
 def two_stages(tmp_path):
     """The offset of the first is to be corrected."""
     first = {**STAGES[0], "conf_file": "nominal/dagger.yml"}

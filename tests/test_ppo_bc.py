@@ -2,6 +2,7 @@
 PPO.
 """
 
+import copy
 import csv
 import inspect
 import math
@@ -180,6 +181,42 @@ def test_a_callback_that_calls_the_policy_leaves_the_labels_alone():
     model.learn(128, callback=Calls())
     expected = np.clip(swing_back(seen[0].observations.reshape(-1, 3)), -2, 2)
     np.testing.assert_allclose(seen[0].expert_actions.reshape(-1, 1), expected, atol=1e-6)
+
+
+def test_a_callback_may_copy_and_save_the_policy(tmp_path):
+    copies = []
+
+    class Keeps(BaseCallback):
+        def _on_step(self):
+            if not copies:
+                copies.append(copy.deepcopy(self.model.policy))
+                th.save(self.model.policy, tmp_path / "policy.pt")
+            return True
+
+    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    observation = th.from_numpy(env.reset())
+    model = PPOBC("MlpPolicy", env, expert=swing_back, bc_coef=1.0, **SMALL)
+    before, _, _ = model.policy(observation, deterministic=True)
+    model.learn(128, callback=Keeps())
+    saved = th.load(tmp_path / "policy.pt", weights_only=False)
+    for policy in (*copies, saved):
+        assert policy.forward.__self__ is policy
+        th.testing.assert_close(policy(observation, deterministic=True)[0], before)
+    after, _, _ = model.policy(observation, deterministic=True)
+    assert not th.equal(after, before)
+
+
+def test_schedules_may_give_any_number_and_stand_where_there_are_some():
+    rate = {
+        "learning_rate": lambda left: np.float32(1e-3) * left,
+        "clip_range": lambda left: th.tensor(0.2),
+    }
+    PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, **{**SMALL, **rate}).learn(64)
+    for name in ("l2_coef", "vf_coef"):
+        with pytest.raises(ConfigError, match=f"{name} .*must be a number"):
+            PPOBC("MlpPolicy", "Pendulum-v1", **{**SMALL, name: LinearSchedule(1.0, 0.0, 1.0)})
+    with pytest.raises(ConfigError, match=r"gamma 1\.5: must be a number from 0 to 1"):
+        PPOBC("MlpPolicy", "Pendulum-v1", **{**SMALL, "gamma": 1.5})
 
 
 def test_the_cloning_weight_is_not_negative_where_the_last_rollout_ends_late():

@@ -312,6 +312,13 @@ def test_the_keywords_of_an_agent_that_does_not_say_how_it_flies_are_refused(tmp
         sb3_quad.env_kwargs(tmp_path / "silent.zip")
 
 
+def test_keywords_of_your_own_replace_those_of_the_agent():
+    own = sb3_quad.env_kwargs("any-quadcopter", vehicle="hummingbird", noise=0.0)
+    assert "vehicles" not in own and own["vehicle"] == "hummingbird" and own["noise"] == 0.0
+    assert sb3_quad.QuadcopterVecEnv(2, **own).observation_space.shape == (188,)
+    assert "vehicles" in sb3_quad.env_kwargs("any-quadcopter", noise=0.0)
+
+
 def test_an_agent_of_rows_that_differ_flies_anywhere():
     sigma = [[1.0] * 18, [2.0] * 18]
     vehicles = ["itm", "crazyflie"]
@@ -324,9 +331,11 @@ def test_an_agent_of_rows_that_differ_flies_anywhere():
 def test_fly_warns_of_a_vehicle_that_an_agent_was_not_trained_on(recwarn):
     model = sb3_quad.load_pretrained("crazyflie-recovery")
     fly(model, n_flights=1, max_steps=1, **sb3_quad.env_kwargs(model))
+    # Its own is the default.
+    fly(model, n_flights=1, max_steps=1)
     assert not recwarn.list
     with pytest.warns(UserWarning, match="vehicle crazyflie and flies itm; sb3_quad"):
-        fly(model, n_flights=1, max_steps=1)
+        fly(model, n_flights=1, max_steps=1, vehicle="itm")
     with pytest.raises(ControllerError, match=r"the environment's \(18,\); give \*\*env_kwargs"):
         fly("itm-robust", n_flights=1, max_steps=1)
 

@@ -17,6 +17,7 @@ from sb3_quad.evaluation.scenarios.parts import VehicleChanges
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 from sb3_quad.simulation.state import QuadcopterState, make_wrench
+from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 
@@ -117,6 +118,12 @@ def test_vehicle_files_lie_beside_the_suite(tmp_path):
     (tmp_path / "other.yaml").write_text(vehicle.model_dump_json())  # JSON is YAML
     (tmp_path / "mine.yaml").write_text("name: x\nscenarios: [{name: a, vehicle: other.yaml}]")
     assert load_suite(tmp_path / "mine.yaml").scenarios[0].flown_vehicle().mass == 1.5
+    (tmp_path / "ranges.yaml").write_text(DISTRIBUTIONS.text("raptor")[0])
+    for vehicles in ("ranges.yaml", "{distribution: ranges.yaml}"):
+        (tmp_path / "mine.yaml").write_text(
+            f"name: x\nscenarios: [{{name: a, vehicles: {vehicles}}}]"
+        )
+        assert load_suite(tmp_path / "mine.yaml").scenarios[0].vehicles is not None
 
 
 def test_vary_is_a_grid_of_named_cells():

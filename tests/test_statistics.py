@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNorma
 from sb3_quad import DAgger
 from sb3_quad.algorithms.networks.gradients import Perceptrons
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.callbacks import BestModel
 from sb3_quad.cli import main
@@ -309,3 +309,18 @@ def test_a_pipeline_whose_stages_do_not_fit_is_refused_before_the_first(tmp_path
         stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0, "settings": settings}]), {})
     (job,) = stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0}]), {})
     assert job.config.normalize
+
+
+def test_an_expert_that_is_a_function_sees_raw_observations():
+    env = VecNormalize(make_vec_env("Pendulum-v1", 3, seed=1))
+    seen = []
+
+    def swing_back(observation):
+        seen.append(observation.copy())
+        return -0.5 * observation[:, 2:3]
+
+    labeller = Controller.for_env(swing_back, env)
+    labeller.labels(env.reset())
+    np.testing.assert_array_equal(seen[-1], env.get_original_obs())
+    with pytest.raises(ExpertError, match="make VecNormalize the outermost wrapper"):
+        Controller.for_env(swing_back, VecFrameStack(env, 2))

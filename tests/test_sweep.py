@@ -165,6 +165,16 @@ def test_entries_of_a_list_have_their_names_and_inherit():
             "env_kwargs.noise differs between the runs of ",
         ),
         (
+            {"configurations": [{"algo": "dagger"}, {"algo": "ppo_bc"}]},
+            ["--algo", "sac_bc"],
+            "algo differs between the runs of ",
+        ),
+        (
+            {"grid": {"env_kwargs": [{"noise": 0.0}, {"noise": 0.1}]}},
+            ["--env-kwargs", "noise:0.2"],
+            "env_kwargs.noise differs between the runs of ",
+        ),
+        (
             {"grid": {"hyperparams.learning_rate": [1e-3, 5e-3]}},
             ["--hyperparams", "learning_rate:0.1"],
             "hyperparams.learning_rate differs between the runs of ",
@@ -497,3 +507,19 @@ def test_a_grid_fills_what_a_configuration_leaves_empty():
     }
     runs = make_runs(SweepSpec(**data, grid={"env_kwargs.noise": [0.0, 0.1]}))
     assert [run.stages[0].settings["env_kwargs"]["noise"] for run in runs] == [0.0, 0.1]
+
+
+def test_mappings_of_a_grid_are_merged_with_the_shared_keys():
+    runs = make_runs(
+        spec(
+            env_kwargs={"vehicle": "crazyflie"},
+            grid={"env_kwargs": [{"noise": 0.0}, {"noise": 0.1}]},
+        )
+    )
+    flown = [run.stages[0].settings["env_kwargs"] for run in runs]
+    assert flown == [{"vehicle": "crazyflie", "noise": noise} for noise in (0.0, 0.1)]
+
+
+def test_a_vehicle_is_given_once():
+    with pytest.raises(ConfigError, match="vehicle crazyflie: env_kwargs have one, too"):
+        make_runs(spec(vehicle="crazyflie", grid={"env_kwargs.vehicle": ["itm", "hummingbird"]}))

@@ -258,6 +258,21 @@ def test_files_of_environments_have_absolute_paths(tmp_path, monkeypatch):
     assert build(env_kwargs=names).env_kwargs == names
 
 
+def test_files_that_settings_name_are_found_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = build(
+        expert="teacher.zip", demonstrations="flown.npz", env_kwargs="dict(vehicle='v.yaml')"
+    )
+    assert config.expert == str(tmp_path / "teacher.zip")
+    assert config.hyperparams["demonstrations"] == str(tmp_path / "flown.npz")
+    assert config.env_kwargs == {"vehicle": str(tmp_path / "v.yaml")}
+    for name in ("pid", "itm-robust", "module:factory"):
+        assert build(expert=name).expert == name
+    # Nobody knows what the keywords of others mean.
+    others = {"vehicle": "car/blue", "reference": "v1.5"}
+    assert build("ppo", "Pendulum-v1", env_kwargs=others).env_kwargs == others
+
+
 def test_settings_can_be_written_and_read_again():
     config = load_config(
         "dagger",

@@ -61,7 +61,8 @@ LIMITS = {
     **dict.fromkeys(_SHARES, (0, 1)),
     **dict.fromkeys(_WEIGHTS, (0, _MOST)),
 }
-"""Valid range of each argument of the algorithms; the greatest holds for settings files alone."""
+"""Valid range of each argument of the algorithms; for weights and counts, the greatest
+holds for settings files alone."""
 History = dict[str, list[float]]
 """The terms of an update's losses in each of its mini-batches, by logged name."""
 # Arguments that SB3 would note in a loaded model without using them
@@ -192,8 +193,11 @@ class ExpertMixin(BaseAlgorithm):
             # Some arguments can be None, and train_freq a tuple.
             if value is None or isinstance(value, tuple):
                 continue
-            if not isinstance(value, (int, float)) or not value >= least:
-                raise ConfigError(f"{name} {value!r}: must be a number and at least {least}")
+            valid, most = f"a number and at least {least}", math.inf
+            if name in _SHARES:
+                valid, most = "a number from 0 to 1", 1.0
+            if not isinstance(value, (int, float)) or not least <= value <= most:
+                raise ConfigError(f"{name} {value!r}: must be {valid}")
             if name in _COUNTS and not isinstance(value, int):
                 raise ConfigError(f"{name} {value!r}: must be a whole number")
         # PPO cannot load the None that DAgger allows.

@@ -224,9 +224,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if self.beta == 0.0:
             self.beta_final = 0.0
         if not self.beta_final <= self.beta <= 1.0:
-            raise ConfigError(
-                f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1"
-            )
+            raise ConfigError(f"beta {self.beta}: must be from beta_final, {self.beta_final}, to 1")
         refuse_unknown("bc_loss", [self.bc_loss], CLONING_LOSSES)
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:

@@ -96,7 +96,7 @@ def hover_offset(
     if crashed > 0.5:
         raise ConfigError(
             f"the steady offset from the target cannot be measured: {100 * crashed:.0f} % of the"
-            " flights to targets end early"
+            " flights to targets end early; train longer first, or do without the correction"
         )
     return np.asarray(flights.final_offset[flights.survival].mean(axis=0))
 

@@ -193,7 +193,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
     return validate(FlightSettings, given, where)
 
 
-def env_kwargs(agent: StrPath | BaseAlgorithm) -> StrDict:
+def env_kwargs(agent: StrPath | BaseAlgorithm, **changes: Any) -> StrDict:
     """Return the keywords of environments that fly as an agent was trained to.
 
     They are its vehicle, noise and observation.
@@ -202,6 +202,8 @@ def env_kwargs(agent: StrPath | BaseAlgorithm) -> StrDict:
     >>> env = gymnasium.make("QuadTargetTracking-v0", **sb3_quad.env_kwargs("itm-robust"))
 
     :param agent: a zip, a run folder, the name of a policy that comes with the package, or a model.
+    :param changes: keywords of your own, which replace the agent's: ``vehicle="mine.yaml"`` flies
+        it on your vehicle, also where it was trained on ``vehicles``.
     :raises ConfigError: a zip or settings that cannot be read; an agent that holds none.
     """
     if isinstance(agent, BaseAlgorithm):
@@ -213,4 +215,7 @@ def env_kwargs(agent: StrPath | BaseAlgorithm) -> StrDict:
                 f"{agent}: does not say how its agent flies; give the keywords that it was trained"
                 " with"
             )
-    return settings.in_any_task()
+    keywords = settings.in_any_task()
+    if "vehicle" in changes:
+        keywords.pop("vehicles", None)
+    return {**keywords, **changes}

@@ -103,7 +103,7 @@ def compare(
     """
     if not isinstance(controllers, Mapping) or not controllers:
         raise ConfigError(
-            "compare: give at least one controller with its label, such as {'PID': 'pid'}"
+            "compare: give a mapping of labels to controllers, such as {'PID': 'pid'}"
         )
     if isinstance(tasks, (str, Mapping, Task)):
         tasks = [tasks]

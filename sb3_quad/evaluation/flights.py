@@ -163,7 +163,7 @@ def fly(
     task: Any = "target_tracking",
     n_flights: int = 240,
     seed: int = 0,
-    vehicle: str | Vehicle = "itm",
+    vehicle: str | Vehicle | None = None,
     noise: float = 0.05,
     backend: str = "batch",
     max_steps: int = MAX_EPISODE_STEPS,
@@ -181,13 +181,13 @@ def fly(
     :param controller: an expert or its name, such as ``"pid"``, asked by ``actions(state)`` for the
         true state; an SB3 model, its zip or the name of a shipped one, asked by
         ``predict(observation, deterministic=True)``; or a function from observations
-        (n, observation size) to actions (n, 4). An agent does not bring the vehicle and the
-        observations that it was trained with, and you are warned if they differ: give them by
-        :func:`~sb3_quad.env_kwargs`, or call :func:`~sb3_quad.evaluation.compare.compare`.
+        (n, observation size) to actions (n, 4).
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
-        ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
-        ``rotor_layout``, unless you give another.
+        ``observation_mean``. Give what an agent was trained to observe by
+        :func:`~sb3_quad.env_kwargs`; you are warned where it differs.
+    :param vehicle: None: the one that the agent was trained on, else ``itm``. The agent flies in
+        the ``rotor_layout`` of its own, unless you give another.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before. The environments call it
         ``max_episode_steps``, which holds if you give both.
@@ -208,13 +208,17 @@ def fly(
     if min(limits, default=1.0) <= 0.0:
         raise ConfigError(f"tolerances {limits}: must be greater than 0 m")
     layout = environment.get("rotor_layout")
-    controller = resolve_expert(controller, vehicle, "controller", layout)
+    flown = "itm" if vehicle is None else vehicle
+    controller = resolve_expert(controller, flown, "controller", layout)
     own = settings_of_model(controller)
-    # A model flies with its rotors where it knows them.
-    if layout is None and own is not None:
-        environment["rotor_layout"] = own.layout
+    if own is not None:
+        if vehicle is None:
+            flown = own.vehicle
+        # A model flies with its rotors where it knows them.
+        if layout is None:
+            environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", max_steps)
-    settings = FlightSettings().with_changes(task=task, vehicle=vehicle, noise=noise, **environment)
+    settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
     refuse_several_limits(settings)
     warn_of_differences(type(controller).__name__, controller, settings)
     return fly_settings(

@@ -247,6 +247,10 @@ def undo_relation(b, grad_feature):
             _add(f, k, lane, scaled(-f[F.velocity + row, lane], vector(b.target_velocity, lane)))
 
 
+# The features whose gradient it knows.
+DIFFERENTIATED = {"position", "rotation", "velocity", "body_rates"}
+
+
 @fast
 def undo_features(b, grad_feature, gradient, for_px4):
     """Undo :func:`.observation.features`: add to the gradient with respect to the state of a

@@ -8,6 +8,7 @@ from numba import float32
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.adjoint import (
+    DIFFERENTIATED,
     MOVING,
     undo_features,
     undo_flight,
@@ -26,6 +27,7 @@ from sb3_quad.simulation.kernel import (
     save_rows,
 )
 from sb3_quad.simulation.observation import (
+    FEATURE_SIZES,
     OBSERVATION_SIZE,
     F,
     clear_hidden,
@@ -95,6 +97,9 @@ class FlightTape:
                 f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
                 " give None, which is what the simulation has"
             )
+        if FEATURE_SIZES.keys() != DIFFERENTIATED:
+            names = ", ".join(FEATURE_SIZES.keys() - DIFFERENTIATED)
+            raise ConfigError(f"features {names}: have no gradient yet; see undo_features")
         self._at = 0
         self._streams = batch.streams.copy()
         self._queue = batch.queue.copy()

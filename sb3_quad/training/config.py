@@ -29,8 +29,9 @@ from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
-from sb3_quad.controllers.pretrained import pretrained_names
+from sb3_quad.controllers.pretrained import agent_path, pretrained_names
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
+from sb3_quad.controllers.tensors import AGENTS
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
@@ -419,10 +420,12 @@ def with_absolute_paths(env_id: str, settings: StrDict) -> StrDict:
             name: _absolute(value) if name in FILE_KEYS else value
             for name, value in parse_mapping(settings[key], key).items()
         }
-    for key in {"expert", "demonstrations"} & settings.keys():
-        path = settings[key]
-        if isinstance(path, str) and path not in pretrained_names() and Path(path).exists():
-            settings[key] = str(Path(path).absolute())
+    if isinstance(settings.get("demonstrations"), str):
+        settings["demonstrations"] = str(Path(settings["demonstrations"]).absolute())
+    expert = str(settings.get("expert"))
+    # A zip or a run folder, and not the name of an agent of the package.
+    if expert not in pretrained_names() and agent_path(expert).endswith(AGENTS):
+        settings["expert"] = str(Path(expert).absolute())
     return settings
 
 
