@@ -104,14 +104,14 @@ def test_a_misspelt_name_or_a_part_of_names_is_guessed_and_nothing_else(given, v
         ("train --sampler tpe", "argument '--sampler': it belongs to sb3-quad tune"),
         ("report folder --nothing", "argument '--nothing': see --help, and docs/zoo.md"),
         ("train 5", "argument '5': see --help"),
-        ("train --algo a2c", "algorithm 'a2c': (valid: apg, dagger,"),
+        ("train --algo a2c", "algorithm 'a2c' (valid: apg, dagger,"),
         (
             "train --conf-file nothere.yml",
-            "settings file 'nothere.yml': (valid: any_quadcopter/apg.yml,",
+            "settings file 'nothere.yml' (valid: any_quadcopter/apg.yml,",
         ),
         (
             "train --hyperparams bc_coef:1 --algo dagger",
-            "key of dagger 'bc_coef': (valid: batch_size,",
+            "key of dagger 'bc_coef' (valid: batch_size,",
         ),
         (
             "enjoy pid --task tracking --no-render",

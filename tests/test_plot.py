@@ -111,7 +111,7 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
         (["agent=nowhere/*"], "'agent=nowhere/*': no such folder"),
         (["agent"], "or NAME=PATTERN"),
         (["agent={runs}/Env_1", "agent={runs}/Env_2"], "'agent': two groups have this name"),
-        (["agent={runs}/Env_1", "-o", "curves.gif"], "ending of --output 'gif': (valid: pdf,"),
+        (["agent={runs}/Env_1", "-o", "curves.gif"], "ending of --output 'gif' (valid: pdf,"),
         (["agent={runs}/Env_1", "-o", "{runs}/mine.svg"], "exists already"),
         (["agent={runs}/Env_1", "--line", "expert"], "NAME:SUCCESS:REWARD"),
         (["agent={runs}"], "no such file"),

@@ -79,7 +79,9 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
     target_tracking)"
     """
     names = sorted(map(str, valid))
-    return f"unknown {kind} {str(name)!r}: {did_you_mean(name, names)}(valid: {', '.join(names)})"
+    guess = did_you_mean(name, names)
+    colon = ":" if guess else ""
+    return f"unknown {kind} {str(name)!r}{colon} {guess}(valid: {', '.join(names)})"
 
 
 def did_you_mean(name: object, valid: Iterable[str]) -> str:

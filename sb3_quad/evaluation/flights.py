@@ -5,16 +5,18 @@ the end of the first control step after which |r - r_T| is within it. The path i
 episode, 15 s, not only of the way until arrival.
 """
 
+import inspect
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown, unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
@@ -203,12 +205,18 @@ def fly(
     :raises ControllerError: a controller of another kind, or a controller or reward that fails in
         flight.
     """
+    valid = {*inspect.signature(fly).parameters, *FlightSettings.model_fields} - {"environment"}
+    for key in environment.keys() - valid:
+        raise ConfigError(f"fly: {unknown('keyword', key, valid)}")
     seeds = episode_seeds(seed, n_flights)
     limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
     if min(limits, default=1.0) <= 0.0:
         raise ConfigError(f"tolerances {limits}: must be greater than 0 m")
     layout = environment.get("rotor_layout")
     flown = "itm" if vehicle is None else vehicle
+    name = str(controller)
+    if not isinstance(controller, (str, Path)):
+        name = type(controller).__name__
     controller = resolve_expert(controller, flown, "controller", layout)
     own = settings_of_model(controller)
     if own is not None:
@@ -220,7 +228,7 @@ def fly(
     environment.setdefault("max_episode_steps", max_steps)
     settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
     refuse_several_limits(settings)
-    warn_of_differences(type(controller).__name__, controller, settings)
+    warn_of_differences(name, controller, settings)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
