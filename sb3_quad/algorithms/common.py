@@ -194,7 +194,7 @@ class ExpertMixin(BaseAlgorithm):
             if value is None or isinstance(value, tuple):
                 continue
             valid, most = f"a number and at least {least}", math.inf
-            if name in _SHARES:
+            if name in _SHARES and name not in _SCHEDULES:
                 valid, most = "a number from 0 to 1", 1.0
             if not isinstance(value, (int, float)) or not least <= value <= most:
                 raise ConfigError(f"{name} {value!r}: must be {valid}")

@@ -61,6 +61,9 @@ class FlightTape:
     """
 
     def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
+        if FEATURE_SIZES.keys() != DIFFERENTIATED:
+            names = ", ".join(FEATURE_SIZES.keys() - DIFFERENTIATED)
+            raise ConfigError(f"features {names}: have no gradient yet; see undo_features")
         n = batch.n
         self.substeps = batch.substeps if substeps is None else substeps
         self.control_step = batch.physics_step * batch.substeps
@@ -97,9 +100,6 @@ class FlightTape:
                 f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
                 " give None, which is what the simulation has"
             )
-        if FEATURE_SIZES.keys() != DIFFERENTIATED:
-            names = ", ".join(FEATURE_SIZES.keys() - DIFFERENTIATED)
-            raise ConfigError(f"features {names}: have no gradient yet; see undo_features")
         self._at = 0
         self._streams = batch.streams.copy()
         self._queue = batch.queue.copy()
