@@ -110,13 +110,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         or reached its time limit begins again.
     :param cost: The cost of each control step, (steps, n), as a function of
         :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved: give it
-            to ``load`` as well.
-    :param body_rates_coef: Weight of
-        :func:`~sb3_quad.algorithms.flight_cost.body_rates_cost`, which is added to the cost: for
-            agents that swing around the target because motors are slow or delays are long.
-    :param low_force_coef: Weight of
-        :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which is added to the cost: for
-            vehicles whose firmware interprets persistently low thrust as a crash.
+        to ``load`` as well.
+    :param body_rates_coef: Weight of :func:`~sb3_quad.algorithms.flight_cost.body_rates_cost`,
+        which is added to the cost: for agents that swing around the target because motors are slow
+        or delays are long.
+    :param low_force_coef: Weight of :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which
+        is added to the cost: for vehicles whose firmware interprets persistently low thrust as a
+        crash.
     :param substeps: Physics steps per control step during training; None: the vehicle's.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a non-finite gradient, even in a single environment.

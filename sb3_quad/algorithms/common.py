@@ -164,8 +164,7 @@ class ExpertMixin(BaseAlgorithm):
         """Cancel the steady offset at which the agent hovers next to its targets.
 
         It changes the agent's own first layer, so the zip stays an ordinary SB3 zip (thesis 4.3.1).
-        See
-        :func:`~sb3_quad.algorithms.offset_correction.correct_offset`.
+        See :func:`~sb3_quad.algorithms.offset_correction.correct_offset`.
 
         :param seed: seed of the flights that measure the offset, with the settings of the model's
             environment.

@@ -98,7 +98,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     :param expert: What labels the states: an object with ``actions(state)`` such as
         ``GeometricExpert``, another SB3 model, or a function from observations to actions;
         :class:`~sb3_quad.controllers.controller.Controller` says what each of them sees. Or a name,
-            as in YAML, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
+        as in YAML, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
         :meth:`set_expert`, before learning continues
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. Its policy and critic are copied; so are its ``net_arch``, ``activation_fn``
