@@ -1,6 +1,6 @@
 r"""Fly exported agents in RotorPy (University of Pennsylvania).
 
-Its SE3 controller and RAPTOR's policy fly there, too, to compare with.
+Its SE3 controller and RAPTOR's policy fly there, too, for comparison.
 
     sb3-quad export any-quadcopter --format onnx --vehicle rotorpy_crazyflie \
         -o any-quadcopter@rotorpy_crazyflie.onnx
@@ -31,7 +31,7 @@ torch.set_num_threads(1)
 
 
 def to_fields(state: State) -> dict[str, torch.Tensor]:
-    """A state as RotorPy has it."""
+    """A state in RotorPy's form."""
     fields = {
         "x": state.position,
         "v": state.velocity,
