@@ -36,7 +36,7 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 
 class BulletBody:
-    """The rigid body of a vehicle in a PyBullet client of its own; several can exist at once.
+    """The rigid body of a vehicle in its own PyBullet client; several can exist at once.
 
     PyBullet integrates a floating multibody base: first explicit steps of the velocities, then the
     pose by the new velocities. The body has no collision shape, so it touches nothing: the task

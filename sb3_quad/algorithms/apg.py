@@ -81,7 +81,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     SHAC (Xu et al., 2022), which adds a critic to short windows, and Heeg, Song and Scaramuzza,
     "Learning Quadrotor Control From Visual Features Using Differentiable Simulation" (2024).
 
-    In each update every environment flies ``n_steps`` control steps by the mean action of the
+    In each update every environment flies ``n_steps`` control steps with the mean action of the
     policy. The optimiser then takes one step along the gradient of the mean cost. It is
     :class:`~sb3_quad.algorithms.soap.SOAP`, unless ``policy_kwargs`` has an ``optimizer_class``.
     Only the actor learns; the critic stays as it is.
@@ -261,7 +261,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly ``n_rollout_steps`` steps by the mean action of the policy, and record them."""
+        """Fly ``n_rollout_steps`` steps with the mean action of the policy, and record them."""
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
         observations = self._tape.reset(self.carry_on)

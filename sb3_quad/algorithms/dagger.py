@@ -324,7 +324,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         beta = self.current_beta  # +
         if beta > 0.0 and self.expert is None:
             raise ExpertError(f"beta {beta:g}: no expert to fly; call set_expert, or set_beta(0)")
-        # + The dataset holds raw observations: the statistics of VecNormalize keep changing.
+        # + The dataset stores raw observations: the statistics of VecNormalize keep changing.
         normalize = statistics_of(self)
         if normalize and normalize.observation_space.shape != self.observation_space.shape:
             raise ConfigError(
@@ -442,7 +442,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         n_passes = self.n_epochs * math.ceil(n_rows / self.batch_size)
         n_batches = min(self.gradient_steps or n_passes, self.n_epochs * n_rows)
         actor_rows = sample_rows(len(self.dataset), n_batches * batch_size, rng, self.shuffle)
-        # + Rows of the rollout for the critic, which takes part in some of the steps
+        # + Rows of the rollout for the critic, which is updated in some of the steps
         n_critic = min(n_passes, n_batches)
         critic_rows = sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle)
         critic_batches = iter(np.array_split(critic_rows, n_critic))

@@ -15,7 +15,7 @@ from sb3_quad.base.types import StrDict, StrPath
 
 ENDING = ".safetensors"
 AGENTS = (".zip", ENDING)
-"""The endings of files that hold an agent."""
+"""The suffixes of files that contain an agent."""
 
 
 def write_tensors(model: Any, data: StrDict) -> bytes:

@@ -90,7 +90,7 @@ def held(item: Any) -> Collection[Any]:
     return item if isinstance(item, (list, tuple, deque)) else ()
 
 
-# Functions that stand for those that SB3's pickles call.
+# Functions that replace those that SB3's pickles call.
 
 
 def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> Any:

@@ -245,7 +245,7 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     ``vec_normalize`` has the statistics of VecNormalize that it was trained with, if any.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown
-        family, parameters that are not finite, or a file that may run code of its own.
+        family, parameters that are not finite, or a file that may run code.
     """
     name = saved_algorithm(path)
     # ``predict`` of this package's algorithms is that of the stock ones.

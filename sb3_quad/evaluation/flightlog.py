@@ -108,7 +108,7 @@ class Recorder(Hook):
 
 def episode_arrays(flights: Flights, seeds: Sequence[int]) -> Arrays:
     """Return the ``episode_`` arrays of all flights."""
-    # The first condition that holds decides.
+    # The first condition that is true decides.
     conditions = [flights.success, flights.survival, flights.collision]
     arrays = {name: getattr(flights, name) for name in EPISODES}
     arrays |= {

@@ -453,7 +453,9 @@ class Arrivals:
 
 
 def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
-    """Return since when a condition has held, given that it ``holds`` now; else NaN."""
+    """Return the time since when a condition has held, given whether it ``holds`` now; otherwise
+    NaN.
+    """
     return np.where(holds, np.fmin(times, time), np.nan)
 
 

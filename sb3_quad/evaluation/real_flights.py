@@ -67,7 +67,7 @@ class Log:
     motion: FloatArray
     thrusts: FloatArray  #: (n, 4), commanded, M1 to M4, N
     flying: BoolArray  #: (n,), in the air
-    offset: float  #: s, by which the vehicle's clock was behind that of the motion capture
+    offset: float  #: how far the vehicle's clock was behind that of the motion capture, s
 
 
 def read_logs(folder: StrPath, step: float) -> list[Log]:

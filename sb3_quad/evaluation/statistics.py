@@ -15,7 +15,7 @@ from sb3_quad.base.validate import Frozen
 Z = 1.959963984540054  # the 97.5 % quantile of the normal distribution
 RESAMPLES = 1000
 Statistic = Callable[..., Any]
-BLOCK = 2**21  # values that a bootstrap holds at once, 16 MiB
+BLOCK = 2**21  # values of a bootstrap in memory at once, 16 MiB
 
 
 class Estimate(Frozen):

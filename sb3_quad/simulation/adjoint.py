@@ -154,7 +154,7 @@ def undo_accelerate(b, before, after, gradient, grad_wanted):
                 1.0 - factor
             ) * grad_new + grad_thrust * exact * new
 
-        # Recompute the force in the body frame: drag by the airspeed, and the thrusts.
+        # Recompute the force in the body frame: drag from the airspeed, and the thrusts.
         airspeed = difference(vector(before[X.velocity :], lane), vector(b.wind, lane))
         drag = vector(b.drag, lane)
         fx, fy, fz = difference(vector(b.force_body, lane), product(drag, to_body(r, airspeed)))

@@ -78,7 +78,7 @@ _KEPT = (
 
 
 class QuadcopterBatch:
-    """n quadcopters, each in an episode of its own; arrays in, arrays out.
+    """n quadcopters, each in its own episode; arrays in, arrays out.
 
     :param n_envs: number of rows, from 1 to 2^20.
     :param settings: how they fly.

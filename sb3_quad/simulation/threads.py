@@ -16,7 +16,7 @@ import numpy as np
 from sb3_quad.simulation.compiled import atomic_add, compiled, give_way
 
 Function = Callable[..., Any]
-# Places in a control array, each on a cache line of its own, and its size
+# Places in a control array, each on its own cache line, and the array's size
 LEFT, DONE, LATE, CONTROL = range(0, 64, 16)
 # Checks of a chunk that another thread still has, before this thread yields its core: about 30 µs
 SPIN = 20_000

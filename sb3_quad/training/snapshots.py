@@ -120,7 +120,7 @@ class SnapshotFile(BaseCallback):
             self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
 
     def write(self) -> None:
-        """Write the latest snapshot; until that is whole, the file holds the one before.
+        """Write the latest snapshot; until it is complete, the file keeps the one before.
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """

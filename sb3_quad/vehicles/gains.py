@@ -28,7 +28,7 @@ class GeometricGains(Frozen):
     descent: PositiveFloat
     """greatest desired acceleration downwards, below g, m/s²"""
     tilt: PositiveFloat
-    """tangent of the tilt at which the greatest desired force holds the height"""
+    """tangent of the tilt at which the greatest desired force keeps the height"""
     attitude: PositiveFloat
     """desired body rate per small angle of thrust direction error, 1/s"""
     angular_deceleration: PositiveFloat

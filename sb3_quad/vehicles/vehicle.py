@@ -88,7 +88,7 @@ Place = tuple[Number, Number]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 _NO_LIMITS = (0.0, 0.0)
-# Results of a search, which hold for one vehicle only.
+# Results of a search, which are valid for one vehicle only
 _FOUND = ("geometric_gains", "time_optimal")
 
 

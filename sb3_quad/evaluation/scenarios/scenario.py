@@ -118,7 +118,7 @@ class Scenario(Frozen):
             self._refuse_nominal()
             vehicle = self.vehicles.hardest(vehicle)
         self._check_way(vehicle)
-        # The task checks the ranges of its own fields.
+        # The task checks the ranges of its fields.
         _ = self.task
         if self.randomize is not None:
             self.randomize.hardest(vehicle)
