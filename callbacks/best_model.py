@@ -77,7 +77,7 @@ class BestModel(EveryTimesteps):
         rewards.
     :param every: timesteps between evaluations.
     :param n_episodes: episodes in each.
-    :param seed: of the evaluation's episodes.
+    :param seed: seed of the evaluation's episodes.
     :param best_model: where the best model goes; an existing file is replaced by a model that is
         better than all in ``evaluations``.
     :param evaluations: where the results go; an existing file is continued.

@@ -4,7 +4,7 @@ Table A.2 of the thesis comes from them.
 
     python examples/observation_statistics.py
 
-The result is not an agent: what is measured are PPO's first flights, when it has hardly begun to
+The result is not an agent: the script measures PPO's first flights, when it has hardly begun to
 learn.
 
 In a settings file, with ``PYTHONPATH=examples`` on the command line::

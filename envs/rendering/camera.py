@@ -76,7 +76,7 @@ def broadside(points: FloatArray, down: float = DOWN) -> FloatArray:
 def chasing(way: FloatArray) -> FloatArray:
     """Return the direction, (3,), of a camera behind a vehicle and a little aside.
 
-    :param way: from the vehicle to its target, (3,).
+    :param way: vector from the vehicle to its target, (3,).
     """
     x, y, z = way
     elevation = math.atan2(z, math.hypot(x, y)) - ASIDE

@@ -96,7 +96,7 @@ class AggregatedDataset:
     :param capacity: maximum number of pairs
     :param observation_shape: shape of one observation
     :param action_dim: length of one action
-    :param dtype: of the observations; actions are float32
+    :param dtype: dtype of the observations; actions are float32
     """
 
     #: The lowest and the highest valid actions, (action_dim,) each; a file's must lie between them

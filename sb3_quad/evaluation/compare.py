@@ -80,9 +80,9 @@ def compare(
     ┃             ┃                 PID ┃                 agent ┃
     ...
 
-    :param controllers: by label: the name of an expert (``"pid"``) or of an agent that comes with
-        the package (``"itm-robust"``), the path of a zip, ``"package.module:factory"``, an SB3
-        model, an expert, or a function from observations (n, 18) to actions (n, 4).
+    :param controllers: controllers by label: the name of an expert (``"pid"``) or of an agent that
+        comes with the package (``"itm-robust"``), the path of a zip, ``"package.module:factory"``,
+        an SB3 model, an expert, or a function from observations (n, 18) to actions (n, 4).
     :param tasks: names, :class:`~sb3_quad.simulation.tasks.Task` or mixtures ``{name: weight}``, or
         only one of these.
     :param n_flights: episodes of each task.

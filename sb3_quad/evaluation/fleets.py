@@ -22,7 +22,7 @@ ENV_ID = "QuadTargetTracking-v0"
 class Fleet(QuadcopterBatch):
     """n vehicles in their first episodes; a lost row stays lost.
 
-    :param seeds: of the episodes, (n,).
+    :param seeds: seeds of the episodes, (n,).
     :param settings: how they fly; ``max_episode_steps`` is ignored here, since flights end by their
         plan.
     """

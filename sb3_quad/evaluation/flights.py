@@ -501,7 +501,7 @@ class Motion:
     straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1; NaN
     if both are the same point.
 
-    :param state: at the start.
+    :param state: state at the start.
     :param control_step: s.
     """
 

@@ -197,7 +197,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
 def overview(results: Results, labels: Sequence[str]) -> list[Table]:
     """Return the tables of all scenarios for a terminal; the last one says how to read them.
 
-    :param labels: of the controllers, in the order of their columns.
+    :param labels: labels of the controllers, in the order of their columns.
     """
     tables = []
     for heading, scenarios in scenario_groups(results):

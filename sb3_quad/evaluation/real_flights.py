@@ -174,7 +174,7 @@ def open_loop(
     Each row from which a log flies on for long enough begins a window. Its rotors begin with the
     speeds that the commands of the preceding ``WARM_UP`` lead to.
 
-    :param logs: with rows at the vehicle's control step.
+    :param logs: logs with rows at the vehicle's control step.
     :param stride: rows from one window to the next.
     :param before_step: called with the batch before each control step; it may set a wrench.
     :return: for each horizon: its time, s; the predictions in the order of ``HEADINGS``; and the

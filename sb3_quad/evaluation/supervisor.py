@@ -35,7 +35,7 @@ class Supervisor:
     The firmware checks every 40 ms, with a sensor filtered at 30 Hz; here every control step is
     checked, and the sensor has no noise.
 
-    :param vehicles: of the flights, (n,).
+    :param vehicles: vehicles of the flights, (n,).
     """
 
     def __init__(self, vehicles: Sequence[Vehicle]) -> None:

@@ -119,7 +119,7 @@ def draw_times(
     """Write the time of each pose on a small plate beside it, inside the picture, where it covers
     least; a plate without room clear of the others is left out.
 
-    :param size: of the font, pixels.
+    :param size: font size, pixels.
     """
     places, breadths = view.project(recording.state.position)
     # What should not be covered: the points of the path, the poses, and then the plates. Each is a

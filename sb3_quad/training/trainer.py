@@ -235,7 +235,7 @@ def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAl
 class _Training:
     """The training of a model in a run folder, with its callbacks and its end.
 
-    :param eval_envs: by task, the job's own under OWN_TASK; empty: no evaluations.
+    :param eval_envs: environments by task, the job's own under OWN_TASK; empty: no evaluations.
     :param user_callbacks: the callbacks in the settings.
     """
 

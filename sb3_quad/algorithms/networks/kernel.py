@@ -34,9 +34,9 @@ _END = np.float32(7.90531110763549805)
 class Layers(NamedTuple):
     """The layers of a perceptron.
 
-    :param widths: of all layers, the inputs first, padded.
+    :param widths: padded widths of all layers, the inputs first.
     :param kinds: the activation of each but the first.
-    :param parameters: of one layer after another.
+    :param parameters: the parameters of all layers, one layer after another.
     """
 
     widths: IntArray

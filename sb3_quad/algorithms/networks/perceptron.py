@@ -139,7 +139,7 @@ class Perceptron:
     def gradient(self, batch: Batch, loss: Loss, log_std: th.Tensor | None = None) -> FloatArray:
         """Set ``.grad`` of all parameters to the gradient of a loss.
 
-        :param log_std: of an actor, (a,); its gradient is set, too.
+        :param log_std: log_std of an actor, (a,); its gradient is set, too.
         :return: the terms of the loss, means over the rows.
         """
         self.pack()

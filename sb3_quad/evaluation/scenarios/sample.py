@@ -21,7 +21,7 @@ class Plan(NamedTuple):
 
     :param start: replaces what the environments sample: any of position, quaternion, velocity,
         body_rates, target; (n, 3) or (n, 4).
-    :param wrenches: by control step, the external wrench from that step on, (n, WRENCH_SIZE).
+    :param wrenches: external wrenches (n, WRENCH_SIZE) by the control step from which they act.
     :param waypoints: targets one after the other, (W, 3), m; ``start`` holds the first as its
         target.
     :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
@@ -36,7 +36,7 @@ class Plan(NamedTuple):
 def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     """Sample the events of some episodes of a scenario, beyond those that its task samples.
 
-    :param seeds: of the episodes, (n,).
+    :param seeds: seeds of the episodes, (n,).
     """
     generators = [np.random.default_rng([SCENARIO_STREAM, seed]) for seed in seeds]
     attitude = scenario.start.attitude

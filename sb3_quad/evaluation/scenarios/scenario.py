@@ -310,7 +310,7 @@ class Suite(Frozen):
     ) -> "Suite":
         """Return a suite of some of these scenarios, with other numbers, seeds or another vehicle.
 
-        :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
+        :param names: names of scenarios, or of those whose cells ``vary`` makes; none: all.
         :param vehicle: name, or path of a YAML file, that flies all scenarios, also those
             with ``vehicles``. Forces and torques stay the same, in N and N m; published metrics, of
             another vehicle, are removed.
