@@ -120,7 +120,7 @@ class ProgressLine(BaseCallback):
         episodes = self.model.ep_info_buffer
         if episodes:
             line += f", mean reward {safe_mean([episode['r'] for episode in episodes]):.2f}"
-        # A resumed training is timed from where it continues.
+        # A resumed training is timed from its continuation.
         seconds_per_step = elapsed / (self.num_timesteps - self._first_timestep)
         return f"{line}, {seconds_per_step * (total - self.num_timesteps) / 60:.0f} min left"
 

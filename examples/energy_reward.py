@@ -125,7 +125,7 @@ targets = QuadcopterVecEnv(240, "target_tracking", seed=seed)
 imitation = DAgger("MlpPolicy", targets, expert=expert, seed=seed, device="cpu")
 imitation.learn(arguments.imitation_timesteps)
 
-# The expert nearly maximises this reward: clone everywhere and strongly, and explore little. The
+# The expert flies much as this reward asks: clone everywhere and strongly, and explore little. The
 # LQR takes more than 5 s to its target, so episodes last their full 15 s.
 env = EnergyCost(QuadcopterVecEnv(480, "target_tracking", seed=seed))
 agent = PPOBC(

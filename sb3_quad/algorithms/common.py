@@ -372,7 +372,7 @@ def unit_action_transform(
 
 
 def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
-    """Return the flight settings of an environment, or None if they do not describe it.
+    """Return the flight settings of an environment, or None if they would not describe its agents.
 
     Wrappers may change rewards, and VecNormalize may be among them, since its statistics are in a
     model's zips. None: the environment is not one of this package, or a wrapper changes

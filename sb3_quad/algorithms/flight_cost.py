@@ -39,7 +39,7 @@ class FlownStates(NamedTuple):
     target: th.Tensor  # (..., 3), m: the position of the reference
     target_velocity: th.Tensor  # (..., 3), m/s
     target_acceleration: th.Tensor  # (..., 3), m/s²
-    target_heading: th.Tensor  # (..., 2), cosine and sine; zeros where none is commanded
+    target_heading: th.Tensor  # (..., 2), cosine and sine; zeros if none is commanded
     target_heading_rate: th.Tensor  # (..., 1), rad/s
     target_ahead: th.Tensor  # (..., 3), m/s², the acceleration in AHEAD seconds
     actions: th.Tensor  # (..., 4), before they are clipped to [-1, 1]
@@ -104,10 +104,10 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     """Return the default cost of each control step, (steps, n).
 
     The distance costs d / (d + 0.5) + d / (d + 0.05), which is steep in the last metre and flat far
-    away, so that no target is too far to matter. Body rates cost little on the way, and more within
-    half a metre of the target. Small terms penalise tilt, actions beyond their limits, and a
-    heading other than the commanded one. Below a height of 1.5 m, proximity to the ground is
-    penalised, since the crash itself has no gradient.
+    away, but never constant, so that no target is too far to matter. Body rates cost little on the
+    way, and more within half a metre of the target. Small terms penalise tilt, actions beyond their
+    limits, and a heading other than the commanded one. Below a height of 1.5 m, proximity to the
+    ground is penalised, since the crash itself has no gradient.
     """
     d = flown.distance
     cost = d / (d + COARSE) + d / (d + FINE)

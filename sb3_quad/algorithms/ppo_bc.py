@@ -313,7 +313,7 @@ class PPOBC(ExpertMixin, PPO):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly a rollout by PPO's loop, and label its states where the update will clone."""
+        """Fly a rollout with PPO's loop, and label its states if the update will clone."""
         # The update follows this rollout, and uses the weight that the schedule has by then.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs

@@ -298,7 +298,7 @@ class SACBC(ExpertMixin, SAC):
             history.setdefault(name, []).append(value.item())
 
         for gradient_step in range(gradient_steps):
-            # Sample the replay buffer, + with the expert's actions where there are any
+            # Sample the replay buffer, + with the expert's actions if there are any
             data: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             actions, *labels = data.actions.split(get_action_dim(self.action_space), dim=1)
             discounts = data.discounts if data.discounts is not None else self.gamma

@@ -26,7 +26,7 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle
 def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
     """Return how the agent in a zip flies, and the file that says so.
 
-    The file is the zip itself, else a ``config.yml`` in a folder next to it, where runs of this
+    The file is the zip itself, or else a ``config.yml`` in a folder next to it, where runs of this
     package and of rl_zoo3 keep their settings. If neither says how the agent flies, the settings
     are ``FlightSettings()`` and the file is None.
 
@@ -175,7 +175,7 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
 def _settings_of_run(config: Path) -> FlightSettings:
     """Return the settings that the agent of a run was evaluated with.
 
-    They are ``env_kwargs`` in ``args.yml``, if it has some, else those in ``config.yml``.
+    They are ``env_kwargs`` in ``args.yml``, if it has some, otherwise those in ``config.yml``.
     """
     settings = read_yaml(config)
     parts = [settings.get("env_kwargs"), settings.get("eval_env_kwargs")]

@@ -70,7 +70,7 @@ class Flights:
     length: IntArray  #: (n,), control steps
     flown: FloatArray  #: (n,), time flown until the loss or the end, s
     #: By tolerance (m): time until |r - r_T| is first within it, s, (n,); NaN if it never was. On a
-    #: course, only the way to the last waypoint counts.
+    #: course, only the distance to the last waypoint counts.
     time_to: Mapping[float, FloatArray]
     #: By tolerance (m): time after which |r - r_T| stays within it to the end, s, (n,); NaN if the
     #: flight ended outside or was lost.

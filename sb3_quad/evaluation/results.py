@@ -177,7 +177,7 @@ def file_name(label: str) -> str:
 
 
 def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
-    """Write ``episodes.csv``, empty where there is no number.
+    """Write ``episodes.csv``, with empty cells where there is no number.
 
     :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
     """

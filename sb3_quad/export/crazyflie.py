@@ -9,8 +9,8 @@ from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 FILES = ("Makefile", "Kbuild", "app-config", "README.md", "src/Kbuild", "src/sb3quad.c")
-CALL = 0.001  # s between calls of the firmware, each of which has so many cycles of its STM32F405:
-CYCLES = 168_000
+CALL = 0.001  # time between calls of the firmware, s
+CYCLES = 168_000  # of its STM32F405 between two calls
 # The policy's instructions may use a quarter of these cycles, or a half if it needs more: an
 # instruction may take two cycles, and the firmware has other work to do.
 SHARE = 0.25

@@ -173,7 +173,7 @@ class QuadcopterBatch:
     def _set_vehicles(self, settings: FlightSettings) -> list[Vehicle]:
         """Load the vehicles, check that all can be flown, and return the different ones.
 
-        ``base_vehicles`` and ``vehicles`` have a column for each row where rows differ, else one
+        ``base_vehicles`` and ``vehicles`` have a column for each row if rows differ, otherwise one
         for all.
         """
         self.distribution = settings.vehicles

@@ -296,7 +296,7 @@ R = first_rows(RANDOMIZATION)
 
 
 def numbers_of(record: Frozen, sizes: Mapping[str, int], control_step: float = 0.0) -> FloatArray:
-    """Return the numbers of a record one after the other, (sum of sizes,); 0 where none are given.
+    """Return the numbers of a record one after the other, (sum of sizes,); 0 if none are given.
 
     :param sizes: how many numbers each field is, in their order.
     :param control_step: s, of gusts.

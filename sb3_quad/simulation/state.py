@@ -49,7 +49,7 @@ REFERENCE_PARTS = {
     "target": 3,
     "target_velocity": 3,
     "target_acceleration": 3,
-    # Its cosine and sine; both zero where no heading is commanded
+    # Its cosine and sine; both zero if no heading is commanded
     "target_heading": 2,
     "target_heading_rate": 1,
     # The acceleration in AHEAD seconds, for experts; the present one if it is unknown
@@ -141,7 +141,7 @@ class QuadcopterState:
 
     @property
     def target_heading(self) -> FloatArray:
-        """Cosine and sine of the commanded heading, (n, 2); zeros where there is none."""
+        """Cosine and sine of the commanded heading, (n, 2); zeros if there is none."""
         return self.array[X.target_heading : X.target_heading_rate].T
 
     @property

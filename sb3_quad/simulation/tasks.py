@@ -42,7 +42,7 @@ class Task(Frozen):
     """least height of a target above the ground, beyond the collision radius, where its distance
     from the start allows it, m"""
     random_attitude: bool = False
-    """start attitude uniform on SO(3), else level"""
+    """start attitude uniform on SO(3), otherwise level"""
     velocity_std: Speed = 0.0
     """standard deviation of v at the start, per axis, m/s"""
     body_rates_std: Speed = 0.0

@@ -332,7 +332,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                         trained = train(job, report, on_start=partial(note, number))
                     run = trained.run
                     seconds = trained.seconds
-                # These signals also have the one that ended a training.
+                # ``signals`` also has the signal that ended a training.
                 if signals.received:
                     break
                 agent = str(_agent(stage, job, run, report))
