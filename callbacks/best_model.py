@@ -1,4 +1,4 @@
-"""Evaluation during the training, and the best model kept."""
+"""Evaluation during training, which keeps the best model."""
 
 import time
 from collections import ChainMap
@@ -19,7 +19,7 @@ from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
 from sb3_quad.controllers.statistics import share_statistics
 
-# By the name in the log: an array of an evaluation, and its statistic.
+# By logged name: an array of an evaluation, and the statistic that is logged.
 LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "success_rate": ("successes", np.mean),
     "survival_rate": ("survivals", np.mean),
@@ -27,11 +27,11 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "mean_ep_length": ("ep_lengths", np.mean),
     "final_error": ("final_errors", np.nanmedian),
 }
-# The array of each rate that may decide; "success_rate" is its name in the log.
+# The array of each rate that can decide, which is logged as "success_rate", for example.
 RATES = {"success": "successes", "survival": "survivals"}
 # The key in ``info`` of each array that environments may report.
 REPORTED = {"successes": "is_success", "survivals": "survival", "final_errors": "distance"}
-# Whether to continue after an evaluation with this rate that decides, and this mean reward.
+# Given the rate that decides and the mean reward of an evaluation, whether to continue.
 ShouldContinue = Callable[[float, float], bool]
 # The rate that decides, and the mean reward.
 Score = tuple[float, float]
@@ -45,7 +45,7 @@ class BestModel(EveryTimesteps):
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's
     EvalCallback keeps the model of the highest mean reward; here a model that succeeds more often
     is better, and reward decides between equals. An evaluation that is due at the last timestep is
-    the one after the last update.
+    made once, after the last update.
 
     ``evaluations.npz`` is EvalCallback's with more arrays: ``seconds`` of training; ``survivals``
     and ``final_errors`` (m, NaN where the vehicle crashed or flew out of range), where environments
@@ -77,7 +77,7 @@ class BestModel(EveryTimesteps):
         rewards.
     :param every: timesteps between evaluations.
     :param n_episodes: episodes in each.
-    :param seed: of the evaluation's episodes.
+    :param seed: seed of the evaluation's episodes.
     :param best_model: where the best model goes; an existing file is replaced by a model that is
         better than all in ``evaluations``.
     :param evaluations: where the results go; an existing file is continued.
@@ -120,7 +120,7 @@ class BestModel(EveryTimesteps):
         self._by = RATES[by]
         path = Path(evaluations)
         self._own = _Evaluations(_vectorised(env), path)
-        # By the prefix of their part of a report.
+        # By the prefix of their part of a report line.
         self._evaluations = {"": self._own}
         for name, other in (others or {}).items():
             self._evaluations[f"{name}: "] = _Evaluations(
@@ -230,12 +230,11 @@ class _Evaluations:
     def append(self, row: StrDict) -> None:
         """Add an evaluation and write the file.
 
-        NaN stands for what one of the evaluations does not have, such as losses before the first
-        update.
+        Values that an evaluation does not have become NaN, such as losses before the first update.
         """
         self.rows = [*self.rows, row]
         arrays: StrDict = {}
-        # Of each array, an example.
+        # An example of each array shows its shape.
         for name, value in ChainMap(*self.rows).items():
             nothing = np.full(np.shape(value), np.nan)
             arrays[name] = [row.get(name, nothing) for row in self.rows]
@@ -255,7 +254,7 @@ def score(row: StrDict, by: str) -> Score:
 
 
 def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
-    """Return the arrays of an evaluation, (n_episodes,) each; those that are reported.
+    """Return the arrays of an evaluation that the environments report, (n_episodes,) each.
 
     :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
@@ -283,7 +282,7 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
             array[[not info.get("survival") for info in ends]] = np.nan
         if not np.isnan(array).all():
             values[name] = array
-    # Some environments report successes and no failures.
+    # Some environments report successes but not failures.
     if "successes" in values:
         values["successes"] = np.nan_to_num(values["successes"])
     return values

@@ -25,7 +25,7 @@ class EveryTimesteps(EventCallback):
     instead, so its events drift away from them.
 
     :param every: timesteps, over all environments together.
-    :raises ConfigError: it is below 1.
+    :raises ConfigError: ``every`` is below 1.
     """
 
     def __init__(self, every: int, verbose: int = 0) -> None:
@@ -116,20 +116,20 @@ class ProgressLine(BaseCallback):
             f"{self.num_timesteps:>12,} of {total:,} timesteps"
             f" ({100 * self.num_timesteps / total:.0f} %)"
         )
-        # Monitor fills this buffer where an episode ends.
+        # Monitor fills this buffer when an episode ends.
         episodes = self.model.ep_info_buffer
         if episodes:
             line += f", mean reward {safe_mean([episode['r'] for episode in episodes]):.2f}"
-        # A resumed training is timed from where it continues.
+        # A resumed training is timed from its continuation.
         seconds_per_step = elapsed / (self.num_timesteps - self._first_timestep)
         return f"{line}, {seconds_per_step * (total - self.num_timesteps) / 60:.0f} min left"
 
 
 class EpisodeLog(BaseCallback):
-    """Adds a line for each episode that ends: return, length, seconds since the start, success.
+    """Writes a line for each episode that ends: return, length, seconds since the start, success.
 
     It reads ``info["episode"]``, which costs nothing until an episode ends. ``load_results`` and
-    rl-zoo's plots read the file. An existing file is continued, its seconds too.
+    rl-zoo's plots read the file. An existing file is continued, and so are its seconds.
 
     >>> from stable_baselines3 import PPO
     >>> from stable_baselines3.common.results_plotter import load_results
@@ -157,7 +157,7 @@ class EpisodeLog(BaseCallback):
             with self._path.open("rb+") as file:
                 file.truncate(file.read().rfind(b"\n") + 1)
             lines = read_text(self._path).splitlines()
-        # Two lines are the file's head, which a crash may have cut, too.
+        # The first two lines are the header, which a crash may have cut, too.
         is_new = len(lines) < 2
         # The seconds of an earlier training count, too.
         if len(lines) > 2:
@@ -189,7 +189,7 @@ class EpisodeLog(BaseCallback):
 
 
 def last_timestep(model: BaseAlgorithm) -> int:
-    """Return the timestep at which ``model.learn``, which has begun, ends: whole rollouts."""
+    """Return the timestep at which the present ``model.learn`` ends, after whole rollouts."""
     steps = 1
     if isinstance(model, OnPolicyAlgorithm):
         steps = model.n_steps

@@ -40,7 +40,7 @@ class FlightKeywords(TypedDict, total=False):
     """Keywords of the environments for editors and type checkers.
 
     :class:`~sb3_quad.simulation.settings.FlightSettings` declares them, with their defaults and
-    meanings. Each constructor adds ``task``, and a test holds both lists equal.
+    meanings. Each constructor adds ``task``, and a test keeps both lists equal.
     """
 
     task_kwargs: StrMapping | None
@@ -63,7 +63,7 @@ class FlightKeywords(TypedDict, total=False):
 def quadcopter_spaces(size: int = OBSERVATION_SIZE) -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
     """Return new observation and action spaces of one quadcopter.
 
-    They are not shared, since each space has random numbers of its own.
+    They are not shared, since each space has its own random generator.
     """
     observations = spaces.Box(-np.inf, np.inf, (size,), np.float32)
     return observations, spaces.Box(-1.0, 1.0, (4,), np.float32)
@@ -73,7 +73,7 @@ class BatchEnv:
     """An environment whose rows are those of ``batch``.
 
     ``QuadcopterEnv`` has one row, and its values have no row axis. The setters take ``indices``,
-    the rows that are set: a number, several, a slice, or None for all.
+    the rows to set: a number, several, a slice, or None for all.
     """
 
     batch: QuadcopterBatch
@@ -95,7 +95,7 @@ class BatchEnv:
             environment's class.
         """
         name = type(self).__name__
-        # Check the names first, so that a slip in one of the constructor's own is recognised, too.
+        # Check the names first, so that a typo in a constructor argument is recognised, too.
         valid = inspect.signature(type(self)).parameters.keys() | FlightSettings.model_fields.keys()
         for key in keywords.keys() - valid:
             raise ConfigError(f"{name}: {unknown('keyword', key, valid - {'keywords'})}")
@@ -104,11 +104,11 @@ class BatchEnv:
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         """Return a copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""
-        # A single column stands for all rows where they do not differ.
+        # A single column serves all rows if they do not differ.
         return np.broadcast_to(columns.T, (self.batch.n, *columns.shape[:-1])).copy()
 
     def _require_reset(self, what: str, rows: Rows = None) -> None:
-        # Before its first reset the attitude of a row is zero. A restored batch needs none.
+        # A row's quaternion is zero before its first reset. A restored batch needs no reset.
         if not self.batch.state[QUATERNION, self.batch.rows(rows)].any(axis=0).all():
             raise ResetNeeded(f"call reset() before {what}")
 
@@ -122,9 +122,9 @@ class BatchEnv:
     def true_state(self) -> QuadcopterState:
         """Return the true state of all rows, free of noise.
 
-        It is a live view: the next step changes it. Only what a reference has besides its position
-        stays as it was at this call. Its wrench is a copy if there are gusts or drag, which it
-        includes.
+        It is a live view: the next step changes it, except for the velocity, acceleration and
+        heading of a reference, which stay as they were at this call. If there are gusts or drag,
+        its wrench includes them and is a copy.
         """
         return self.batch.true_state()
 
@@ -146,16 +146,16 @@ class BatchEnv:
         heading_rate: ArrayLike = 0.0,
         indices: Rows = None,
     ) -> None:
-        """Set what these rows should do now: a position, how it moves, and a heading.
+        """Set the reference of these rows: a position, its motion, and a heading.
 
-        It stays so until you set another one or their episode ends, and does not move by itself:
-        call it before each step. A curve of the environment's ``reference`` ends with it.
+        It lasts until you set another one or their episode ends, and does not move by itself: call
+        this before each step. It replaces a curve of the environment's ``reference``.
 
         :param position: (3,) for all these rows or (rows, 3), world frame, m.
         :param velocity: likewise, m/s.
         :param acceleration: likewise, m/s².
-        :param heading: of the body's x axis from the world's, one number or one for each of these
-            rows, rad. None: none is commanded.
+        :param heading: angle of the body's x axis from the world's, one number or one for each of
+            these rows, rad. None: no heading is commanded.
         :param heading_rate: likewise, rad/s.
         :raises ConfigError: a wrong shape, a number that is not finite, or a heading_rate without a
             heading.
@@ -173,9 +173,9 @@ class BatchEnv:
             turning = np.stack([np.cos(angle), np.sin(angle), rate])
         elif rate.any():
             raise ConfigError("heading_rate: needs a heading")
-        # That reset would set another target.
+        # The first reset would set another target.
         self._require_reset("set_target() or set_reference()", rows)
-        # Nobody knows its future, so the acceleration ahead is the present one.
+        # Its future is unknown, so the acceleration ahead is the present one.
         parts = [positions, velocities, accelerations, turning, accelerations]
         self.batch.set_reference(np.concatenate(parts), rows)
 
@@ -190,7 +190,7 @@ class BatchEnv:
         """Apply an external force and torque at the centre of mass.
 
         They act until you set others; if ``randomize`` samples a force or torque, until the next
-        episode. Without arguments you remove them.
+        episode. A call without arguments removes them.
 
         :param force: (3,) for all these rows or (rows, 3), N.
         :param torque: likewise, N m.
@@ -207,7 +207,7 @@ class BatchEnv:
         """Set the velocity of the air until you set another; if ``randomize`` samples a wind, until
         the next episode.
 
-        It acts through drag alone, and a warning says so if no vehicle here has ``drag``.
+        It acts through drag only, and a warning says so if no vehicle here has ``drag``.
 
         :param velocity: (3,) for all these rows or (rows, 3), world frame, m/s.
         :raises ConfigError: a wrong shape, or a number that is not finite.
@@ -252,7 +252,7 @@ class BatchEnv:
 
     @property
     def task(self) -> TaskSpec:
-        """The task, as it was given; ``task_kwargs`` replace fields of it."""
+        """The task, as it was given; ``task_kwargs`` override fields of it."""
         task: TaskSpec = self.flight_settings.task
         return task
 

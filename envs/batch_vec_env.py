@@ -1,4 +1,4 @@
-"""``BatchVecEnv``: anybody's own compiled batch as one Stable-Baselines3 environment."""
+"""``BatchVecEnv``: your own batched simulation as one Stable-Baselines3 environment."""
 
 from functools import cached_property
 from typing import Any
@@ -113,18 +113,18 @@ class BatchVecEnv(VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, *args: Any, **kwargs: Any) -> Any:
-        """Refuse; override it where your rows have attributes of their own."""
+        """Refuse; override it if your rows have attributes of their own."""
         raise NotImplementedError("rows have no attributes and methods of their own")
 
     env_method: Any = set_attr
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Return True for SB3's ``Monitor`` only, since the rows give its ``info["episode"]``."""
+        """Return True for SB3's ``Monitor`` only, since infos have its ``episode``."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
 
 def refuse_options(env: VecEnv) -> None:
-    """Refuse options of a reset, which SB3 passes through a method of their own, before it."""
+    """Refuse reset options, which SB3 sets by a separate method before the reset."""
     if any(env._options):
         env._reset_options()
         raise ConfigError(
@@ -134,17 +134,17 @@ def refuse_options(env: VecEnv) -> None:
 
 
 def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyArray:
-    """Return a copy of what a method has given, as an array.
+    """Return a copy of what a method has returned, as an array.
 
-    :param what: the method and what it gives, for the message.
+    :param what: the method and what it returns, for the message.
     :raises ConfigError: another shape, or numbers that are not finite.
     """
-    with raised_as(ConfigError, f"{what} are no numbers"):
+    with raised_as(ConfigError, f"{what} are not numeric"):
         given = np.asarray(values)
-        # Integers and booleans hide what is not finite or does not fit.
+        # A cast to integers or booleans hides numbers that are not finite or do not fit.
         with np.errstate(invalid="ignore"):
             array = given.astype(dtype)
-    # None, of a method without a return, would be a number of shape ().
+    # None, from a method without a return, would become a number of shape ().
     if values is None:
         raise ConfigError(f"{what}: None; return an array of shape {shape}")
     if array.shape != shape:
@@ -154,7 +154,7 @@ def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyA
         reason = "a number that is not finite"
     else:
         unfit = array != given
-        reason = f"a number that is no {array.dtype}"
+        reason = f"a number that is not a valid {array.dtype}"
     if unfit.any():
         row = np.argwhere(unfit)[0, 0]
         raise ConfigError(f"{what}: row {row} has {reason}")

@@ -30,20 +30,20 @@ from sb3_quad.simulation.state import (
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
-# PyBullet's window makes the simulation wait for each frame, so it draws only so many per second.
+# PyBullet's window makes the simulation wait for each frame, so it draws only this many per second.
 WINDOW_FPS = 25.0
 _ORIGIN = (0.0, 0.0, 0.0)
 
 
 class BulletBody:
-    """The rigid body of a vehicle in a PyBullet client of its own; several can exist at once.
+    """The rigid body of a vehicle in its own PyBullet client; several can exist at once.
 
-    PyBullet integrates a floating multibody base, which is what specification section 1 describes:
-    explicit velocities, then the pose by the new velocities. It has no shape, so that it touches
-    nothing: the task decides on contact with the ground by the position.
+    PyBullet integrates a floating multibody base: first explicit steps of the velocities, then the
+    pose by the new velocities. The body has no collision shape, so it touches nothing: the task
+    decides about contact with the ground by the position.
 
     :param vehicle: mass, inertia, gravity and physics step.
-    :param client: is this body's own from now on.
+    :param client: belongs to this body from now on.
     """
 
     def __init__(self, vehicle: Vehicle, client: Client) -> None:
@@ -100,11 +100,12 @@ class BulletBody:
         is_disturbed = any(world_force) or any(world_torque)
         for force, torque in wrenches.tolist():
             if is_disturbed:
-                # A world-frame force acts at a point of the world: where the centre of mass is now.
+                # PyBullet applies a world-frame force at a point of the world: the present centre
+                # of mass.
                 position, _ = client.getBasePositionAndOrientation(body)
                 client.applyExternalForce(body, -1, world_force, position, p.WORLD_FRAME)
                 client.applyExternalTorque(body, -1, world_torque, p.WORLD_FRAME)
-            # Drag depends on the velocity, which differs by physics step.
+            # Drag depends on the velocity, which changes in each physics step.
             if drag is not None:
                 force = np.add(force, self._drag(drag, wind))
             client.applyExternalForce(body, -1, force, _ORIGIN, p.LINK_FRAME)
@@ -125,7 +126,7 @@ class BulletBody:
         state[POSITION, 0] = position
         state[QUATERNION, 0] = w, x, y, z
         state[VELOCITY, 0] = velocity
-        # PyBullet's body rates are in the world frame.
+        # PyBullet's angular velocities are in the world frame.
         state[BODY_RATES, 0] = to_body(rotation_rows(w, x, y, z), rates)
 
     def close(self) -> None:
@@ -171,7 +172,7 @@ class Renderer:
         control_step = self.vehicle.control_step
         self.rotor_angles += state[ROTOR_SPEEDS] * control_step
         if self.human:
-            # Wait for real time. After a step that took longer, do not hurry.
+            # Wait for real time, but do not hurry after a step that took longer.
             now = time.perf_counter()
             self.shown_at = max(self.shown_at + control_step, now)
             time.sleep(self.shown_at - now)
@@ -180,7 +181,7 @@ class Renderer:
                 return None
             self.frames_due %= 1.0
         self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])
-        # Vehicle and target are in the picture.
+        # Vehicle and target must both be in the picture.
         both = np.stack([state[POSITION], state[TARGET]])
         camera = framing_camera(both, MARGIN * self.scene.scale, self.forward, self.lens)
         if not self.human:

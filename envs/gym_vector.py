@@ -26,15 +26,14 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
     :func:`~sb3_quad.base.seeds.row_seeds`.
 
     The infos of every step hold ``is_success``, ``survival``, ``distance``, ``collision`` and
-    ``out_of_range``, (n,) each. ``_is_success`` and so on are masks of the rows for which they
-    hold.
+    ``out_of_range``, (n,) each. ``_is_success`` and so on are masks of the rows that have a value.
 
     Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
 
     :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. With ``"SameStep"`` a
         row that ends returns the first observation and infos of its next episode; the last ones are
         in ``final_obs[i]`` and ``final_info``. With ``"NextStep"`` it returns the last ones, and
-        the next step begins its next episode; its action then does not count, but must be finite.
+        the next step begins its next episode; its action is then ignored, but must be finite.
     :raises ConfigError: an argument that does not fit.
     """
 

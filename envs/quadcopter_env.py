@@ -63,9 +63,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     `Box(-1, 1, (4,), float32)`: the commanded thrust of each rotor, (0.5 a + 1) m g / 4 for the
     default vehicle (Eq. 3.18). In general -1 and 1 are the vehicle's thrust limits, and 0 is the
-    middle between them. That is hover for the default vehicle; for others it is
-    `vehicle.hover_action`. Numbers outside [-1, 1] are clipped. Numbers that are not finite raise
-    an error.
+    middle between them. The default vehicle hovers at 0; others hover at `vehicle.hover_action`.
+    Numbers outside [-1, 1] are clipped. Numbers that are not finite raise an error.
 
     | Num | Rotor (default vehicle) | Min | Max | Thrust (N) |
     |-----|-------------------------|-----|-----|------------|
@@ -81,8 +80,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, sampled every
     control step, then `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2). With `last_action`,
-    `history` or `position_integral` the observation consists of several frames of these, of
-    `batch.observation.size` numbers in all.
+    `history` or `position_integral` the observation consists of frames built from these features,
+    with `batch.observation.size` numbers in all.
 
     | Num | Feature | Frame | Unit | std |
     |-----|---------|-------|------|-----|
@@ -102,8 +101,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     ## Starting State
 
     See the first table. In state recovery the attitude is uniform on SO(3), and each component of
-    the velocity is N(0, 2 m/s), of the body rates N(0, 4 rad/s). The rotors turn at hover speed,
-    and the delayed command is hover. You can fix a start by `reset(options=...)`:
+    the velocity is normal with σ = 2 m/s, each of the body rates with σ = 4 rad/s. The rotors turn
+    at hover speed, and the delayed command is hover. You can fix a start by `reset(options=...)`:
 
     | Key | Meaning |
     |-----|---------|
@@ -131,8 +130,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     | Key | Meaning |
     |-----|---------|
-    | `is_success` | whether it is close enough to the target now; at the end, the success |
-    | `survival` | whether it is not terminated so far; at the end, the thesis's success |
+    | `is_success` | whether it is close enough now; at the end, whether the episode succeeded |
+    | `survival` | whether it has not terminated so far; at the end, the thesis's success |
     | `distance` | distance from the target, m |
     | `collision` | whether it touched the ground |
     | `out_of_range` | whether it is too far from the target |
@@ -189,8 +188,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     ## While Flying
 
-    Call these methods on `env.unwrapped`. A setting holds until you set it again, a target or
-    reference until the next reset.
+    Call these methods on `env.unwrapped`. A setting lasts until you set it again; a target or
+    reference lasts until the next reset.
 
     | Method | Sets |
     |--------|------|
@@ -201,8 +200,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `set_noise(level)` | the relative standard deviation of the observation noise |
 
     Force and torque act in the frames `force_frame="world"` and `torque_frame="body"` unless you
-    give others. If `randomize` samples them or a wind, the next episode has its own. Wind acts on
-    vehicles with `drag`.
+    give others. If `randomize` samples them or a wind, the next episode replaces yours. Wind acts
+    on vehicles with `drag`.
 
     `true_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`, `observation_std`,
     `task`, `task_kwargs` and `vehicle` return the current values.
@@ -261,7 +260,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         return {**vars(self), "_body": None, "_renderer": None}
 
     def __setstate__(self, state: StrDict) -> None:
-        """Go on with the same flight in a simulation of its own."""
+        """Resume the flight in a new simulation."""
         vars(self).update(state)
         self._open()
         if self._has_begun:
@@ -329,7 +328,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         if not math.isfinite(sum(array.tolist())):
             raise ValueError(f"action {array.tolist()}: every number must be finite")
 
-        # The batch turns the rotors and scores; between them PyBullet moves the body.
+        # The batch turns the rotors and scores the step; in between, PyBullet moves the body.
         batch = self.batch
         drag = batch.vehicles[P.drag_x : P.drag_z + 1, 0] if batch.has_drag else None
         rotor_wrenches = batch.turn_rotors(array[None])

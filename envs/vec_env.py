@@ -50,7 +50,7 @@ class RowSeeds(VecEnv):
 
 
 class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
-    """n quadcopters stepped together by compiled code; the flight is PyBullet's to 1e-9.
+    """n quadcopters stepped together by compiled code; flights equal PyBullet's to 1e-9.
 
     The learning problem, the arguments and the setters are those of
     :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`. Row i flies exactly as that environment
@@ -60,9 +60,8 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     A row that ends begins its next episode within the same step. Its info then holds
     ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``, ``l``, ``t`` as of SB3's
     Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
-    infos of other rows are empty. The list of infos and the dictionaries in it are the
-    environment's own, and it uses them again: a wrapper that writes into one should write into a
-    copy. The arrays are new ones.
+    infos of other rows are empty. The environment reuses the list of infos and the dictionaries in
+    it: a wrapper that writes into one should write into a copy. The arrays are new ones.
 
     Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
 
@@ -70,7 +69,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over
         ``max_episode_steps``. The first mean return and success of a training then come from all
         kinds of episodes, not from early crashes alone.
-    :param seed: gives each row a stream of its own; None: random.
+    :param seed: seeds a random stream for each row; None: random.
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use.
         Results do not depend on it.
     :raises ConfigError: an argument that does not fit.
@@ -115,7 +114,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
 
         :return: observations (n, observation size), rewards (n,), done (n,), infos.
         """
-        # An info holds until the next step.
+        # An info is valid until the next step.
         for row in self._ended:
             self._infos[row] = {}
         observations, rewards, dones = self._fly(self._actions)

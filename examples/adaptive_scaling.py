@@ -43,10 +43,10 @@ def adaptive_factor(distance: npt.ArrayLike) -> FloatArray:
 
 
 class AdaptiveScaling:
-    """A policy behind the thesis's scaling; it has ``predict`` as an SB3 model has.
+    """A policy with the thesis's scaling; like an SB3 model, it has ``predict``.
 
-    The environment gives s / σ. The policy sees (s - μ) / (α σ) in the position components. The
-    distance in α is the observed one, with its noise, so the policy needs its observation only.
+    The environment returns s / σ. The policy sees (s - μ) / (α σ) in the position components. The
+    distance in α is the observed one, with its noise, so the policy needs only its observation.
 
     :param policy: an SB3 model, or a function of observations.
     :param mean: position components of μ, (3,), m; zero: only α.
@@ -64,10 +64,10 @@ class AdaptiveScaling:
         self.std = np.asarray(std, dtype=np.float64)[POSITION]
 
     def predict(self, observation: Float32Array, **how: Any) -> tuple[Any, Any]:
-        """Ask the policy for actions, with its observations scaled.
+        """Query the policy with scaled observations.
 
-        :param observation: (n, 18), as the environment gives them.
-        :param how: keywords of the policy's own ``predict``.
+        :param observation: (n, 18), as the environment returns them.
+        :param how: keywords for the policy's ``predict``.
         """
         position = observation[:, POSITION] * self.std
         factor = adaptive_factor(np.linalg.norm(position, axis=1, keepdims=True))
@@ -84,7 +84,7 @@ def measure_mean(
 ) -> FloatArray:
     """Find the position components of μ, (3,), m, with which a policy stops at its target.
 
-    Eq. 4.10 shrinks the offset, too. So it is measured with α in use, and again after each
+    Eq. 4.10 shrinks the offset, too, so it is measured with α in use, and again after each
     correction.
 
     :raises ConfigError: for a policy that crashes on the way to targets.
@@ -125,7 +125,7 @@ def main() -> None:
     for spec in parse_controllers(options.controllers):
         controller = resolve_expert(spec.spec, scenario.nominal_vehicle(), "controller")
         plain[spec.label] = summarise(fly_scenario(controller, scenario, own=spec.observed))
-        # An expert sees the true state, and no observation that could be scaled.
+        # An expert sees the true state, so there is no observation to scale.
         if hasattr(controller, "actions"):
             continue
         if spec.own is not None and spec.own.is_extended:
@@ -146,7 +146,7 @@ def main() -> None:
     rows = metric_rows(scenario, cells, scenario.published.values())
     console().print(Table(columns, rows, title=scenario.heading, caption=CAPTION))
     if options.output:
-        # With adaptive scaling, an agent has a lighter tone of its own colour.
+        # With adaptive scaling, an agent has a lighter shade of its colour.
         colours = colours_of([*plain])
         for label in plain:
             red, green, blue = to_rgb(colours[label])

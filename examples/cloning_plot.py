@@ -5,8 +5,8 @@ docs/research/results.md shows the plot.
     sb3-quad sweep cloning
     python examples/cloning_plot.py logs/sweep/cloning_1/results.csv cloning.png
 
-The name of a configuration says what it shares with another one, and whether it clones, such as
-"our reward, cloning, 1 M".
+The name of a configuration tells what it has in common with another one, and whether it clones:
+"our reward, cloning, 1 M", for example.
 """
 
 import argparse
@@ -22,7 +22,7 @@ COLOURS = {"cloning": "#1B7EC2", "none": "#D55E00"}
 def pairs(path: str | Path, scenario: str = "tracking") -> dict[str, dict[str, list[float]]]:
     """Read the median final error of each seed, m.
 
-    :returns: lists by what two configurations share, and by whether they clone.
+    :returns: lists, by what two configurations have in common and by whether they clone.
     """
     errors: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     with Path(path).open(encoding="utf-8", newline="") as file:

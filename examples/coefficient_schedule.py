@@ -1,4 +1,4 @@
-"""A callback by which a coefficient of the algorithm follows how well the training goes.
+"""A callback that moves a coefficient of the algorithm with the progress of the training.
 
     python examples/coefficient_schedule.py
 
@@ -34,9 +34,9 @@ class CoefficientSchedule(BaseCallback):
     of the cloning term). You can use it with any algorithm, for any of its numbers that is a float
     or a schedule: ``ent_coef``, ``clip_range``, ``learning_rate``, SAC's ``tau``.
 
-    The coefficient is set after a rollout, holds for the next one and is logged as
-    ``schedule/<coefficient>``. A model's zip holds the current number, and nothing of this package.
-    A training that continues from the zip continues from that number.
+    The coefficient is set after a rollout, applies to the next one, and is logged as
+    ``schedule/<coefficient>``. A model's zip contains the current number, and nothing of this
+    package. A training that continues from the zip continues from that number.
 
     :param coefficient: its name. If the model has a method ``set_<name>(value)``, it is called.
     :param start: its value until the followed quantity is known and has passed ``between[0]``.
@@ -94,7 +94,7 @@ class CoefficientSchedule(BaseCallback):
         self._value = self._start
         if self.num_timesteps > 0:
             self._value = _read(self.model, self.coefficient)
-        # Set each value once, so that one out of range is refused now and not at the end.
+        # Set each value once, so that one that is out of range is refused now and not at the end.
         for value in (self._final, self._start, self._value):
             _set(self.model, self.coefficient, value)
         if self.follow == PROGRESS:
@@ -132,7 +132,7 @@ class CoefficientSchedule(BaseCallback):
 
 
 def _set(model: BaseAlgorithm, name: str, value: float) -> None:
-    """Set a coefficient by the algorithm's ``set_<name>``, or else as its constructor would."""
+    """Set a coefficient with the algorithm's ``set_<name>``, or else as its constructor would."""
     setter = getattr(model, f"set_{name}", None)
     if setter is not None:
         setter(value)

@@ -3,8 +3,8 @@
     python examples/energy_reward.py
 
 The controller is an LQR, which knows the linear model of a hovering quadcopter. The reward is that
-of target tracking less an energy: (T / T_hover)^1.5 of each rotor's thrust T, the power of an ideal
-rotor. A wrapper takes it off, and nothing else changes.
+of target tracking minus an energy: (T / T_hover)^1.5 for each rotor's thrust T, the power of an
+ideal rotor. A wrapper subtracts it; nothing else changes.
 """
 
 import argparse
@@ -64,7 +64,7 @@ class LQR(Expert):
 
 
 class EnergyCost(VecEnvWrapper):
-    """Takes the power of the rotors from the reward of every control step."""
+    """Subtracts the power of the rotors from the reward of every control step."""
 
     def reset(self):
         """Begin a new episode in every row."""
@@ -78,7 +78,7 @@ class EnergyCost(VecEnvWrapper):
         self.venv.step_async(actions)
 
     def step_wait(self):
-        """The environment's own reward, less the energy."""
+        """Return the environment's own reward minus the energy."""
         observations, rewards, dones, infos = self.venv.step_wait()
         return observations, rewards - ENERGY_COST * self.power.astype(np.float32), dones, infos
 
@@ -125,8 +125,8 @@ targets = QuadcopterVecEnv(240, "target_tracking", seed=seed)
 imitation = DAgger("MlpPolicy", targets, expert=expert, seed=seed, device="cpu")
 imitation.learn(arguments.imitation_timesteps)
 
-# The reward is much like what the expert does: clone everywhere and strongly, and explore little.
-# The LQR takes more than 5 s to its target, so episodes last their full 15 s.
+# The expert flies much as this reward asks: clone everywhere and strongly, and explore little. The
+# LQR takes more than 5 s to its target, so episodes last their full 15 s.
 env = EnergyCost(QuadcopterVecEnv(480, "target_tracking", seed=seed))
 agent = PPOBC(
     "MlpPolicy",

@@ -1,11 +1,11 @@
-"""What the firmware of a Crazyflie does with flights: whom it cuts, what a low battery costs.
+"""What a Crazyflie's firmware does in flight: which flights it cuts, and what a low battery costs.
 
     python examples/firmware.py volts
     python examples/firmware.py supervisor crazyflie-robust my.zip -n 3840
     python examples/firmware.py battery crazyflie-robust --lowest 0.89 -n 960
 
-Agents are names, zips or run folders, and fly ``--vehicle`` in the noise that they were trained in.
-All constants are those of bitcraze/crazyflie-firmware, commit 2a18fc2 (2026).
+Agents are names, zips or run folders, and fly ``--vehicle`` with the noise that they were trained
+with. All constants are those of bitcraze/crazyflie-firmware, commit 2a18fc2 (2026).
 """
 
 import argparse
@@ -29,7 +29,7 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("state_recovery", "target_tracking")
 # src/platform/interface/platform_defaults_cf2.h and _cf21bl.h: the thrust of a rotor, N, is a
-# polynomial in its motor's voltage, the constant first; then the largest thrust that is asked for.
+# polynomial in its motor's voltage, the constant first; then the largest thrust that is commanded.
 MOTORS = {
     "legacy propellers": (
         [-0.014830744918356092, 0.04724465241828281, -0.01847364358025878, 0.005960923942142],
@@ -49,13 +49,13 @@ MOTORS = {
     ),
 }
 VOLTAGES = (4.2, 3.7, 3.2, 3.0, 2.85)
-PERIOD = 4  # control steps of 10 ms between two looks of the firmware (RATE_25_HZ)
+PERIOD = 4  # control steps of 10 ms between two checks of the firmware (RATE_25_HZ)
 CUTOFF = 30.0  # Hz, ACCEL_LPF_CUTOFF_FREQ of src/hal/src/sensors_bmi088_bmp3xx.c
 
 
 def print_volts() -> None:
-    """Print what a supply voltage leaves of the largest thrust, and of a thrust that is not
-    compensated.
+    """Print how much a supply voltage leaves of the largest thrust, and of a thrust without
+    compensation.
     """
     for name, (polynomial, largest) in MOTORS.items():
         thrust = np.polynomial.Polynomial(polynomial)
@@ -67,18 +67,18 @@ def print_volts() -> None:
             f" it turns at {100 * slower:.0f} % of the speed:"
         )
         for voltage in VOLTAGES:
-            # Compensated, a command gets its thrust as long as the voltage suffices.
+            # With compensation, a command gets its thrust as long as the voltage suffices.
             most = min(thrust(voltage) / largest, 1.0)
             print(f"  {voltage:.2f} V: largest {thrust(voltage):.4f} N, {100 * most:.0f} %", end="")
-            # Not compensated, the duty cycle is the force over the largest.
+            # Without compensation, the duty cycle is the force divided by the largest one.
             plain = 2.0 * thrust(voltage / 2.0) / largest
             print(f"; without compensation a command of half the most gives {100 * plain:.0f} %")
 
 
 class Firmware(Hook):
-    """The supervisor as the firmware runs it, by every phase of its 25 Hz: ``cut`` (phases, n).
+    """The supervisor as the firmware runs it, at every phase of its 25 Hz: ``cut`` (phases, n).
 
-    The accelerometer, at 1,000 Hz between two control steps on a straight line, goes through the
+    The accelerometer's samples, at 1,000 Hz and linear between two control steps, go through the
     firmware's second-order low-pass (src/utils/src/filter.c).
     """
 
@@ -95,7 +95,7 @@ class Firmware(Hook):
             2.0 * (warp**2 - 1.0) / scale,
             (1.0 - 2.0 * math.cos(math.pi / 4.0) * warp + warp**2) / scale,
         )
-        # At rest in the first force
+        # The filter is at rest at the first force.
         self.delays[:] = self.last / (1.0 + sum(self.feedback))
 
     def filtered(self, force):

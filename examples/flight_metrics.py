@@ -53,12 +53,12 @@ class FlightMetrics(BaseCallback):
             raise ConfigError(f"FlightMetrics: window {window}: must be at least 1 episode")
         self._tolerance = tolerance
         self._window = window
-        # Of each flight the final distance, m; the time until it arrived, s, NaN if it never did;
-        # collision; out of range.
+        # For each flight, the final distance, m; the time until it arrived, s, NaN if it never did;
+        # collision; out of range
         self._flights: deque[tuple[float, float, bool, bool]] = deque()
 
     def metrics(self) -> dict[str, float]:
-        """The logged means, by name, without those that no flight has shown yet."""
+        """The logged means, by name, without those that no flight has contributed to yet."""
         if not self._flights:
             return {}
         final, time_to, collision, out_of_range = np.array(self._flights, dtype=np.float64).T
@@ -96,7 +96,7 @@ class FlightMetrics(BaseCallback):
         ended = np.flatnonzero(self.locals["dones"])
         now = self._state().distance
         distance = now.copy()
-        # A row that has ended flies its next episode already; its info has the last distance.
+        # A row that has ended is already in its next episode; its info has the last distance.
         for row in ended:
             distance[row] = infos[row]["distance"]
         self._steps += 1

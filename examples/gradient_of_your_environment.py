@@ -4,10 +4,10 @@
 
 ``APG`` asks its environment for a tape, ``env.record(n_steps, substeps)``. A tape records flights
 step by step and then carries gradients back, the last step first: see
-``sb3_quad.algorithms.apg.Tape``. Here PyTorch differentiates each step. Code of your own that
-returns a vector-Jacobian product does as well.
+``sb3_quad.algorithms.apg.Tape``. Here PyTorch differentiates each step. Your own code that returns
+a vector-Jacobian product would also do.
 
-The environment is a row of carts, each of which a force pushes to its mark, where it should stop.
+The environment is a row of carts. A force pushes each one to its mark, where it should stop.
 """
 
 import argparse
@@ -63,7 +63,7 @@ class CartTape:
         return -costs.detach().numpy(), np.full(n, self.n_steps), np.zeros(n, dtype=bool)
 
     def begin(self, cost):
-        """Begin the backward pass; return the mean cost. The environment has a cost of its own."""
+        """Begin the backward pass; return the mean cost. The environment has its own cost."""
         self.grad_state = th.zeros(self.env.num_envs, 2)
         return float(th.stack([cost for *_, cost in self.steps]).detach().mean())
 
@@ -118,7 +118,7 @@ def mean_cost(model, seed):
 
 
 def main():
-    """Train, and print what it brought."""
+    """Train, and print the improvement."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--updates", type=int, default=150)

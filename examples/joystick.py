@@ -1,15 +1,15 @@
-"""Fly an agent by hand, in PyBullet's window: you say where to, it flies.
+"""Fly an agent by hand in PyBullet's window: you steer, it flies.
 
     python examples/joystick.py
     python examples/joystick.py any-quadcopter --speed 4
     pip install pygame  # for a gamepad
 
 Keys, with the window in front: arrows move forward, back, left and right, w and s up and down, a
-and d turn, q ends. A gamepad is taken instead if pygame is installed and one is plugged in: its
-right stick moves, its left one climbs and turns; `--axes` if yours numbers them otherwise.
+and d turn, q quits. A gamepad is used instead if pygame is installed and one is plugged in: its
+right stick moves, its left one climbs and turns; give `--axes` if yours numbers them differently.
 
-A stick asks for a velocity and a yaw rate, in the frame of the heading. A filter smooths them, so
-that the acceleration of the reference is finite, too; the sum of the velocities is its position.
+A stick commands a velocity and a yaw rate, in the frame of the heading. A filter smooths them, so
+that the acceleration of the reference is finite, too; its position is the integral of the velocity.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.rendering.window import has_display
 
-FLOOR = 2.0  # m, below which the reference does not go
+FLOOR = 2.0  # m, the lowest height of the reference
 LEASH = 3.0  # m: the reference waits for a vehicle that is farther away
 FREQUENCY = 4.0  # rad/s, of the filter of velocities
 TURN_LAG = 0.2  # s, of the filter of the yaw rate
@@ -68,14 +68,14 @@ class Gamepad:
         """Return what :class:`Keyboard` does."""
         self.pygame.event.pump()
         values = np.array([-self.device.get_axis(axis) for axis in self.axes])
-        # Sticks that are let go do not come to rest exactly in the middle.
+        # Released sticks do not come to rest exactly in the middle.
         return np.sign(values) * np.clip(np.abs(values) - 0.1, 0.0, None) / 0.9
 
 
 class Guide:
     """The reference that a stick moves.
 
-    :param speed: that a full stick asks for, m/s; ``turn`` likewise, rad/s.
+    :param speed: the velocity that a full stick commands, m/s; ``turn`` likewise, rad/s.
     :param dt: control step, s.
     """
 
@@ -94,7 +94,7 @@ class Guide:
         forward, left, up, turn = stick
         c, s = np.cos(self.heading), np.sin(self.heading)
         wanted = self.speed * np.array([c * forward - s * left, s * forward + c * left, up])
-        # It slows down in time for the floor, and it waits for the vehicle.
+        # Slow down in time for the floor, and wait for the vehicle.
         wanted[2] = max(wanted[2], (FLOOR - self.position[2]) * FREQUENCY / 4)
         wanted *= np.linalg.norm(self.position - vehicle) < LEASH
         # A critically damped filter of second order: the velocity follows without overshoot.
@@ -119,7 +119,7 @@ def fly(agent, stick, speed=3.0, turn=1.5, render_mode="human"):
     :param agent: name of an agent of the package, or path of a zip.
     :param stick: a function that returns forward, left, up and turn, each in [-1, 1], or None.
     """
-    # Experts of the package's names are no zips; an agent brings its vehicle and observation.
+    # A name of the package stands for a zip here; an agent brings its vehicle and observation.
     path = pretrained(agent) or agent
     model = load_model(path)
     settings = {**env_kwargs(path), "task": "target_tracking", "reference": None}
@@ -151,7 +151,7 @@ def fly(agent, stick, speed=3.0, turn=1.5, render_mode="human"):
 
 
 def plugged_in():
-    """Return pygame if it is installed and finds a gamepad, else None."""
+    """Return pygame if it is installed and finds a gamepad, otherwise None."""
     try:
         import pygame
     except ImportError:

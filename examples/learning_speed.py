@@ -2,11 +2,11 @@
 
     python examples/learning_speed.py learning_speed.csv learning_speed.png
 
-Every method flies the vehicle, noise and delay of the thesis and is evaluated along the way by the
+Every method flies the vehicle, noise and delay of the thesis, and is evaluated along the way on the
 same fresh episodes: recoveries from the thesis's starts, and targets 10 m away. Evaluations are not
 counted. "From the clone" starts from the agent of `clone of the PID`, whose training is counted.
-Use one thread (``OMP_NUM_THREADS=1``), so that CPU seconds are seconds of one core. A
-seed takes some ten minutes; ``--cpu-seconds`` ends each training earlier.
+Use one thread (``OMP_NUM_THREADS=1``), so that CPU seconds are seconds of one core. A seed takes
+about ten minutes; ``--cpu-seconds`` ends each training earlier.
 """
 
 import argparse
@@ -47,7 +47,7 @@ COLUMNS = ("method", "seed", "cpu_s", "timesteps", "recoveries", "survival", "se
 
 
 class Evaluations(BaseCallback):
-    """Evaluates a model along its training, at times that are even on a logarithmic axis."""
+    """Evaluates a model during its training, at times that are even on a logarithmic axis."""
 
     def __init__(
         self, method: str, seed: int, spent: float, limit: float, rows: list[tuple[Any, ...]]
@@ -79,13 +79,13 @@ class Evaluations(BaseCallback):
         return self.spent + time.process_time() - self.start
 
     def evaluate(self) -> None:
-        """Fly the episodes of the evaluation and note what came out."""
+        """Fly the episodes of the evaluation and record the results."""
         cpu = self.cpu
         recoveries = fly(self.model, "state_recovery", 960, seed=1_000)
         targets = fly(self.model, "target_tracking", 240, seed=2_000)
         settling = targets.settling_time[0.1]
         settled = np.isfinite(settling)
-        # A mean over the few that settle would flatter.
+        # A mean over the few that settle would look too good.
         mean = float(settling[settled].mean()) if settled.mean() > 0.9 else np.nan
         row = (
             self.method,
@@ -116,7 +116,7 @@ def train(
     job = TrainingJob(config=config, seed=seed, trained_agent=clone)
     begun = time.process_time()
     model = build_model(job, env)
-    # The actor of SAC imitates the clone at first, which takes its time.
+    # The actor of SAC first imitates the clone, which takes time.
     spent += time.process_time() - begun
     evaluations = Evaluations(method, seed, spent, spent + limit, rows)
     model.learn(config.n_timesteps, evaluations)
@@ -125,7 +125,7 @@ def train(
 
 
 def train_from_nothing(seed: int, limit: float, rows: list[tuple[Any, ...]]) -> None:
-    """Train by the model's gradient alone, on windows of a second that carry their flights on."""
+    """Train only by the model's gradient, on windows of a second that continue their flights."""
     tasks = {"state_recovery": 0.6, "target_tracking": 0.4}
     env = QuadcopterVecEnv(256, task=tasks, seed=seed_for("training", seed))
     model = APG("MlpPolicy", env, n_steps=100, carry_on=True, seed=seed)
@@ -162,7 +162,7 @@ def draw(rows: list[dict[str, str]], path: str) -> None:
     right.set_xlim(left.get_xlim())
     right.set_ylim(0.0, 14.0)
     left.legend(frameon=False, fontsize=8)
-    # Without a word, an absent curve looks like a mistake.
+    # Without a note, a missing curve looks like a mistake.
     if unsettled:
         text = "no curve, since 10 % of flights or more never settle:\n" + "\n".join(unsettled)
         right.text(0.02, 0.98, text, transform=right.transAxes, va="top", fontsize=8)

@@ -3,7 +3,7 @@
     python examples/load_in_plain_sb3.py sb3_quad/controllers/pretrained/itm-robust.zip
 
 Nothing here imports sb3_quad: the zip says what its agent observes. Copy `Observation` to your own
-simulator or vehicle, for which `Quadcopter` stands here.
+simulator or vehicle, which `Quadcopter` represents here.
 """
 
 import argparse
@@ -12,15 +12,15 @@ import sys
 import numpy as np
 from stable_baselines3 import PPO
 
-# Scale of the features if the zip gives none.
+# Scale of the features if the zip contains none
 STD = np.repeat([10 / np.sqrt(3), np.sqrt(3), 5.0, 5.0], [3, 9, 3, 3])
-ACCELERATION_STD = 5.0  # m/s², scale of what is seen of a reference's future
+ACCELERATION_STD = 5.0  # m/s², scale of the observed future acceleration of a reference
 
 
 class Observation:
     """Makes the agent's observations in an episode from the state in SI units.
 
-    Call it once in each control step.
+    Call it once in every control step.
     """
 
     def __init__(self, settings):
@@ -61,20 +61,20 @@ class Observation:
         :param velocity: relative to the reference's, world frame, m/s.
         :param body_rates: body frame, rad/s.
         :param action: the agent's last action, (4,); zeros at the start.
-        :param heading: that the body's x axis should have, rad; 0 if nothing is asked of it.
+        :param heading: desired heading of the body's x axis, rad; 0 if none is commanded.
         :param heading_rate: of that heading, rad/s.
         :param accelerations: of the reference in each control step of ``preview``, (previews, 3),
             world frame, m/s²; None: it rests.
         """
-        # All is relative to the reference, and the world is turned to its heading; give an agent
-        # for PX4 no heading, and the velocity itself.
+        # Everything is relative to the reference, and the world is turned to its heading. For an
+        # agent for PX4, pass no heading, and the velocity itself.
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         velocity = rotation.T @ velocity
         body_rates = body_rates - heading_rate * rotation[2]
         position = turn @ position
         rotation = turn @ rotation
-        # The integral grows near the target alone, so that it removes a constant offset there.
+        # The integral grows only near the target, where it removes a constant offset.
         rule = self.rule
         if rule and self.frames:
             near = np.linalg.norm(position) < rule["distance"]
@@ -105,7 +105,7 @@ class Observation:
 
 
 class Quadcopter:
-    """The vehicle of the zip without wind, level and at rest at first."""
+    """The vehicle of the zip, without wind, initially level and at rest."""
 
     def __init__(self, vehicle, position):
         self.vehicle = vehicle
@@ -190,7 +190,7 @@ if __name__ == "__main__":
             quadcopter.step(action)
         print(f"{path}: {np.linalg.norm(quadcopter.position):.3f} m from the target after 15 s")
 
-        # Then it follows a circle of 2 m at 2 m/s, and turns once in each.
+        # Then it follows a circle of 2 m at 2 m/s, and turns once in each round.
         dt = settings["vehicle"]["control_step"]
         rate = 1.0
         errors = []

@@ -2,11 +2,11 @@
 
     OMP_NUM_THREADS=1 python examples/nominal_policy.py --seed 0
 
-DAgger gives a network of 64 and 64 units a first idea of the geometric expert, which takes some
-four seconds. The gradient of the model does the rest, from starts that are somewhat harder than
-the thesis's. Prints the CPU seconds of both and the share of 3,840 recoveries that succeed, from
-the thesis's starts with its noise and the vehicle's delay. If you give another ``--vehicle``, give
-a smaller ``--learning-rate``, too, such as 4e-3.
+DAgger first gives a network of 64 and 64 units a rough copy of the geometric expert, in about four
+seconds. The gradient of the model does the rest, from starts that are somewhat harder than the
+thesis's. The script prints the CPU seconds of both and the share of 3,840 recoveries that succeed,
+from the thesis's starts with its noise and the vehicle's delay. If you give another ``--vehicle``,
+give a smaller ``--learning-rate``, too, such as 4e-3.
 """
 
 import argparse

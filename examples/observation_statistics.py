@@ -4,7 +4,8 @@ Table A.2 of the thesis comes from them.
 
     python examples/observation_statistics.py
 
-You get no agent: the first flights of PPO are measured, when it has hardly begun to learn.
+The result is not an agent: the script measures PPO's first flights, when it has hardly begun to
+learn.
 
 In a settings file, with ``PYTHONPATH=examples`` on the command line::
 
@@ -32,8 +33,8 @@ class ObservationStatistics(EveryTimesteps):
     step are combined with all earlier ones (T. F. Chan, G. H. Golub, R. J. LeVeque, *Updating
     formulae and a pairwise algorithm for computing sample variances*, Stanford 1979).
 
-    :param path: YAML file to write; its ``observation_std`` is a list as ``env_kwargs`` takes it.
-        None: no file.
+    :param path: YAML file to write; its ``observation_std`` is a list for ``env_kwargs``. None: no
+        file.
     :param every: timesteps after which it logs (``observation/std_<group>``) and writes. It does so
         at the end, too.
     """
@@ -59,7 +60,7 @@ class ObservationStatistics(EveryTimesteps):
         return "\n".join(lines)
 
     def _on_step(self) -> bool:
-        # The environments scale what they show; undo it.
+        # The environments scale observations; undo that.
         std = np.array(self.training_env.get_attr("observation_std"))
         mean = np.array(self.training_env.get_attr("observation_mean"))
         self.moments.update(self.locals["new_obs"] * std + mean)

@@ -1,4 +1,4 @@
-"""Train in a batch of your own: you write how rows begin and move, ``BatchVecEnv`` the rest.
+"""Train in a batch of your own: you write how rows begin and move, ``BatchVecEnv`` does the rest.
 
     python examples/own_batch.py
 
@@ -49,7 +49,7 @@ class Pendulums(BatchVecEnv):
 
 
 def main():
-    """Train, and print what it brought."""
+    """Train, and print the improvement."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--timesteps", type=int, default=100_000)
     arguments = parser.parse_args()

@@ -1,6 +1,7 @@
 """An expert of your own teaches an agent.
 
-It is the geometric controller while the vehicle is tilted or turning, and the thesis's PID else.
+It is the geometric controller while the vehicle is tilted or turning, and otherwise the thesis's
+PID.
 
     python examples/own_expert.py
 
@@ -19,7 +20,7 @@ from sb3_quad.experts.protocol import Expert
 
 
 class SwitchingExpert(Expert):
-    """Recovers as one controller and travels as the other."""
+    """Recovers with one controller and travels with the other."""
 
     def __init__(self, vehicle="itm"):
         super().__init__(vehicle)

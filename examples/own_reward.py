@@ -4,7 +4,7 @@
 
 Here restless actions cost something, and an agent that comes with sb3_quad learns to fly with
 calmer ones. The wrapper is SB3's, around many vehicles at once; around a single environment
-(`gymnasium.make`) a `gymnasium.Wrapper` with the same two lines does it.
+(`gymnasium.make`), use a `gymnasium.Wrapper` with the same two lines.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from sb3_quad import PPOBC, QuadcopterVecEnv, fly
 
 
 class CalmActions(VecEnvWrapper):
-    """Takes `cost` times the mean squared change of the action from the reward of every control
+    """Subtracts `cost` times the mean squared change of the action from the reward of every control
     step.
     """
 
@@ -39,7 +39,7 @@ class CalmActions(VecEnvWrapper):
         self.venv.step_async(actions)
 
     def step_wait(self):
-        """The environment's own reward, less the cost."""
+        """Return the environment's own reward minus the cost."""
         observations, rewards, dones, infos = self.venv.step_wait()
         # These rows begin their next episode.
         self.last[dones] = 0.0
@@ -57,7 +57,7 @@ def make_env(n_envs, seed):
         max_episode_steps=500,
         seed=seed,
     )
-    # Then ep_rew_mean is that of the new reward; SB3 warns of that.
+    # With this, ep_rew_mean is that of the new reward; SB3 warns about it.
     return VecMonitor(CalmActions(env, cost=2.0))
 
 

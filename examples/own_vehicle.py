@@ -5,7 +5,7 @@ An agent then learns to fly it from the geometric expert.
     python examples/own_vehicle.py
     python examples/own_vehicle.py --vehicle path/to/yours.yaml
 
-By command you imitate the same expert on more tasks, for 6,000,000 timesteps:
+On the command line, you imitate the same expert on more tasks, for 6,000,000 timesteps:
 
     sb3-quad train --algo dagger --env QuadStateRecovery-v0 --conf-file nominal/dagger.yml \
         --env-kwargs vehicle:examples/my_quadcopter.yaml
@@ -37,7 +37,7 @@ parser.add_argument(
 )
 arguments = parser.parse_args()
 
-# A value that no vehicle can have is refused here, by its name.
+# A value that no vehicle can have is refused here, with its name.
 vehicle = load_vehicle(arguments.vehicle)
 low, high = vehicle.thrust_range
 print(

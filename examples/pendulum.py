@@ -3,8 +3,8 @@
     python examples/pendulum.py
 
 DAgger imitates a swing-up controller. Then an expert that uses half of the torque is imitated, and
-PPOBC makes the agent better than this expert. PPO with the same settings learns from nothing, to
-compare. All fly the same hundred fresh episodes.
+PPOBC makes the agent better than this expert. PPO with the same settings learns from scratch, for
+comparison. All fly the same hundred fresh episodes.
 """
 
 import argparse
@@ -22,7 +22,7 @@ N_EPISODES = 100
 
 
 def swing_up(observations, limit=2.0):
-    """Add the energy that is missing to swing up, and hold on top; torques in N m, (n, 1)."""
+    """Add the energy that is missing to swing up, then balance; torques in N m, (n, 1)."""
     cosine, sine, rate = observations.T
     missing = 15.0 * (1.0 - cosine) - 0.5 * rate**2
     hold = -10.0 * np.arctan2(sine, cosine) - 2.0 * rate

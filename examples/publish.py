@@ -9,10 +9,10 @@ The card holds measured metrics, the command that trained the policy, seed and v
     python examples/publish.py itm-recovery --name itm-recovery --hub
     python examples/publish.py itm-recovery --name itm-recovery --push somebody/itm-recovery
 
-The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 can
+The zip contains only the weights and plain numbers, so that other versions of Stable-Baselines3 can
 read it, too. For the card the policy flies fresh episodes: 3,840 recoveries, 960 targets at each of
-10, 15 and 20 m, and 960 figures of eight. The run folder says how it was trained; what it does not
-say, the card calls "not recorded". The agents of the package were made in this way.
+10, 15 and 20 m, and 960 figures of eight. The run folder says how it was trained; the card calls
+anything else "not recorded". The agents of the package were made in this way.
 
 With --hub you get a folder NAME in the layout of huggingface_sb3: the card as README.md with
 metadata, the zip and its content, config.json and results.json, whose rewards are those of the
@@ -171,7 +171,7 @@ def run(options: argparse.Namespace) -> int:
 def _origin(model: Path) -> tuple[str, dict[str, str]]:
     """Return the command that trained an agent, and further facts.
 
-    What neither its zip nor its run folder says is UNKNOWN.
+    Facts that are in neither its zip nor its run folder are UNKNOWN.
     """
     algorithm = saved_algorithm(model)
     timesteps = f"{saved_data(model)['num_timesteps']:,} timesteps"
@@ -196,7 +196,7 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
 
 
 def _plain(text: Any) -> str:
-    """One line that ends no code span or fence of the card, whatever a run folder says."""
+    """One line that cannot end a code span or fence of the card, whatever a run folder contains."""
     return " ".join(str(text).split()).replace("`", "'")
 
 
@@ -219,7 +219,7 @@ def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> byte
     for key in ("net_arch", "activation_fn"):
         if key in source.policy_kwargs:
             kwargs[key] = source.policy_kwargs[key]
-    # Without an environment, whose spaces are set by hand: nothing has to fly here.
+    # Without an environment, whose spaces are set by hand, since nothing has to fly here.
     stock: Any = PPO
     model = stock("MlpPolicy", None, policy_kwargs=kwargs, device="cpu", _init_setup_model=False)
     model.observation_space = source.observation_space
@@ -230,7 +230,7 @@ def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> byte
     model.num_timesteps = source.num_timesteps
     if settings is not None:
         settings.write_into(model)
-    # A plain number: the version of SB3 that loads it makes a schedule of its own from it.
+    # A plain number, from which the version of SB3 that loads it makes its own schedule.
     model.clip_range = 0.2
     buffer = io.BytesIO()
     model.save(buffer, exclude=["lr_schedule", "clip_range_vf", "start_time"])
@@ -266,8 +266,8 @@ def hub_layout(
 ) -> tuple[str, dict[str, bytes]]:
     """Return the metadata that huggingface_sb3 puts before a card, and its further files by path.
 
-    :param content: bytes of the zip, whose members also lie unpacked in a folder ``name``.
-    :param task: task of the agent; of several tasks the recovery counts.
+    :param content: bytes of the zip, whose members are also unpacked in a folder ``name``.
+    :param task: task of the agent; if there are several, the recovery counts.
     :param flown: result of :func:`measure`.
     """
     env_id = "QuadStateRecovery-v0"
@@ -328,7 +328,7 @@ def write_card(
         target = Target(distance=TARGETS.get(task, 0.0))
         scenario = Scenario(name="card", target=target, vehicle=vehicle, vehicles=vehicles)
         cells = {**metric_cells(metrics), LIMIT: Cell(scenario.physical_limit, words="–")}
-        # These begin at their targets, so times to them say nothing.
+        # These begin at their targets, so times to them are meaningless.
         if task not in TARGETS:
             cells |= dict.fromkeys(TIMES, Cell(words="–"))
         rows.append(Row(task, "", [cells.get(row, Cell(words="–")) for row in SHOWN]))

@@ -49,7 +49,7 @@ class Module:
         self.std = row.std[:, 0]
 
     def __call__(self, observations: Any) -> Any:
-        """Return the actions of observations, (n, 18) to (n, 4)."""
+        """Return the actions (n, 4) for observations (n, 18)."""
         features = observations * self.std + self.mean
         thrusts, _ = self.call(features.astype(np.float32))
         return self.vehicle.thrust_to_action(thrusts.astype(np.float64))

@@ -1,4 +1,4 @@
-r"""RAPTOR's published policy, a recurrent network for many quadcopters, to compare with.
+r"""RAPTOR's published policy, a recurrent network for many quadcopters, for comparison.
 
     pip install foundation-policy        # or pip install '.[raptor]', its extra
     python examples/raptor.py
@@ -40,7 +40,7 @@ DIRECTIONS = (-1, 1, -1, 1)
 
 
 class Raptor:
-    """The policy, with ``predict`` as SB3's recurrent policies have it.
+    """The policy, with ``predict`` as in SB3's recurrent policies.
 
     It sees the 18 features as an agent does, with their noise. Of the vehicle it knows only the
     order of the rotors and the range of their speeds.
@@ -87,7 +87,7 @@ class Raptor:
         episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, State]:
-        """Actions (n, 4) for observations (n, 18); of longer ones it sees the current 18 features.
+        """Actions (n, 4) for observations (n, 18); of longer ones, it uses the current 18 features.
 
         :param state: the one returned before; None: all rows begin an episode.
         :param episode_start: (n,), the rows that begin an episode; None: no row does.
@@ -112,9 +112,9 @@ class Raptor:
         return actions, (self._gru.state, commands)
 
     def _actions(self, commands: Float32Array) -> FloatArray:
-        """Actions (n, 4) of motor commands: a rotor's thrust is the square of its speed."""
+        """Actions (n, 4) for motor commands: a rotor's thrust goes with the square of its speed."""
         idle = self._idle[np.arange(len(commands)) % len(self._idle)]
-        # Speed and thrust as shares of the greatest ones.
+        # Speed and thrust as shares of their greatest values
         speeds = idle + (1.0 - idle) * (commands.astype(np.float64) + 1.0) / 2.0
         shares = speeds**2
         return np.asarray(2.0 * (shares - idle**2) / (1.0 - idle**2) - 1.0)

@@ -2,10 +2,10 @@
 
     python examples/real_flights.py FOLDER [--vehicle FILE] [--leave-out NAME …] [--control]
 
-FOLDER holds CSV files in the format of NanoBench: docs/vehicles.md lists their columns. What is
-printed, and what came out for eleven flights of a Crazyflie, stands in docs/research/reality.md.
-``--control`` flies a vehicle of known lag under the firmware's kind of controller instead, and
-shows what the same estimates make of it.
+FOLDER holds CSV files in the format of NanoBench: docs/vehicles.md lists their columns.
+docs/research/reality.md explains the output, and has the results for eleven flights of a Crazyflie.
+``--control`` flies a vehicle with a known lag under a controller like the firmware's instead, and
+shows the same estimates for it.
 """
 
 import argparse
@@ -31,18 +31,18 @@ from sb3_quad.simulation.state import TORQUE_BODY, QuadcopterState
 STEP = 0.01  # s, of the estimates
 GRAVITY = np.array([0.0, 0.0, 9.81])
 AXES = ("roll", "pitch", "yaw", "thrust")
-# Thrusts of M1 to M4 (front right, back right, back left, front left) to what turns or lifts: the
-# difference between two sides, N, or the sum.
+# From thrusts of M1 to M4 (front right, back right, back left, front left) to what turns or lifts:
+# the difference between two sides, N, or the sum
 SIDES = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1], [1, 1, 1, 1]])
 ARM = 0.0325  # m, of a rotor about an axis
-# Past rates and past commands of the model that predicts the next rate.
+# Number of past rates and of past commands in the model that predicts the next rate
 PAST = 12
 COMMANDS = 25
 
 
 @dataclass
 class Run:
-    """What the estimates need of one flight, rows 0.01 s apart."""
+    """The data of one flight for the estimates, in rows 0.01 s apart."""
 
     commands: np.ndarray  # (n, 4), by axis, N
     response: np.ndarray  # (n, 4), body rates (rad/s) and specific force along z (m/s²)
@@ -112,7 +112,7 @@ def state_of(motion):
 
 
 def columns_of(log, names):
-    """Return further columns of a log's file, (n, names), by the clock of the vehicle."""
+    """Return further columns of a log's file, (n, names), which follow the clock of the vehicle."""
     table = pd.read_csv(log.path)
     grid = table["t"].iloc[0] + STEP * np.arange(len(log.motion)) + log.offset
     return np.stack([np.interp(grid, table["t"], table[name]) for name in names], axis=1)
@@ -130,7 +130,9 @@ def run_of(log):
 
 
 def one_step_table(logs, vehicle):
-    """Compare the accelerations that a vehicle file gives the recorded commands with the flown."""
+    """Compare the accelerations that a vehicle file predicts from recorded commands with the
+    measured ones.
+    """
     flown = []
     given = []
     for log in logs:
@@ -163,7 +165,7 @@ def in_body(rotation, vectors):
 
 
 def lagged(signal, time_constant, delay, step=STEP):
-    """Return a signal, (n, k), behind a delay and a first-order lag, both in s."""
+    """Return a signal, (n, k), after a delay and a first-order lag, both in s."""
     rows = np.arange(len(signal))
     columns = [np.interp(rows - delay / step, rows, column) for column in signal.T]
     late = np.stack(columns, axis=1)
@@ -181,7 +183,7 @@ def lag_table(runs, title):
     """Return, by axis, three estimates of the lag and the slope, with 95 % jackknife intervals.
 
     Cross-correlation and plain regression are what one would try first. In a closed loop both are
-    wrong: the command answers the very motion that it is compared with.
+    wrong: the command reacts to the very motion that it is compared with.
     """
     rows = []
     for axis, name in enumerate(AXES):
@@ -212,7 +214,7 @@ def estimates(runs, axis):
 
 
 def accelerations(run, axis):
-    """Return what a command makes: an angular acceleration, or the specific force."""
+    """Return the effect of a command: an angular acceleration, or the specific force."""
     response = run.response[:, axis]
     return response if axis == 3 else np.gradient(response, STEP)
 
@@ -239,9 +241,9 @@ def correlated(runs, axis, width=5, most=15):
 def step_response(runs, axis):
     """Return the acceleration, (30,), after a step of the command, from an ARX model.
 
-    The next response is predicted from PAST earlier ones and COMMANDS earlier commands. What the
-    controller answers is then kept apart from what the motors do, as long as these take at least
-    one sample (Ljung, System Identification, 2nd ed., 13.4).
+    The next response is predicted from PAST earlier ones and COMMANDS earlier commands. This
+    separates the controller's reaction from the effect of the motors, as long as that takes at
+    least one sample (Ljung, System Identification, 2nd ed., 13.4).
     """
     regressors = []
     targets = []
@@ -291,14 +293,14 @@ def resonance(runs, axis, n=256):
         for begin in range(0, len(command) - n, n // 2):
             piece = command[begin : begin + n]
             power += np.abs(np.fft.rfft(window * (piece - piece.mean()))) ** 2
-    # The least squares of a smooth curve would do; a running mean is enough.
+    # A running mean is enough; a least-squares fit of a smooth curve would also do.
     power = np.convolve(power, np.ones(3) / 3.0, "same")
     inside = (frequencies > 2.5) & (frequencies < 12.0)
     return float(frequencies[inside][np.argmax(power[inside])])
 
 
 def estimate_table(logs):
-    """Return what motion tells directly, with 95 % jackknife intervals."""
+    """Return what can be estimated from the motion directly, with 95 % jackknife intervals."""
     names = (
         "mass by thrust, g",
         "drag in x, y by mass, 1/s",
@@ -395,10 +397,10 @@ def fit_text(vehicle, spread, names):
 
 
 def fit_forces(logs):
-    """Return mass by thrust, g; drag by mass, 1/s; and the moment that airspeed brings, mN m s/m.
+    """Return mass from thrust, g; drag divided by mass, 1/s; and the moment per airspeed, mN m s/m.
 
     The commands go through the lag of the whole thrust (below). The moment is what the controller
-    holds against at low frequencies, where a vehicle hardly turns.
+    counteracts at low frequencies, where a vehicle hardly turns.
     """
     lift = []
     side = []
@@ -415,7 +417,7 @@ def fit_forces(logs):
             speed = airspeed[:, axis] - airspeed[:, axis].mean()
             pull = force[:, axis] - force[:, axis].mean()
             side.append([-speed @ pull, speed @ speed])
-        # Moving forward asks for a pitching moment; leftward, for a rolling moment.
+        # Moving forward requires a pitching moment; moving left, a rolling moment.
         for axis, along, sign in ((1, 0, 1.0), (0, 1, -1.0)):
             speed = airspeed[:, along] - airspeed[:, along].mean()
             moment = ARM * (commands[:, axis] - commands[:, axis].mean())
@@ -449,7 +451,7 @@ def moment_table(logs, vehicle, moment):
 
 
 class Cascade:
-    """A controller of the firmware's kind: position, velocity, attitude, rates.
+    """A controller like the firmware's: position, velocity, attitude, rates.
 
     Gains, limits and units are those of crazyflie-firmware 2025.12 (platform_defaults_cf2.h,
     position_controller_pid.c, attitude_pid_controller.c): degrees, and motors of 0 to 65,535 for 0
@@ -457,7 +459,7 @@ class Cascade:
     """
 
     UNIT = 0.12 / 65535.0  # N
-    MOST = 1.27 * 65535.0  # of a motor: the whole PWM at 3.4 V gives that share of 0.12 N
+    MOST = 1.27 * 65535.0  # of a motor: full PWM at 3.4 V yields this share of 0.12 N
 
     def __init__(self, vehicle, n):
         self.vehicle = vehicle
@@ -472,7 +474,7 @@ class Cascade:
         x, y = np.array(vehicle.rotor_positions).T
         directions = np.array(vehicle.rotor_directions)
         self.mixer = np.stack([np.ones(4), np.sign(y) / 2.0, -np.sign(x) / 2.0, directions])
-        # The firmware's height integral learns what the vehicle weighs; here it begins there.
+        # The firmware's height integral learns the vehicle's weight; here it starts with it.
         self.fallen[:, 2] = (vehicle.hover_thrust / self.UNIT - 36000.0) / 15000.0
 
     def thrusts(self, state, target, rates):
@@ -498,7 +500,7 @@ class Cascade:
         moments = error * [250.0, 250.0, 120.0] + self.spin * [500.0, 500.0, 16.7]
         moments = np.clip(moments + slowing * [2.5, 2.5, 0.0], -32767.0, 32767.0)
         motors = np.column_stack([self.thrust, moments]) @ self.mixer
-        # An excess of one motor is taken off all.
+        # The excess of one motor is subtracted from all.
         motors -= np.maximum(motors.max(axis=1, keepdims=True) - self.MOST, 0.0)
         return self.UNIT * np.maximum(motors, 0.0)
 
@@ -519,7 +521,7 @@ class Cascade:
 
 
 def closed_loop_table(logs, vehicle):
-    """Fly recorded setpoints; return how far off them it flies, beside the real flight."""
+    """Fly recorded setpoints; return the distances from them, next to those of the real flight."""
     rows = []
     for log in logs:
         part = longest_flight(log)
@@ -599,10 +601,10 @@ def print_control(vehicle):
 
 def simulated_runs(vehicle, n=10, seconds=30.0, torque=1e-4, noise=0.004, seed=0):
     """Fly the cascade along curves in turbulence, and log it as the radio does: commands and
-    response at moments of their own, each tenth sample lost.
+    response at different times, with every tenth sample lost.
 
     :param torque: standard deviation, N m, of a torque that changes with 8 Hz.
-    :param noise: of the gyro, rad/s.
+    :param noise: noise of the gyro, rad/s.
     """
     rng = np.random.default_rng(seed)
     vehicle = fast(vehicle)

@@ -1,4 +1,4 @@
-r"""The picture of docs/agents.md: success and final error over what scenarios of a suite vary.
+r"""The picture of docs/agents.md: success and final error over the quantities that a suite varies.
 
     PYTHONPATH=examples sb3-quad evaluate PID=pid geometric "RL agent=itm-recovery" \
         itm-robust RAPTOR=raptor:Raptor --suite robustness \
@@ -50,7 +50,7 @@ def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> N
             success = entry.metrics.success
             if success is not None:
                 shares.append((x, success.value, success.low, success.high))
-            # A median over the few survivors would flatter: half of the flights must survive.
+            # A median over few survivors would look too good: half of the flights must survive.
             median = entry.metrics.final_error_median
             if median is not None and entry.metrics.survival.value >= 0.5:
                 errors.append((x, max(median, LEAST_ERROR)))

@@ -1,4 +1,5 @@
-"""Ctrl-C in your own training script: the training ends after the step, and the model is saved.
+"""Ctrl-C in your own training script: the training ends after the current step, and the model is
+saved.
 
     python examples/stop_on_signal.py
 

@@ -52,7 +52,7 @@ class PIDReading(PIDExpert):
         if self._frame == "body":
             velocity = np.einsum("nji,nj->ni", rotation, velocity)
 
-        # The acceleration that the position loop asks for, and the tilt that gives it.
+        # The acceleration that the position loop commands, and the tilt that produces it.
         error = state.target - state.position
         wanted = KP * error - KD * velocity
         sin = np.sin(yaw)
@@ -70,7 +70,7 @@ class PIDReading(PIDExpert):
         wrench = np.column_stack([force, np.asarray(vehicle.inertia) * turning])
         thrusts = wrench @ vehicle.mixer_inverse.T
         low, high = vehicle.thrust_range
-        # Where a rotor would exceed its limit, all four are scaled down.
+        # If a rotor would exceed its limit, all four are scaled down.
         thrusts *= (high / np.maximum(thrusts.max(1), high))[:, None]
         half = (high - low) / 2
         actions = (np.maximum(thrusts, low) - low) / half - 1

@@ -7,8 +7,8 @@
 The vehicle hovers until the first command acts, after its delay. Its rotors then speed up and slow
 down as fast as their motor gains and limits let them (Eq. 4.1). The full model is discretized by
 direct collocation (Hermite-Simpson), and IPOPT solves it, starting from the flight of the geometric
-expert. So each time is a local minimum: it bounds what a controller can do unless another kind of
-flight is quicker. The directions are spread evenly over the sphere.
+expert. Each time is thus a local minimum: it bounds what a controller can do, unless another kind
+of flight is quicker. The directions are spread evenly over the sphere.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
     middle = problem.variable(4, n)
     durations = problem.variable(2)
 
-    # Hermite-Simpson: the state in the middle is that of a cubic, and Simpson's rule integrates.
+    # Hermite-Simpson: the state in the middle follows from a cubic, and Simpson's rule integrates.
     h = ca.horzcat(*[durations[0] / WAY] * WAY, *[durations[1] / REST] * REST)
     steps = ca.repmat(h, size, 1)
     slope = f.map(n + 1)(x, u)

@@ -4,8 +4,7 @@
     python examples/train_ppo_bc.py dagger.zip
 
 The best agent by survival of recoveries is kept as best_model.zip, with a curve of both tasks in
-evaluations*.npz. The last one hovers next to its target by an offset, which is corrected in the
-end.
+evaluations*.npz. The last one hovers at an offset from its target, which is corrected at the end.
 """
 
 import argparse

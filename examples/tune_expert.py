@@ -5,9 +5,9 @@
     sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
 
 Gains are judged by recoveries first, then by the settling time at targets 7 to 20 m away and by the
-overshoot rate, on the same episodes each time. The file holds the vehicle with the new gains, or
-with the first ones if these are as good on episodes that the search has not seen. Ctrl-C writes the
-best so far. OUTPUT.journal keeps the study, and the same command continues it.
+overshoot rate, on the same episodes each time. The file contains the vehicle with the new gains, or
+with the original ones if these are as good on episodes that the search has not seen. Ctrl-C writes
+the best so far. OUTPUT.journal keeps the study, and the same command continues it.
 """
 
 import argparse
@@ -47,8 +47,8 @@ DESCENT_STEPS = 400
 TRACKING_STEPS = 800
 RECOVERY_STEPS = 1000
 
-# Slow descents help agents that imitate the expert imprecisely. The expert itself does not need
-# them, so its own flights cannot find this gain.
+# Slow descents help agents that imitate the expert inexactly. The expert itself does not need them,
+# so its own flights cannot find this gain.
 SEARCHED = tuple(name for name in GAIN_NAMES if name != "descent_deceleration")
 RANGE = 2.0  # each gain lies between its first value divided by this and multiplied by this
 
@@ -68,7 +68,7 @@ class Lowest(Hook):
 class Objective:
     """The cost of gains, to be minimised: 1500 for crashing always, then seconds.
 
-    Sensible gains recover from nearly all starts, so most starts do not tell them apart. Of
+    Sensible gains recover from nearly all starts, so most starts do not distinguish them. Of
     ``starts`` recoveries only one in sixty is flown: those on which the first gains come closest to
     the ground. The others count as recovered.
     """
@@ -93,7 +93,7 @@ class Objective:
 
         # Ordinary recoveries find gains that crash from starts other than the hardest.
         lost = (~hard.survival).sum() / self.starts + (~recovery.survival).mean()
-        # The height tells narrow escapes from safe ones.
+        # The height distinguishes narrow escapes from safe ones.
         low = np.exp(-np.maximum(lowest.height, 0.0) / CLOSE).sum() / self.starts
         # A flight that does not settle counts as twice its length.
         never = 2 * TRACKING_STEPS * self.vehicle.control_step
@@ -127,7 +127,7 @@ def measure_expert(
 ) -> dict[str, Any]:
     """Fly ``episodes`` recoveries per seed, and as many targets 10 m away with the first seed.
 
-    A tracking flight that never comes, or never stays, within 0.1 m counts as ``time_limit``
+    A tracking flight that never gets within 0.1 m, or never stays there, counts as ``time_limit``
     control steps.
     """
     keywords: dict[str, Any] = {"vehicle": vehicle, "noise": 0.0, "max_steps": time_limit}

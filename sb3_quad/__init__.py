@@ -12,8 +12,8 @@ _is_command = "sb3_quad.cli" in sys.orig_argv or Path(sys.argv[0]).stem == "sb3-
 if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie next to this folder rather than in
-# it; an installed package holds them inside, and then this does nothing.
+# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` are next to this folder rather than in it;
+# an installed package contains them, and then this does nothing.
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():
     __path__.append(str(_checkout))

@@ -129,7 +129,7 @@ def test_its_random_numbers_follow_the_seed():
         (1, lambda gained: gained / 0.0, "advance: rewards: row 0"),
         (2, lambda failed: failed[:, None], "advance: terminated of shape"),
         (2, lambda failed: None, "advance: terminated: None"),
-        (2, lambda failed: failed + np.nan, "advance: terminated: row 0 has a number that is no"),
+        (2, lambda failed: failed + np.nan, "advance: terminated: row 0 has a number that is not"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value")
@@ -158,7 +158,7 @@ def test_what_an_integer_cannot_hold_is_refused():
     env = Rows(3)
     env.observation_space = spaces.Box(0, 255, (2,), np.uint8)
     env.begin = lambda rows: np.full((len(rows), 2), 300.7)
-    with pytest.raises(ConfigError, match=r"begin: .* row 0 has a number that is no uint8"):
+    with pytest.raises(ConfigError, match=r"begin: .* row 0 has .* is not a valid uint8"):
         env.reset()
 
 
@@ -168,7 +168,7 @@ def test_what_an_integer_cannot_hold_is_refused():
         (None, r"begin: observations: None; return an array of shape \(3, 2\)"),
         (np.zeros(2), r"begin: observations of shape \(2,\)"),
         (np.full((3, 2), np.nan), "begin: observations: row 0"),
-        ("near", "begin: observations are no numbers"),
+        ("near", "begin: observations are not numeric"),
     ],
 )
 def test_what_begin_returns_is_checked(given, says):

@@ -186,10 +186,10 @@ def test_an_own_reward_that_does_not_fit_is_named(reward, message):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"n_flights": 4.0}, "n_flights 4.0: must be a whole number of 1 to"),
+        ({"n_flights": 4.0}, "n_flights 4.0: must be a whole number from 1 to"),
         ({"n_flights": 0}, "n_flights 0"),
         ({"n_episodes": 4}, r"fly: unknown keyword 'n_episodes' \(valid: .*n_flights"),
-        ({"seed": -1}, "seed -1: must be a whole number of 0 to"),
+        ({"seed": -1}, "seed -1: must be a whole number from 0 to"),
         ({"seed": 0.5}, "seed 0.5"),
         ({"tolerances": "near"}, "tolerances 'near': must be numbers"),
         ({"tolerances": -1.0}, r"tolerances \[-1.0\]: must be greater than 0 m"),

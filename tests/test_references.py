@@ -198,7 +198,7 @@ def test_random_pieces_that_rest_do_not_turn_along_their_path():
         ("long.csv", "long.csv: takes 601 s; at most 600 s"),
         ({"waypoints": [(1e4, 0, 0), (-1e4, 0, 0)], "speed": 0.1}, "at most 600 s are possible"),
         ({"curve": "circle", "size": (1e4, 1e4, 0), "speed": 0.1}, "at most 600 s are possible"),
-        ({"waypoints": [(0, 0, 0)]}, "one alone, the start"),
+        ({"waypoints": [(0, 0, 0)]}, "the only one is the start"),
         ({"waypoints": [(1, 0, 0), (1, 0, 0)]}, "same point"),
         ({"waypoints": [(1e-60, 0, 0)]}, "reference polynomial"),
         ({"curve": "circle", "size": (0.1, 0.1, 0), "speed": 10}, "6.28 m/s, less than speed 10"),

@@ -1,5 +1,6 @@
-"""Cameras, and their places from which everything is in the picture. The world frame has z up;
-lengths are in m.
+"""Cameras, placed so that everything is in the picture.
+
+The world frame has z up; lengths are in m.
 """
 
 import math
@@ -10,14 +11,14 @@ import numpy as np
 from sb3_quad.base.types import FloatArray
 
 SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that distance hardly changes sizes
-WIDE = math.tan(math.radians(27.0))  # not more than that of PyBullet's window
+WIDE = math.tan(math.radians(27.0))  # at most that of PyBullet's window
 MARGIN = 0.6  # around a vehicle and its target, m, for the default vehicle
 ASIDE = math.radians(9.0)  # between the direction to the target and that of a chasing camera
 STEEPEST = math.radians(70.0)  # elevation of a chasing camera's direction
-# How far a camera that frames points looks down, and one that shows the path of a target
+# How far cameras look down: one that frames points, and one that shows a target's path
 DOWN = math.radians(5.0)
 ON_PATH = math.radians(40.0)
-LOWEST = (-math.inf, -math.inf, 0.3)  # where a camera is at least, m
+LOWEST = (-math.inf, -math.inf, 0.3)  # lower bounds of a camera's position, m
 
 
 class Lens(NamedTuple):
@@ -66,8 +67,8 @@ def broadside(points: FloatArray, down: float = DOWN) -> FloatArray:
     :param down: how far it looks down, rad.
     """
     spread = np.cov(points[:, :2].T)
-    # The direction of the least spread. Of its two signs always the same one is taken, so that
-    # similar flights are seen from the same side.
+    # The direction of the least spread, always with the same one of its two signs, so that similar
+    # flights are seen from the same side.
     x, y = np.linalg.eigh(spread)[1][:, 0]
     return direction(math.atan2(y, x) % math.pi, -down)
 
@@ -75,7 +76,7 @@ def broadside(points: FloatArray, down: float = DOWN) -> FloatArray:
 def chasing(way: FloatArray) -> FloatArray:
     """Return the direction, (3,), of a camera behind a vehicle and a little aside.
 
-    :param way: from the vehicle to its target, (3,).
+    :param way: vector from the vehicle to its target, (3,).
     """
     x, y, z = way
     elevation = math.atan2(z, math.hypot(x, y)) - ASIDE
@@ -87,7 +88,7 @@ def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens:
     """Return the nearest camera that sees balls of radius ``margin`` at all points.
 
     :param points: (n, 3), world frame, m.
-    :param forward: its direction, a unit vector, (3,), not vertical.
+    :param forward: direction of the camera, a unit vector, (3,), not vertical.
     """
     # Level: the camera does not roll.
     right = np.cross(forward, (0.0, 0.0, 1.0))

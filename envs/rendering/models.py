@@ -1,5 +1,5 @@
-"""The shapes that vehicles, targets and arrows are drawn with, as PyBullet bodies without mass that
-touch nothing. Their lengths are in units of their own.
+"""The shapes that vehicles, targets and arrows are drawn with: PyBullet bodies that have no mass
+and touch nothing. Each has its own unit of length.
 """
 
 import itertools
@@ -41,7 +41,7 @@ class Part(NamedTuple):
 def add_body(client: Client, parts: Sequence[Part], unit: float, colour: Colour) -> int:
     """Add a body of at most 16 parts, out of sight; return its number.
 
-    :param unit: of the parts' lengths, m.
+    :param unit: unit of the parts' lengths, m.
     """
     shapes, *sizes, angles = zip(*parts, strict=True)
     # PyBullet takes lists only; tuples crash it.
@@ -65,10 +65,10 @@ def rotor_radius(vehicle: Vehicle) -> float:
 
 
 def frame(places: FloatArray) -> dict[Colour, list[Part]]:
-    """Return a vehicle without its rotors, by colour: PyBullet's window gives a body one colour
-    only. The unit is the arm.
+    """Return the parts of a vehicle without its rotors, by colour: a body in PyBullet's window can
+    have only one. The unit is the arm.
 
-    :param places: of the rotors, (4, 2).
+    :param places: positions of the rotors, (4, 2).
     """
     parts = {
         DARK: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.02), 0.30, 0.14)],

@@ -69,7 +69,7 @@ def backdrop(camera: Camera, shadow: Float32Array) -> Image:
 
 
 def draw_trails(picture: Pillow.Image, trails: Sequence[Trail], camera: Camera) -> None:
-    """Draw trails into a picture by ``camera``, but for what is behind it."""
+    """Draw trails into a picture taken by ``camera``, except for what is behind it."""
     draw = ImageDraw.Draw(picture)
     width = max(2, round(LINE * picture.height))
     for points, colour in trails:

@@ -22,12 +22,12 @@ MARKER = (0.10, 0.72, 0.28, 1.0)
 FORCE = (0.86, 0.10, 0.14, 1.0)
 TORQUE = (0.55, 0.15, 0.75, 1.0)
 REFERENCE_ARM = 0.24  # of the default vehicle, m
-# Radius of the rings around a target and of a shadow, m, for a vehicle of the default one's size
+# Radius of the rings around a target and of a shadow, m, for a vehicle of the default size
 RING = 0.42
-# Drawn rotors turn so much slower than real ones, which would seem to stand or turn backwards in a
-# film.
+# Drawn rotors turn slower than real ones by this factor; in a film, real speeds would seem to stand
+# still or turn backwards.
 SLOWED = 12.0
-# How the two hoops of a target stand, (x, y, z, w)
+# Attitudes of the two hoops of a target, (x, y, z, w)
 LENGTHWISE = (0.0, 0.0, 0.0, 1.0)
 CROSSWISE = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 
@@ -47,9 +47,9 @@ class Scene:
     """Vehicles of one kind, targets, and arrows of wrenches. What it adds to a client has no mass
     and touches nothing.
 
-    :param vehicle: that is drawn.
-    :param client: to draw in; None: one without a display, until :meth:`close`.
-    :param n_vehicles: in the scene; ``n_targets`` likewise.
+    :param vehicle: the vehicle to draw.
+    :param client: the client to draw in; None: a new one without a display, until :meth:`close`.
+    :param n_vehicles: vehicles in the scene; ``n_targets`` likewise.
     :param size: how much larger than life everything is drawn.
     """
 
@@ -66,7 +66,7 @@ class Scene:
         # Distances in pictures are multiples of the scale.
         self.scale = size * vehicle.arm_length / REFERENCE_ARM
         self._vehicles = [_VehicleBodies(vehicle, client, size) for _ in range(n_vehicles)]
-        # A target is two hoops that cross, through which a vehicle in it is seen.
+        # A target is two crossing hoops, through which a vehicle inside stays visible.
         self._hoops = [
             add_body(client, models.hoop(), RING * self.scale, MARKER) for _ in range(2 * n_targets)
         ]
@@ -106,7 +106,7 @@ class Scene:
         # Without numpy at PyBullet's build time these are flat tuples.
         bodies = np.array(pixels, np.uint8).reshape(high, wide, 4)
         bodies[..., 3] = 255 * (np.reshape(names, (high, wide)) >= 0)
-        # The bodies lie over the trails, and both over the backdrop.
+        # Bodies are drawn over trails, and both over the backdrop.
         drawn = Pillow.new("RGBA", (wide, high))
         draw_trails(drawn, trails, larger)
         drawn.alpha_composite(Pillow.fromarray(bodies))
@@ -116,7 +116,7 @@ class Scene:
         return picture
 
     def close(self) -> None:
-        """Give a client of its own back; calling it twice is fine."""
+        """Close the client; calling it twice is fine."""
         self.client.close()
 
 
@@ -129,7 +129,7 @@ class _VehicleBodies:
         radius = size * models.rotor_radius(vehicle)
         places = np.array(vehicle.rotor_positions) / vehicle.arm_length
         self.centres = arm * np.column_stack([places, np.full(len(places), 0.17)])
-        # A rotor's drag on the body is opposed to its sense of turning.
+        # A rotor's drag on the body opposes its sense of rotation.
         self.senses = np.negative(vehicle.rotor_directions)
         self.frame = []
         for colour, parts in models.frame(places).items():

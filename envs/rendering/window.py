@@ -15,7 +15,7 @@ from sb3_quad.envs.rendering.camera import Camera
 
 
 class Client:
-    """PyBullet's functions in a simulation of its own: ``client.stepSimulation()`` is
+    """PyBullet's functions, bound to a new simulation: ``client.stepSimulation()`` is
     ``p.stepSimulation(physicsClientId=client.number)``.
 
     :param mode: ``p.DIRECT``, without a display, or ``p.GUI``.
@@ -33,7 +33,7 @@ class Client:
         return function
 
     def close(self) -> None:
-        """End the simulation, unless that has been done, as by shutting the window."""
+        """End the simulation, unless it has ended already, for example with its window."""
         if self.isConnected():
             self.disconnect()
 
@@ -52,7 +52,7 @@ def open_window(width: int, height: int) -> Client:
     sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
     with raised_as(
         ConfigError,
-        "render_mode 'human': PyBullet could not open its window, of which a process may have one; "
+        "render_mode 'human': PyBullet could not open its window, of which a process can have one; "
         "use render_mode='rgb_array'",
     ):
         client = Client(p.GUI, options=f"--width={width} --height={height} {sky}")
@@ -78,8 +78,9 @@ def start_drawing(client: Client) -> None:
 
 
 def point_window(client: Client, camera: Camera, towards: FloatArray) -> None:
-    """Look through a window from where ``camera`` is, and draw it; ``towards``: what it looks at,
-    (3,).
+    """Give a window the view of ``camera``, and draw it.
+
+    :param towards: the point that it looks at, (3,).
     """
     forward = camera.axes[0]
     distance = np.linalg.norm(towards - camera.eye)

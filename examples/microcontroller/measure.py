@@ -5,9 +5,9 @@
     python examples/microcontroller/measure.py crazyflie-robust --optimize=-O2
 
 It needs arm-none-eabi-gcc with newlib and qemu-system-arm (Debian: gcc-arm-none-eabi,
-libnewlib-arm-none-eabi, qemu-system-arm). `-icount shift=0` lets each instruction take a nanosecond
-of virtual time, and a timer of the chip reads it. QEMU counts instructions, not cycles: waiting for
-flash, and the three cycles that a Cortex-M4 takes for a multiply-add, are not in them.
+libnewlib-arm-none-eabi, qemu-system-arm). With `-icount shift=0`, each instruction takes a
+nanosecond of virtual time, which a timer of the chip reads. QEMU counts instructions, not cycles:
+it does not count waiting for flash, or the three cycles that a Cortex-M4 takes for a multiply-add.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from sb3_quad.export.policy import export_policy
 from sb3_quad.simulation.settings import FlightSettings
 
 HERE = Path(__file__).resolve().parent
-# The firmware of the Crazyflie is compiled so.
+# The firmware of the Crazyflie is compiled with these flags.
 CORE = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-fno-math-errno")
 LINK = ("--specs=rdimon.specs", "-nostartfiles", "-ffunction-sections", "-Wl,--gc-sections")
 QEMU = (
@@ -92,7 +92,7 @@ def count(exported, optimize="-Os", n=1000):
 
 
 def sizes(exported):
-    """Return multiplications, tanh units, ReLU units and 1, by what an export says of itself."""
+    """Return multiplications, tanh units, ReLU units and 1, from the metadata of an export."""
     layers, _, hidden = exported.metadata["network"].partition(", hidden layers ")
     numbers = [int(number) for number in layers.split("-")]
     products = sum(a * b for a, b in itertools.pairwise(numbers))
@@ -135,7 +135,7 @@ def main():
     terms = np.array([sizes(exported) for exported in exports.values()], float)
     counts = np.array([count(exported, options.optimize) for exported in exports.values()])
     if not options.agents:
-        # Relative errors count, so that small networks are as right as large ones.
+        # Minimise relative errors, so that small networks are as accurate as large ones.
         table = np.linalg.lstsq(terms / counts[:, None], np.ones(len(counts)), rcond=None)[0]
         product, tanh, relu, call = table
         print(

@@ -24,14 +24,14 @@ MAX_DISTANCE = 30.0  # m; farther from its target a flight is out of range
 ARRIVED = 0.1  # m
 SETTLED = 200  # control steps after which the errors of a curve count
 # The motion of a target at rest: position, velocity and acceleration in each control step of a
-# flight and a second after it, which is what an agent sees of the future.
+# flight and for a second after it, as far as an agent sees ahead.
 REST = np.zeros((STEPS + 101, 3, 3))
 QUARTER = np.pi / 2.0
 # Sines along x, y and z: sizes (m), multiples of a rate, phases; and greatest speed over that rate.
 SINES = {
     "figure_eight": ((2.0, 1.0, 0.0), (1, 2, 0), (0.0, 0.0, 0.0), np.sqrt(8.0)),
     "circle": ((2.0, 2.0, 0.0), (1, 1, 0), (QUARTER, 0.0, 0.0), 2.0),
-    # That of crazyflow's FigureEightEnv, which takes 10 s: 0.889 m/s.
+    # The curve of crazyflow's FigureEightEnv, which takes 10 s: 0.889 m/s
     "vertical_eight": ((1.0, 0.0, 0.5), (1, 0, 2), (0.0, 0.0, 0.0), np.sqrt(2.0)),
 }
 CURVES = ("figure_eight_1", "figure_eight_2", "figure_eight_4", "circle_2")
@@ -64,10 +64,10 @@ class State:
 
 @dataclass
 class Setpoint:
-    """Where n vehicles should be, and how that moves, in the world frame.
+    """Where n vehicles should be, and how these points move, in the world frame.
 
     Positions (n, 3), m, velocity (3,), m/s, and the accelerations (steps, 3), m/s², from this
-    control step on. No heading is asked for.
+    control step on. No heading is commanded.
     """
 
     position: Array
@@ -126,7 +126,7 @@ class ExportedAgent:
         )
         facts = self._session.get_modelmeta().custom_metadata_map
         rotors = facts["rotors"]
-        # In how many control steps it sees the acceleration of its reference.
+        # How many control steps ahead it sees the acceleration of its reference.
         ahead = re.findall(r"of the reference in (\d+) control steps", facts["observation"])
         self._ahead = [int(steps) for steps in ahead]
         signs = []
@@ -158,7 +158,7 @@ class ExportedAgent:
 class Raptor:
     """RAPTOR's policy (package ``foundation-policy``), used as in examples/raptor.py.
 
-    As its authors do, it sees position and velocity relative to the setpoint. Where rotors form a
+    As with its authors, it sees position and velocity relative to the setpoint. If rotors form a
     plus, it sees the vehicle and the world turned by 45°.
     """
 
@@ -250,17 +250,18 @@ def observe(state: State, setpoint: Setpoint) -> Array:
 
 
 def check_rotors(make: Callable[[int], Simulator]) -> None:
-    """Speed up one rotor at a time in hover, and check that the body turns as its place says.
+    """Speed up one rotor at a time in hover, and check that the body turns as expected from its
+    place.
 
     :raises SystemExit: if it turns in another way.
     """
     simulator = make(4)
-    # The difference to a plain hover takes out what the wind does.
+    # The difference from a plain hover removes the effect of the wind.
     hovering = _after_hover(simulator, 0.0)
     turned = _after_hover(make(4), 0.2)
     rates = turned.body_rates - hovering.body_rates
     climb = turned.velocity[:, 2] - hovering.velocity[:, 2]
-    # Rotors of a plus turn it about one of two axes only.
+    # Rotors of a plus turn it about only one of the two axes.
     rates[np.abs(rates) < 1e-3 * np.abs(rates).max()] = 0.0
     x, y, yaw = simulator.rotors.T
     if not np.array_equal(np.sign(rates), np.sign(np.stack([y, -x, yaw], axis=1))):
@@ -311,7 +312,7 @@ def fly(
     distance, tilt = TASKS[task]
     near = errors <= ARRIVED
     first = np.where(near.any(axis=0), near.argmax(axis=0) + 1, np.inf)
-    # Steps at the end of the flight that are near without a break.
+    # Number of steps at the end of the flight that are near without a break
     near_at_the_end = np.logical_and.accumulate(near[::-1]).sum(axis=0)
     last = np.where(near[-1], STEPS + 1 - near_at_the_end, np.inf)
     succeeded = ~lost & (errors[-1] <= distance) & (state.rotation[:, 2, 2] >= np.cos(tilt))
@@ -338,7 +339,7 @@ def follow(
     delay: int,
     moving: bool = False,
 ) -> Following:
-    """Follow a curve from a hover at its start; parameters as those of ``fly``.
+    """Follow a curve from a hover at its start; parameters are as for ``fly``.
 
     :param moving: begin with the curve's velocity instead, level.
     """
@@ -363,7 +364,7 @@ def _errors(
 ) -> tuple[Array, State]:
     """Fly, and return the distances after each control step, (STEPS, n), m, and the last state.
 
-    :param motion: of the target, as from ``make_curve``.
+    :param motion: motion of the target, as from ``make_curve``.
     """
     rng = np.random.default_rng([seed, 1])
     simulator.reset(start)
@@ -377,7 +378,7 @@ def _errors(
         setpoint = Setpoint(target + position, velocity, motion[step:, 2])
         factors = 1.0 + noise * rng.standard_normal((simulator.n, 18))
         observation = observe(state, setpoint) * factors
-        # The simulator may give anything for a vehicle that has crashed, also NaN.
+        # The simulator may return anything for a vehicle that has crashed, even NaN.
         observation[lost] = 0.0
         commands.append(policy(observation.astype(np.float32), state, setpoint))
         command = np.full((simulator.n, 4), simulator.hover)
@@ -511,9 +512,9 @@ def main(
 ) -> None:
     """Run a script's command: check the rotors, fly, print the table.
 
-    :param others: controllers to compare with, by name; each is made for a simulator, or is
-        none that flies there.
-    :param curves: those that it follows if none are named.
+    :param others: factories of controllers to compare with, by name; each gets a simulator, and
+        returns None if its controller cannot fly there.
+    :param curves: the curves to follow if none are named.
     """
     options = parse_options(description, [*cells], [*others], curves)
     header = HEADER
@@ -541,7 +542,8 @@ def main(
                 conditions += f", {10 * delay} ms delay"
             how = (options.seed, options.noise, delay)
             for name, policy in policies.items():
-                # A controller may bring a simulator that takes its commands, without a delay.
+                # A controller may bring its own simulator, which takes its commands without a
+                # delay.
                 flown = getattr(policy, "simulator", simulator)
                 if delay > 0 and flown is not simulator:
                     continue

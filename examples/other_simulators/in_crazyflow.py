@@ -1,6 +1,6 @@
 r"""Fly exported agents in crazyflow (TU Munich).
 
-Its own controller and RAPTOR's policy fly there, too, to compare with.
+Its own controller and RAPTOR's policy fly there, too, for comparison.
 
     sb3-quad export any-quadcopter --format onnx --vehicle cf2x_L250 \
         -o any-quadcopter@cf2x_L250.onnx
@@ -29,9 +29,9 @@ FREQUENCY = 500  # Hz, of its physics
 
 
 class Crazyflow:
-    """n vehicles ``drone`` in n of its worlds.
+    """n vehicles of the type ``drone`` in n of its worlds.
 
-    :param control: what commands are: rotor speeds, or crazyflow's setpoints (n, 16).
+    :param control: the kind of commands: rotor speeds, or crazyflow's setpoints (n, 16).
     """
 
     ground = 0.02  # m: half the height of its collision box
@@ -45,7 +45,7 @@ class Crazyflow:
         self._curve = np.asarray(parameters["rpm2thrust"], np.float64).ravel()
         self._limits = float(parameters["thrust_min"]), float(parameters["thrust_max"])
         self.hover = float(parameters["mass"]) * 9.81 / 4.0
-        # Signs of the moments that each rotor's thrust makes about the three axes.
+        # Signs of the moments of each rotor's thrust about the three axes
         roll, pitch, yaw = np.asarray(parameters["mixing_matrix"])
         arm = float(np.ravel(parameters["L"])[0])
         self.rotors = np.stack([-pitch * arm, roll * arm, yaw], axis=1)
@@ -96,7 +96,7 @@ class Crazyflow:
 class Mellinger:
     """crazyflow's own controller, with its gains; its commands are setpoints.
 
-    It runs inside of crazyflow: position at 100 Hz, attitude at 500 Hz.
+    It runs inside crazyflow: position at 100 Hz, attitude at 500 Hz.
     """
 
     def __init__(self, simulator: Crazyflow) -> None:

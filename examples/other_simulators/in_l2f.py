@@ -1,6 +1,6 @@
 r"""Fly exported agents in l2f, the simulator of RAPTOR and of Learning to Fly.
 
-RAPTOR's policy flies there, too, to compare with.
+RAPTOR's policy flies there, too, for comparison.
 
     sb3-quad export any-quadcopter --format onnx --vehicle l2f_crazyflie \
         -o any-quadcopter@l2f_crazyflie.onnx
@@ -42,7 +42,7 @@ class L2F:
         self._vector.initialize_rng(self._device, self._rng, 0)
         self._vector.initialize_environment(self._device, self._environment)
         self._vector.initial_parameters(self._device, self._environment, self._parameters)
-        # Mass and rotors of the vehicle can be read as JSON only.
+        # Mass and rotors of the vehicle can only be read as JSON.
         single = l2f.Environment()
         parameters = self._parameters.parameters[0]
         l2f.initialize_environment(self._device, single)

@@ -3,7 +3,7 @@ r"""Fly the same exported agents and RAPTOR's policy, on the same starts, in our
     python examples/other_simulators/in_own.py any-quadcopter@cf2x_L250.onnx \
         --cells cf2x_L250 --delay 0 1
 
-RotorPy's SE3 controller flies RotorPy's vehicles where RotorPy is installed.
+RotorPy's SE3 controller flies RotorPy's vehicles if RotorPy is installed.
 
 A cell is a vehicle file of that name. You give the delay here; the file's own delay is ignored.
 """

@@ -1,6 +1,6 @@
 r"""Fly exported agents in RotorPy (University of Pennsylvania).
 
-Its SE3 controller and RAPTOR's policy fly there, too, to compare with.
+Its SE3 controller and RAPTOR's policy fly there, too, for comparison.
 
     sb3-quad export any-quadcopter --format onnx --vehicle rotorpy_crazyflie \
         -o any-quadcopter@rotorpy_crazyflie.onnx
@@ -31,7 +31,7 @@ torch.set_num_threads(1)
 
 
 def to_fields(state: State) -> dict[str, torch.Tensor]:
-    """A state as RotorPy has it."""
+    """A state in RotorPy's form."""
     fields = {
         "x": state.position,
         "v": state.velocity,
@@ -76,7 +76,8 @@ class RotorPy:
 
     :param wind: function from the number of vehicles to one of RotorPy's wind profiles.
     :param payload: greatest mass of AdaptiveQuadBench's payload, as a share of the vehicle's mass.
-    :param weakness: greatest error of a rotor's thrust in either direction, as a share of it.
+    :param weakness: greatest error of a rotor's thrust in either direction, as a share of the
+        thrust.
     """
 
     def __init__(
@@ -168,7 +169,7 @@ class SE3:
 
 
 def gusts(n: int) -> BatchedSinusoidWind:
-    """Sines of 2 m/s and 0.3 Hz along each axis, each with a phase of its own."""
+    """Sines of 2 m/s and 0.3 Hz along each axis, each with its own phase."""
     phase = torch.tensor(np.random.default_rng(0).uniform(0.0, 1.0 / 0.3, (n, 3)))
     return BatchedSinusoidWind(torch.full((n, 3), 2.0), torch.full((n, 3), 0.3), phase)
 

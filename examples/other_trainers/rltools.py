@@ -3,12 +3,12 @@ r"""Train a Crazyflie by RLtools' L2F trainer, and fly its policy from the thesi
     git clone https://github.com/rl-tools/rl-tools && git -C rl-tools checkout 9acdf5c
     OMP_NUM_THREADS=1 python examples/other_trainers/rltools.py rl-tools --seeds 0 1 2
 
-You need g++. The trainer is compiled as the README of its zoo says, for this processor and without
-evaluations along the way. It trains for as many steps as its authors set, unless you give
-``--steps``. The CPU seconds are those of its whole process; compiling does not count.
+You need g++. The trainer is compiled as in the README of its zoo, for this processor and without
+evaluations during the training. It trains for the number of steps that its authors set, unless you
+give ``--steps``. The CPU seconds are those of its whole process, without compiling.
 
-The trainer's own episodes last 10 s at most and end 1 m off a moving reference; their mean length,
-of 100, is as it prints it. Its policy then flies here, on the vehicle that it was trained for
+The trainer's own episodes last 10 s at most and end 1 m off a moving reference; it prints their
+mean length, over 100 episodes. Its policy then flies here, on the vehicle that it was trained for
 (l2f_zoo.yaml), with the noise of the thesis and without delay, for 15 s. Gentle starts are level
 and at rest at the target; recoveries are from the thesis's starts.
 """
@@ -33,20 +33,20 @@ from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATI
 Array = npt.NDArray[Any]
 VEHICLE = load_vehicle(Path(__file__).with_name("l2f_zoo.yaml"))
 GENTLE = {"random_attitude": False, "velocity_std": 0.0, "body_rates_std": 0.0}
-HOLD = 2  # control steps of 10 ms in one of the trainer's
+HOLD = 2  # our control steps of 10 ms in one of the trainer's
 LAST_ACTIONS = 2  # how many of them it sees
 FLAGS = ("-std=c++17", "-Ofast", "-march=native")
 NUMBERS = re.compile(r"memory\[\] = \{(.*?)\};\s*using SHAPE = [^<]*<unsigned long, ([\d, ]+)>")
 
 
 def rational_tanh(x: Array) -> Array:
-    """The Padé approximant of tanh, constant from ±3 on, which its SAC has in its layers."""
+    """The Padé approximant of tanh, constant from ±3 on, which its SAC uses."""
     x = x.clip(-3.0, 3.0)
     return x * (27.0 + x**2) / (27.0 + 9.0 * x**2)
 
 
 def relu(x: Array) -> Array:
-    """The activation that its TD3 has in its layers."""
+    """The activation that its TD3 uses."""
     return x.clip(0.0)
 
 
@@ -55,15 +55,15 @@ ALGORITHMS: dict[str, tuple[str, Callable[[Array], Array]]] = {
     "sac": ("sac_tiny.h", rational_tanh),
     "td3": ("td3.h", relu),
 }
-# Of a flight: the last actions, the newest first, and how often the newest was flown.
+# The state of a flight: the last actions, the newest first, and how often the newest was flown
 State = tuple[Array, int]
 
 
 class Policy:
-    """A policy that the trainer has saved, with ``predict`` as SB3's recurrent policies have it.
+    """A policy that the trainer has saved, with ``predict`` as in SB3's recurrent policies.
 
     :param checkpoint: its ``checkpoint.h``.
-    :raises SystemExit: if it does not give the outputs that the file has for its example.
+    :raises SystemExit: if it does not reproduce the outputs of the example in the file.
     """
 
     def __init__(self, checkpoint: Path, activation: Callable[[Array], Array]) -> None:
@@ -110,7 +110,7 @@ class Policy:
             inputs = np.hstack([part.reshape(n, -1) for part in parts])
             speeds = np.concatenate([self._evaluate(inputs)[:, None], speeds[:, :-1]], axis=1)
             flown = 0
-        # The thrust is the square of a speed from 0 to 1.
+        # The thrust goes with the square of a speed from 0 to 1.
         shares = ((speeds[:, 0] + 1.0) / 2.0) ** 2
         return (2.0 * shares - 1.0).astype(np.float32), (speeds, flown + 1)
 
@@ -118,8 +118,8 @@ class Policy:
 def compile_trainer(clone: Path, algorithm: str, steps: int | None, folder: Path) -> Path:
     """Compile the trainer of a clone into a folder.
 
-    :param steps: of the training; None: as its authors set it.
-    :raises SystemExit: without a clone or a compiler that can.
+    :param steps: steps of the training; None: as its authors set them.
+    :raises SystemExit: without a clone or a suitable compiler.
     """
     zoo = clone / "src" / "rl" / "zoo"
     if not (zoo / "zoo.cpp").is_file():

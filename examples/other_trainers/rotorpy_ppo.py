@@ -5,13 +5,13 @@ r"""Train a Crazyflie by PPO in RotorPy's environment, and fly it there from the
 
 It trains as RotorPy's example of PPO does: 512 vehicles with masses and rotors that vary a little,
 thrust and attitude as actions, the true state as observation, SB3's PPO with 32 steps a rollout and
-batches of 1,024. It trains for as many CPU seconds as you give. They count the environments and the
-training; imports and flights afterwards do not count.
+batches of 1,024. It trains for as many CPU seconds as you give. These include the environments and
+the training, but not imports and the flights afterwards.
 
-Its own episodes start at rest up to 2 m from the target along each axis, and end after 5 s or 4 m
-off. Their mean length and the distance at the end are of 240 of them, with RotorPy's nominal
-vehicle. Recoveries are those of examples/other_simulators: in RotorPy, 15 s, without noise and
-delay. No package of ours is needed.
+Its own episodes start at rest up to 2 m from the target along each axis, and end after 5 s or at a
+distance of 4 m. Their mean length and final distance are those of 240 episodes with RotorPy's
+nominal vehicle. Recoveries are those of examples/other_simulators: in RotorPy, 15 s, without noise
+and delay. No package of ours is needed.
 """
 
 import argparse

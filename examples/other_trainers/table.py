@@ -1,4 +1,4 @@
-"""The table that the scripts for the trainers of others print, a row a seed."""
+"""The table that the scripts for other trainers print, with a row for each seed."""
 
 HEADER = (
     "| trainer | seed | CPU s | its own episodes: length, of 500 "

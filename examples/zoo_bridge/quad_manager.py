@@ -176,7 +176,7 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         return model
 
     def learn(self, model: Any) -> None:
-        """Train; the zips say that their agent flies as it is evaluated."""
+        """Train; the zips record the flight settings of the evaluations."""
         if self._env_id in ENVIRONMENTS:
             flown = {"task": ENVIRONMENTS[self._env_id], **self.eval_env_kwargs}
             FlightSettings().with_changes(**flown).write_into(model)

@@ -39,36 +39,35 @@ class Tape(Protocol):
     """Records flights of n environments, and carries gradients back through their steps.
 
     An environment that ``APG`` can train on has ``record(n_steps, substeps)``, which returns one.
-    A recording is :meth:`reset`, then :meth:`step` once for each step; the backward pass is
+    To record, call :meth:`reset`, then :meth:`step` once for each step. For the backward pass, call
     :meth:`begin`, then :meth:`backward` once for each step, the last one first.
     """
 
     def reset(self, carry_on: bool) -> Float32Array:
         """Begin a recording; return the observations, (n, ...).
 
-        :param carry_on: whether to continue the flights of the last recording where they can be.
+        :param carry_on: whether to continue the flights of the last recording where possible.
         """
 
     def step(self, actions: Float32Array) -> Float32Array:
-        """Take a step by actions (n, a); return the observations after it, (n, ...)."""
+        """Take a step with actions (n, a); return the observations after it, (n, ...)."""
 
     def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return the sum of the rewards, the length, and whether it was lost, of each flight."""
+        """Return each flight's sum of rewards, its length, and whether it was lost, (n,) each."""
 
     def begin(self, cost: FlightCost) -> float:
         """Begin the backward pass; return the mean cost of a step.
 
-        :param cost: that of a quadcopter's states. An environment with a cost of its own ignores
-            it.
+        :param cost: the cost of a quadcopter's states; an environment with its own cost ignores it.
         """
 
     def backward(self, step: int, grad_observation: Float32Array) -> FloatArray:
         """Return the gradient of the mean cost with respect to the actions of a step, (n, a).
 
-        It includes what these actions do in later steps, of which the tape keeps account.
+        It includes the effect of these actions on later steps, which the tape tracks.
 
-        :param grad_observation: the gradient with respect to the observations after the step,
-            (n, ...). It comes through the actions that the policy took on them.
+        :param grad_observation: the gradient with respect to the observations after the step, (n,
+            ...). It arises from the actions that the policy computed from them.
         """
 
 
@@ -77,12 +76,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
     The equations of motion are known and smooth, so the gradient of a flight's cost with respect to
     the policy's weights can be computed exactly: the flight is recorded, then the derivative is
-    carried back through policy, observation, delay, rotors and rigid body. There is no critic,
-    no teacher and no exploration. Relatives are backpropagation through time (Werbos, 1990),
+    carried back through policy, observation, delay, rotors and rigid body. There is no critic, no
+    teacher and no exploration. Related methods are backpropagation through time (Werbos, 1990),
     SHAC (Xu et al., 2022), which adds a critic to short windows, and Heeg, Song and Scaramuzza,
     "Learning Quadrotor Control From Visual Features Using Differentiable Simulation" (2024).
 
-    In each update every environment flies ``n_steps`` control steps by the mean action of the
+    In each update every environment flies ``n_steps`` control steps with the mean action of the
     policy. The optimiser then takes one step along the gradient of the mean cost. It is
     :class:`~sb3_quad.algorithms.soap.SOAP`, unless ``policy_kwargs`` has an ``optimizer_class``.
     Only the actor learns; the critic stays as it is.
@@ -96,34 +95,35 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
     :param learning_rate: A rate, or a schedule of the remaining progress. The default falls to
         a fiftieth.
-    :param n_steps: Control steps of each flight in an update. Whole flights take some 300.
-    :param max_grad_norm: The gradient is scaled down to this length where it is longer.
-    :param max_row_ratio: At each step the gradient with respect to the actions of an environment is
-        scaled down to this many times the median length over all of them. With a vehicle for each
-        episode a few flights on the verge of chaos outweigh the others without it; 3 is a good
-        value. None: it is left as it is.
-    :param stats_window_size: Flights that ``rollout/`` averages over; at least all of an update.
+    :param n_steps: Control steps of each flight in an update. A whole flight takes about 300.
+    :param max_grad_norm: The gradient is scaled down to this norm if it is larger.
+    :param max_row_ratio: At each step, the gradient with respect to the actions of each environment
+        is limited to this many times the median norm over all environments. Where each episode has
+        another vehicle, a few flights on the verge of chaos would otherwise outweigh all others; 3
+        is a good value. None: no limit.
+    :param stats_window_size: Number of flights that the values of ``rollout/`` average over; at
+        least all flights of an update.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. From scratch, whole flights learn badly: clone an expert first (DAgger), or
-        fly short windows with ``carry_on``.
+        shipped agent. Learning whole flights from scratch works badly: clone an expert first
+        (DAgger), or fly short windows with ``carry_on``.
     :param carry_on: Let each update continue the flights of the one before. A flight that crashed
         or reached its time limit begins again.
     :param cost: The cost of each control step, (steps, n), as a function of
-        :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved:
-        give it to ``load``, too.
-    :param body_rates_coef: Weight of
-        :func:`~sb3_quad.algorithms.flight_cost.body_rates_cost`, which is added to the cost: for
-        agents that swing at the target where motors are slow or delays are long.
-    :param low_force_coef: Weight of
-        :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which is added to the cost: for
-        vehicles whose firmware takes a thrust that stays low for a crash.
-    :param substeps: Physics steps in a control step of the training; None: those of the vehicle.
+        :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved: give it
+        to ``load`` as well.
+    :param body_rates_coef: Weight of :func:`~sb3_quad.algorithms.flight_cost.body_rates_cost`,
+        which is added to the cost: for agents that swing around the target because motors are slow
+        or delays are long.
+    :param low_force_coef: Weight of :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which
+        is added to the cost: for vehicles whose firmware interprets persistently low thrust as a
+        crash.
+    :param substeps: Physics steps per control step during training; None: the vehicle's.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
-    :raises TrainingError: a gradient that is not finite, if only of one environment.
+    :raises TrainingError: a non-finite gradient, even in a single environment.
     """
 
     policy_aliases = PPO.policy_aliases
-    # Algorithms that have a critic would take its own values for theirs.
+    # If they were saved, algorithms with a critic would adopt these placeholders.
     _not_saved = ("cost", "_tape", "_recorded_policy", "gamma", "gae_lambda", "ent_coef", "vf_coef")
     _tape: Tape
 
@@ -188,10 +188,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             raise ConfigError(
                 f"cost {self.cost!r}: must be a function; leave it out for the default"
             )
-        # A zip may say so already, of a cost that it does not hold.
+        # A zip may have set this already, for a cost that it does not contain.
         self.own_cost |= self.cost is not flight_cost
         super()._setup_model()
-        # policy_kwargs do not name SOAP, so that a zip loads where this package is missing.
+        # SOAP stays out of policy_kwargs, so that a zip loads where this package is missing.
         if "optimizer_class" not in self.policy_kwargs:
             policy = self.policy
             rate = self.lr_schedule(1.0)
@@ -200,7 +200,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
 
     def will_clone(self) -> bool:
-        """Return False: it has no expert."""
+        """Return False: APG has no expert."""
         return False
 
     def learn(
@@ -222,14 +222,14 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         if isinstance(env, VecMonitor):
             if env.results_writer is not None:
                 raise ConfigError(
-                    "VecMonitor: no flight of APG passes it, so that its file would stay empty;"
+                    "VecMonitor: APG's flights bypass it, so its file would stay empty;"
                     " remove filename"
                 )
             env = env.venv
         if env is not env.unwrapped:
             raise ConfigError(
-                f"{type(env).__name__}: APG differentiates the environment below its wrappers, and"
-                " would leave this one out; remove it, and give an own reward as a cost"
+                f"{type(env).__name__}: APG differentiates the environment below its wrappers, so"
+                " this one would have no effect; remove it, and give a reward of your own as a cost"
             )
         if not hasattr(env, "record"):
             raise ConfigError(
@@ -261,7 +261,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly ``n_rollout_steps`` steps by the mean action of the policy, and record them."""
+        """Fly ``n_rollout_steps`` steps with the mean action of the policy, and record them."""
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
         observations = self._tape.reset(self.carry_on)
@@ -269,7 +269,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         for step in range(n_rollout_steps):
             observations = self._tape.step(self._recorded_policy.forward(step, observations))
             self.num_timesteps += env.num_envs
-            # Callbacks find every flight to end with the recording.
+            # To callbacks, every flight ends with the recording.
             dones = np.full(env.num_envs, step == n_rollout_steps - 1)
             if dones.all():
                 for info, reward, length, is_lost in zip(
@@ -277,7 +277,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 ):
                     info["episode"] = {"r": float(reward), "l": int(length), "t": 0.0}
                     info["is_success"] = not is_lost
-                # All flights end at once, and each counts.
+                # All flights end at once, and the averages must include each of them.
                 window = max(self._stats_window_size, env.num_envs)
                 self.ep_info_buffer = deque(self.ep_info_buffer or (), window)
                 self.ep_success_buffer = deque(self.ep_success_buffer or (), window)
@@ -291,14 +291,15 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     def train(self) -> None:
         """Carry the gradient of the mean cost back through the recorded flights, and descend.
 
-        :raises TrainingError: some row's gradient is not finite; the parameters stay as they were.
+        :raises TrainingError: the gradient of a row is not finite; the parameters are left
+            unchanged.
         """
-        # Layers such as dropout act as they did in the recorded flight.
+        # Layers such as dropout must act as they did in the recorded flight.
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         cost = self._tape.begin(partial(cost_and_gradients, self._whole_cost))
 
-        # What the critic or an earlier update has left; autograd adds to it.
+        # Autograd adds to gradients that the critic or an earlier update has left.
         self.policy.optimizer.zero_grad()
         # The observation after the last step leads to no action.
         grad_observations = np.zeros_like(self._last_obs)
@@ -327,13 +328,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         return cost
 
     def _limited(self, gradients: FloatArray) -> FloatArray:
-        """Return gradients (n, a), the longest shortened to ``max_row_ratio`` times the median."""
+        """Return gradients (n, a), their norms limited to ``max_row_ratio`` times the median."""
         if self.max_row_ratio is None:
             return gradients
         lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
-        # Rows that were lost have none.
+        # Rows whose flight was lost have zero gradients.
         present = lengths[lengths > 0.0]
         if present.size == 0:
             return gradients
-        longest = self.max_row_ratio * np.median(present)
-        return np.asarray(gradients * (longest / np.maximum(lengths, longest)))
+        limit = self.max_row_ratio * np.median(present)
+        return np.asarray(gradients * (limit / np.maximum(lengths, limit)))

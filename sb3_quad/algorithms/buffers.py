@@ -62,7 +62,7 @@ class ExpertRolloutBuffer(RolloutBuffer):
         if shuffle:
             rows = np.random.permutation(n_rows)  # noqa: NPY002 - as SB3 does, bit for bit
         else:
-            # Flattened, the rows of an environment follow one another.
+            # In the flattened arrays, the rows of an environment are consecutive.
             rows = np.arange(n_rows).reshape(self.n_envs, self.buffer_size).T.reshape(-1)
         if not self.generator_ready:
             stock = ("observations", "actions", "values", "log_probs", "advantages", "returns")
@@ -91,15 +91,15 @@ class ExpertRolloutBuffer(RolloutBuffer):
 
 
 class AggregatedDataset:
-    """A bounded set of (observation, expert action) pairs on the CPU; the oldest leave first.
+    """A bounded set of (observation, expert action) pairs on the CPU; the oldest are dropped first.
 
-    :param capacity: most pairs held
+    :param capacity: maximum number of pairs
     :param observation_shape: shape of one observation
     :param action_dim: length of one action
-    :param dtype: of the observations; actions are float32
+    :param dtype: dtype of the observations; actions are float32
     """
 
-    #: The least and the greatest actions, (action_dim,); those of a file must lie between
+    #: The lowest and the highest valid actions, (action_dim,) each; a file's must lie between them
     action_range: Any = (-np.inf, np.inf)
 
     def __init__(
@@ -110,10 +110,11 @@ class AggregatedDataset:
         dtype: npt.DTypeLike = np.float32,
     ) -> None:
         self.capacity = capacity
-        # np.empty takes no memory before it is written to: a large capacity costs what is in use.
+        # np.empty takes no memory until it is written to: a large capacity costs only what is in
+        # use.
         self.observations = np.empty((capacity, *observation_shape), dtype)
         self.actions = np.empty((capacity, action_dim), np.float32)
-        self.added = 0  # pairs since it was empty
+        self.added = 0  # pairs added since it was last empty
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
@@ -125,7 +126,7 @@ class AggregatedDataset:
     def add(self, observations: AnyArray, actions: Float32Array) -> None:
         """Add observations (n, ...) and actions (n, action_dim), oldest first.
 
-        Of more than ``capacity`` pairs, the last are kept.
+        If there are more than ``capacity`` pairs, the last ones are kept.
         """
         n = min(len(actions), self.capacity)
         places = (self.added + np.arange(n)) % self.capacity
@@ -149,7 +150,7 @@ class AggregatedDataset:
 
     @property
     def filled(self) -> Arrays:
-        """Views of the rows in use, in the order of memory."""
+        """Views of the rows in use, in memory order."""
         n = len(self)
         return {"observations": self.observations[:n], "actions": self.actions[:n]}
 
@@ -161,26 +162,27 @@ class AggregatedDataset:
         write_arrays(path, **self.pairs)
 
     def load(self, source: Any) -> None:
-        """Hold the pairs of recorded flights instead of the present ones.
+        """Replace the present pairs with those of recorded flights.
 
         :param source: an ``.npz`` file with the arrays ``observations`` and ``actions``, as
-            :meth:`save` and ``fly(..., record=...)`` write it, or ``obs`` and ``acts``; or several
-            flights, each with arrays of these names: a Minari dataset, a list of imitation's
-            trajectories. A flight may have one observation more than actions, its last.
-        :raises ConfigError: a file that is missing, damaged, of other spaces, or of more pairs than
-            ``capacity``; the present pairs then stay.
+            :meth:`save` and ``fly(..., record=...)`` write them, or ``obs`` and ``acts``; or
+            several flights, each with arrays of these names: a Minari dataset, or a list of
+            trajectories of imitation. A flight may have one observation more than actions, its
+            last.
+        :raises ConfigError: a file that is missing or damaged, belongs to other spaces, or has more
+            pairs than ``capacity``; the present pairs are kept.
         """
         where = type(source).__name__
         if isinstance(source, (str, Path)):
             where = str(source)
             source = [SimpleNamespace(**read_arrays(source))]
-        # Begun by no rows of the dataset's own, which arrays of other shapes do not follow.
+        # Start with zero rows of ours, so that concatenating another shape fails.
         seen = [self.observations[:0]]
         acted = [self.actions[:0]]
-        # Files of others may hold anything.
+        # Third-party files may contain anything.
         with raised_as(ConfigError, f"{where}: holds no flights that fit the environment"):
             for flight in source:
-                # imitation has the shorter names.
+                # imitation uses the shorter names.
                 short = hasattr(flight, "acts")
                 observations = np.asarray(flight.obs if short else flight.observations)
                 actions = np.asarray(flight.acts if short else flight.actions)
@@ -195,7 +197,7 @@ class AggregatedDataset:
                     f"{len(observations)} observations, {len(actions)} actions, room for"
                     f" {self.capacity}"
                 )
-            # NaN is not itself.
+            # This refuses NaN, too, which differs from itself.
             if (actions != actions.clip(*self.action_range)).any():
                 raise ValueError(f"actions from {actions.min():g} to {actions.max():g}")
             if not np.isfinite(observations).all():
@@ -209,7 +211,7 @@ def sample_rows(
 ) -> IntArray:
     """Return ``count`` row numbers below ``n_rows``.
 
-    They are whole passes in random order, then a random remainder. Without ``shuffle``: all in
+    They are whole passes in random order, then a random remainder. Without ``shuffle``, all rows in
     order, again and again.
     """
     if not shuffle:

@@ -64,13 +64,13 @@ LIMITS = {
 """Valid range of each argument of the algorithms; for weights and counts, the greatest
 holds for settings files alone."""
 History = dict[str, list[float]]
-"""The terms of an update's losses in each of its mini-batches, by logged name."""
-# Arguments that SB3 would note in a loaded model without using them
+"""The value of each term of the loss in every mini-batch of an update, by logged name."""
+# Arguments that SB3 would store in a loaded model without using them
 _OF_NEW_MODELS = {
     "initial_policy": "a zip holds its policy; give the other one to a new model",
     "demonstrations": "a loaded model of DAgger takes them by model.dataset.load(...)",
 }
-# What of an agent's ``policy_kwargs`` says how its networks compute.
+# The ``policy_kwargs`` that define what the networks compute.
 _OF_NETWORKS = (
     "net_arch",
     "activation_fn",
@@ -85,16 +85,16 @@ _OF_NETWORKS = (
 )
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
-# A limit further than this from the middle of the range is none at all.
+# A limit further than this from the middle of the range counts as unbounded.
 _UNLIMITED = 1e9
 
 
 def with_unit_actions(train: Callable[[Any], None]) -> Callable[[Any], None]:
     """Rescale actions to [-1, 1] during an update, and back after it.
 
-    The losses assume that scale, and Adam's steps do not adapt to any other: it moves all weights
-    by about the same, which is nothing to an actor that gives 1,000 to 2,000, and too much to one
-    that gives ±0.002. In a Box of [-1, 1] nothing is done.
+    The losses assume that scale. So do Adam's steps, which move every weight by about the same
+    amount: negligible for outputs of 1,000 to 2,000, far too much for ±0.002. In a Box of [-1, 1]
+    nothing changes.
     """
 
     @wraps(train)
@@ -109,7 +109,7 @@ def with_unit_actions(train: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 class ExpertMixin(BaseAlgorithm):
-    """The expert of an algorithm, and what its zips say about its flights."""
+    """Adds an expert to an algorithm, and records in its zips how its agent flies."""
 
     policy: Any
     action_space: Any
@@ -119,13 +119,13 @@ class ExpertMixin(BaseAlgorithm):
     batch_size: Any
     bc_coef: Any
     expert: ExpertLike | None = None
-    # It asks the expert, and holds the state that a recurrent one carries on.
+    # Queries the expert, and keeps a recurrent expert's state.
     _labeller: Controller | None = None
-    # What else of an algorithm no zip holds.
+    # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
 
     def set_expert(self, expert: ExpertLike | None) -> None:
-        """Learn from ``expert`` from now on, as a model must that was loaded without one.
+        """Learn from ``expert`` from now on; needed if a model was loaded without one.
 
         :raises ExpertError: an expert that does not fit the environment.
         """
@@ -144,15 +144,15 @@ class ExpertMixin(BaseAlgorithm):
     def will_clone(self) -> bool:
         """Return whether learning asks the expert: whether the cloning term ever has a weight.
 
-        A hundred samples of its schedule are taken.
+        The schedule is sampled at 101 points.
         """
         return any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Learn in another environment from now on; see SB3's ``set_env``.
 
-        The model's zips say from then on that its agent flies as this environment does, or nothing
-        of how it flies where that cannot be read. Its statistics of VecNormalize go on there.
+        From then on the model's zips record the flight settings of this environment, or none if
+        they cannot be read. The model's VecNormalize statistics continue there.
 
         :raises ConfigError: only one of the agent and the environment normalises observations.
         """
@@ -164,14 +164,15 @@ class ExpertMixin(BaseAlgorithm):
     def correct_offset(self, seed: int = 0, scale: float = 1.0) -> offset_correction.Correction:
         """Cancel the steady offset at which the agent hovers next to its targets.
 
-        Its own first layer is changed, so that its zip stays stock (thesis 4.3.1). See
-        :func:`~sb3_quad.algorithms.offset_correction.correct_offset`.
+        It changes the agent's own first layer, so the zip stays an ordinary SB3 zip (thesis 4.3.1).
+        See :func:`~sb3_quad.algorithms.offset_correction.correct_offset`.
 
-        :param seed: of the flights that measure the offset, as the model's environment flies.
+        :param seed: seed of the flights that measure the offset, with the settings of the model's
+            environment.
         :param scale: α of Eq. 4.10; below 1, the agent is quicker near its target.
         :return: the offset before and after, m.
         :raises ConfigError: no quadcopter environment; an agent that crashes on the way to targets,
-            or whose first layer does not read the 18 features. The agent is then as it was.
+            or whose first layer does not read the 18 features. The agent is left unchanged.
         """
         settings = flight_settings_of(self.env)
         if settings is None:
@@ -214,7 +215,7 @@ class ExpertMixin(BaseAlgorithm):
             self.bc_coef = FloatSchedule(self.bc_coef)
         if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
             raise ConfigError(
-                f"policy {self.policy_class.__name__}: {type(self).__name__} has none of this kind;"
+                f"policy {self.policy_class.__name__}: {type(self).__name__} does not support it;"
                 " give an agent of another algorithm as expert=... to a new model"
             )
         is_for_parts = issubclass(self.policy_class, self.policy_aliases["MultiInputPolicy"])
@@ -236,7 +237,7 @@ class ExpertMixin(BaseAlgorithm):
         with one_torch_thread(compiled=True):
             super()._setup_model()  # type: ignore[safe-super]
         if self.env is not None:
-            # A zip's statistics, which are read before this, go on in the environment.
+            # The statistics of a zip, which are read before this, continue in the environment.
             if hasattr(self, STATISTICS):
                 share_statistics(getattr(self, STATISTICS), self.env, training=True)
             self._note_flight_settings()
@@ -255,7 +256,7 @@ class ExpertMixin(BaseAlgorithm):
     def set_parameters(self, *arguments: Any, **keywords: Any) -> None:
         """Take the parameters of another model by SB3's ``set_parameters``.
 
-        :raises RuntimeError: parameters of other networks, in one line.
+        :raises RuntimeError: the parameters belong to other networks; the message is one line.
         """
         try:
             super().set_parameters(*arguments, **keywords)
@@ -263,11 +264,11 @@ class ExpertMixin(BaseAlgorithm):
             raise RuntimeError(f"set_parameters: {one_line(error)}") from None
 
     def _scale_actions(self, inverse: bool = False) -> None:
-        """Rescale actions to [-1, 1] during an update. The losses assume that scale, and Adam's
-        steps do not adapt to any other.
+        """Rescale actions to [-1, 1] for an update, or back; see :func:`with_unit_actions`.
 
         :param inverse: scale them back.
-        :raises ConfigError: no limits to speak of, or an actor without a plain last layer.
+        :raises ConfigError: an action space without usable limits, or an actor without a plain last
+            layer.
         """
         factor, offset = unit_action_transform(self.action_space, inverse)
         if (factor == 1.0).all() and not offset.any():
@@ -275,7 +276,7 @@ class ExpertMixin(BaseAlgorithm):
         policy = self.policy
         buffer = self.rollout_buffer
         buffer.expert_actions = buffer.expert_actions * factor + offset
-        if policy.squash_output:  # which gives actions in [-1, 1] already
+        if policy.squash_output:  # its actions are in [-1, 1] already
             return
         buffer.actions = buffer.actions * factor + offset
         buffer.log_probs = buffer.log_probs - np.log(factor).sum()
@@ -283,7 +284,7 @@ class ExpertMixin(BaseAlgorithm):
         unfit = f"action space {self.action_space}: wrap it in RescaleAction(env, -1, 1)"
         with raised_as(ConfigError, unfit), th.no_grad():
             if getattr(policy.action_dist, "use_expln", False):
-                raise ValueError("use_expln: log_std is no logarithm of a deviation")
+                raise ValueError("use_expln: log_std is not the log of a standard deviation")
             policy.action_net.weight *= scale[:, None]
             policy.action_net.bias.mul_(scale).add_(th.as_tensor(offset, device=policy.device))
             policy.log_std += scale.log()
@@ -293,12 +294,12 @@ class ExpertMixin(BaseAlgorithm):
         if settings is not None:
             settings.write_into(self)
         elif hasattr(self, KEY):
-            delattr(self, KEY)  # those of an environment before
-        # BaseAlgorithm has them by this name, which no zip holds.
+            delattr(self, KEY)  # left by an earlier environment
+        # BaseAlgorithm keeps them as ``_vec_normalize_env``, which is not saved.
         setattr(self, STATISTICS, self._vec_normalize_env)
 
     def learn(self, *arguments: Any, **keywords: Any) -> Self:
-        """Learn as SB3 does. Compiled code leaves PyTorch one thread.
+        """Learn as SB3 does. While compiled networks learn, PyTorch has one thread.
 
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
@@ -315,7 +316,7 @@ class ExpertMixin(BaseAlgorithm):
         Call it before the step.
         """
         self._labeller = Controller.for_env(self.expert, env, self._labeller)
-        with th.enable_grad():  # SB3's loops have no gradients, which an expert may need
+        with th.enable_grad():  # SB3's loops disable gradients, which an expert may need
             return self._labeller.labels(self._last_obs, self._last_episode_starts)
 
     def _refuse_dict_observations(self) -> None:
@@ -327,13 +328,13 @@ class ExpertMixin(BaseAlgorithm):
             )
 
     def _log_update(self, history: History) -> None:
-        """Log the means of an update's terms, whose values are given by name."""
+        """Log the mean of each term of an update."""
         for name, values in history.items():
             self.logger.record(f"train/{name}", float(np.mean(values)))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _log_rollout(self, buffer: RolloutBuffer, clip_range_vf: float | None) -> None:
-        """Log what else PPO logs after an update."""
+        """Log the other values that PPO logs after an update."""
         explained_var = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
         self.logger.record("train/explained_variance", explained_var)
         if hasattr(self.policy, "log_std"):
@@ -350,7 +351,7 @@ class ExpertMixin(BaseAlgorithm):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        # Nothing of this package may be pickled: PPO.load must work where it is not installed.
+        # No object of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
         return [*super()._excluded_save_params(), *own, *self._not_saved]
 
@@ -358,10 +359,10 @@ class ExpertMixin(BaseAlgorithm):
 def unit_action_transform(
     space: spaces.Box, inverse: bool = False
 ) -> tuple[Float32Array, Float32Array]:
-    """Return factors and offsets, (a,) each, that take actions of a space to [-1, 1].
+    """Return factors and offsets, (a,) each, that map actions of a space to [-1, 1].
 
-    :param inverse: return those that take actions in [-1, 1] to the space.
-    :raises ConfigError: limits so far apart that they are none.
+    :param inverse: return those that map [-1, 1] back to the space.
+    :raises ConfigError: limits so far apart that they count as unbounded.
     """
     low, high = limits_of(space)
     half = 0.5 * high - 0.5 * low
@@ -375,11 +376,11 @@ def unit_action_transform(
 
 
 def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
-    """Return how the vehicles of an environment fly, also through wrappers that change rewards, and
-    VecNormalize, whose statistics are in a model's zips.
+    """Return the flight settings of an environment, or None if they would not describe its agents.
 
-    None: it is not of this package, or a wrapper changes observations or actions, so that an agent
-    of this environment would fly otherwise without the wrapper.
+    Wrappers may change rewards, and VecNormalize may be among them, since its statistics are in a
+    model's zips. None: the environment is not one of this package, or a wrapper changes
+    observations or actions, so that its agent would fly differently without the wrapper.
     """
     if env is None or not env.has_attr(KEY):
         return None
@@ -402,9 +403,11 @@ def policy_arguments(
 ) -> StrDict:
     """Return the ``policy_kwargs`` of a new model.
 
-    :param given: what the user gives; it holds. ``log_std_init=None`` there: no default.
-    :param initial: the model that it starts from. Where that is of the same ``family``, what says
-        how its networks compute is taken, such as its ``net_arch`` and its features extractor.
+    :param given: the user's arguments, which take precedence. ``log_std_init=None``: use no
+        default.
+    :param initial: the agent that the model starts from. If it belongs to the same ``family``, the
+        arguments that define what its networks compute are taken from it, such as ``net_arch`` and
+        the features extractor.
     :param log_std_init: the default.
     """
     arguments: StrDict = {}
@@ -421,7 +424,7 @@ def policy_arguments(
 def actor_and_critic_parameters(policy: Any) -> tuple[list[Any], list[Any]]:
     """Return the parameters of the actor and those that only the critic has.
 
-    The actor's hold what it shares with the critic.
+    Parameters that both share count as the actor's.
     """
     actor: list[Any] = []
     critic: list[Any] = []

@@ -58,33 +58,34 @@ _VALUE_CHUNK = 16384
 class DAgger(ExpertMixin, OnPolicyAlgorithm):
     """Data aggregation (DAgger): the agent flies, and learns what the expert would have done.
 
-    In every control step and every environment, independently, the expert's action flies with
-    probability β, else the agent's sampled action. Each visited observation joins a bounded dataset
-    together with the expert's action for the state *before* the step. The actor learns from
-    mini-batches of the dataset, the critic from the GAE returns of the rollout just flown. The loss
-    is Eq. 4.3, with the sign of its entropy term put right (it prints +c_H H in a loss that is
-    minimised; entropy is to be encouraged)::
+    In every control step, each environment independently flies the expert's action with probability
+    β, and otherwise an action sampled from the agent's policy. Each visited observation joins a
+    bounded dataset together with the expert's action for the state *before* the step. The actor
+    learns from mini-batches of the dataset, the critic from the GAE returns of the rollout just
+    flown. The loss is Eq. 4.3, with the sign of its entropy term corrected (the thesis prints +c_H
+    H in a loss that is minimised, although entropy is to be encouraged)::
 
         L_BC + l2_coef * 1/2 Σw² - ent_coef * H + vf_coef * value loss (Eq. 3.8)
 
     with Σw² over the weight matrices of both networks, without biases and log_std.
 
-    For any environment with a Box action space and observations that are not a Dict. Errors of
-    actions and log_std are those of actions scaled to [-1, 1]. Papers:
-    https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
+    For any environment with a Box action space and observations that are not a Dict. Action errors
+    and log_std refer to actions scaled to [-1, 1]. Papers: https://arxiv.org/abs/1011.0686
+    (DAgger); the study thesis STUD-512 (this variant).
 
-    A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from
-    generators that are seeded by it and by the updates made so far, so a resumed run continues
-    exactly as the uninterrupted one would have.
+    A run is determined by its ``seed``: the choice of who flies, the agent's samples and the
+    mini-batches come from generators seeded with it and with the number of updates made so far. A
+    resumed run therefore continues exactly as the uninterrupted one would have.
 
     The defaults are those that we recommend for hundreds of quadcopters at once; Table A.4 of the
     thesis is ``zoo_configs/thesis/dagger.yml``. Arguments that are not listed here mean what they
     mean in :class:`stable_baselines3.PPO`. ``learning_rate`` and ``clip_range_vf`` can be functions
     of the remaining progress (from 1 to 0).
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs``
-        holds ``log_std_init``, it begins at -2: sampled actions fly, and SB3's own 0 spreads them
-        over the whole action space. ``log_std_init=None``: SB3's, or that of the initial policy
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). ``log_std`` begins at -2
+        unless ``policy_kwargs`` has a ``log_std_init``: the agent flies sampled actions, which
+        SB3's default of 0 would spread over the whole action space. ``log_std_init=None``: SB3's
+        default, or the initial policy's ``log_std``
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param batch_size: Minibatch size, in pairs of the dataset; the whole dataset while it is
         smaller
@@ -92,36 +93,36 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         a rollout holds, unless ``gradient_steps`` says otherwise
     :param clip_range_vf: ε of the clipped value loss (Eq. 3.8). None: plain mean squared error
     :param ent_coef: Entropy coefficient c_H
-    :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by
-        itself, so that a large error of the critic does not hold up the actor. None: no clipping
-    :param expert: Who labels: an object with ``actions(state)`` such as ``GeometricExpert``,
-        another SB3 model, or a function from observations to actions;
-        :class:`~sb3_quad.controllers.controller.Controller` says what each is shown. Or a name as
-        YAML takes it, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
+    :param max_grad_norm: The maximum norm of the gradient, clipped separately for actor and critic,
+        so that a large error of the critic does not slow down the actor. None: no clipping
+    :param expert: What labels the states: an object with ``actions(state)`` such as
+        ``GeometricExpert``, another SB3 model, or a function from observations to actions;
+        :class:`~sb3_quad.controllers.controller.Controller` says what each of them sees. Or a name,
+        as in YAML, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
         :meth:`set_expert`, before learning continues
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. Its policy and critic are taken; so are its ``net_arch``,
-        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them
+        shipped agent. Its policy and critic are copied; so are its ``net_arch``, ``activation_fn``
+        and features extractor unless ``policy_kwargs`` gives them
     :param gradient_steps: Optimiser steps after each rollout, at most one for each row of
         ``n_epochs`` passes over it. Each takes ``batch_size`` pairs of the dataset. None:
-        ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The critic takes part in as
-        many of them as that, or in all if there are fewer, each with an equal share of its passes
+        ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The critic is updated in that
+        many of them, or in all if there are fewer, each time on an equal share of its passes
     :param beta: β of the first rollout, from 0 to 1
     :param beta_decay: How much β loses with every rollout
     :param beta_final: Where β stops falling
-    :param bc_loss: ``"nll"``, Eq. 3.12, learns the standard deviation too; ``"mse"``, on the mean
-        alone, leaves it to ``log_std_init`` and ``ent_coef``; so do ``"huber"``, squared up to 0.05
-        and linear beyond, which is more exact where the expert is smooth, and ``"huber_mse"``, that
-        and three times the squared error
-    :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
+    :param bc_loss: ``"nll"`` (Eq. 3.12) also learns the standard deviation. The others compare mean
+        actions only, and leave the deviation to ``log_std_init`` and ``ent_coef``: ``"mse"``, the
+        squared error; ``"huber"``, quadratic up to 0.05 and linear beyond, which is more exact
+        where the expert is smooth; ``"huber_mse"``, the same plus three times the squared error
+    :param log_std_min: log_std never falls below this; with ``"nll"`` alone it would collapse
     :param l2_coef: c_L2
-    :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only,
-        as the thesis trains
+    :param dataset_capacity: Maximum number of pairs; the oldest are dropped first. 0: the current
+        rollout only, as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
         prepares them ("chronologically", 4.2.3)
-    :param demonstrations: a file of flights that the dataset begins with, as ``dataset.load`` takes
-        it. With ``beta=0`` no expert is needed: the agent clones these flights alone, and its own
-        flights train the critic
+    :param demonstrations: a file of recorded flights that the dataset begins with, in a format that
+        ``dataset.load`` reads. With ``beta=0`` no expert is needed: the agent clones these flights
+        alone, and its own flights train the critic
     :raises ConfigError: an argument out of range, or observations that are a Dict
     :raises ExpertError: an expert that does not fit the environment
     """
@@ -201,7 +202,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.shuffle = shuffle
         self.expert = None
         self._n_rollouts = 0
-        # Seeds the generators where no seed is given.
+        # Seeds the generators if no ``seed`` is given.
         self._entropy = secrets.randbits(63)
 
         if expert is not None:
@@ -218,7 +219,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._refuse_dict_observations()
-        # A zip of PPO names PPO's.
+        # A zip of PPO names PPO's buffer class.
         self.rollout_buffer_class = ExpertRolloutBuffer
         super()._setup_model()
         if self.beta == 0.0:
@@ -238,6 +239,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             raise ConfigError(
                 f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy"
             )
+        # A new actor acts in [-1, 1]; bring it to the units of the action space.
         self._scale_actions(inverse=True)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
@@ -253,18 +255,18 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.dataset.action_range = limits_of(self.action_space)
 
     def will_clone(self) -> bool:
-        """Return whether learning asks the expert; else it clones the flights it was given."""
+        """Return whether learning needs the expert; otherwise it clones recorded flights."""
         return self.expert is not None or self.beta > 0.0 or len(self.dataset) == 0
 
     @property
     def current_beta(self) -> float:
-        """β of the present rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
+        """β of the current rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
         return max(self.beta - self.beta_decay * self._n_rollouts, self.beta_final)
 
     def set_beta(self, beta: float) -> None:
         """Let the expert fly with probability ``beta`` from the next rollout on.
 
-        ``beta_decay`` plays no part then.
+        β then stays constant, whatever ``beta_decay`` is.
 
         :raises ConfigError: a number below 0 or above 1
         """
@@ -283,8 +285,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     ) -> Self:
         """Train for ``total_timesteps``; all arguments are those of SB3's ``learn``.
 
-        With ``reset_num_timesteps`` β begins again. The dataset stays until ``dataset.clear()``.
-        Without an expert, the agent clones the pairs that the dataset holds, if β is 0.
+        With ``reset_num_timesteps`` β starts over. The dataset is kept until ``dataset.clear()``.
+        Without an expert, the agent clones the pairs in the dataset, which requires β = 0.
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """
@@ -297,7 +299,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     def _generator(self, purpose: int) -> np.random.Generator:
         """Return random numbers for this rollout (0) or update (1).
 
-        There is no state to save: after a resume they are the same again.
+        There is no state to save: a resumed run draws the same numbers.
         """
         seed = self._entropy if self.seed is None else self.seed
         return np.random.default_rng([seed, purpose, self._n_updates])
@@ -309,9 +311,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly ``n_rollout_steps`` steps by the mixture of expert and agent, and keep the labels.
+        """Fly ``n_rollout_steps`` steps with the mixture of expert and agent, and keep the labels.
 
-        It fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs.
+        It fills ``rollout_buffer`` as SB3 does, except for ``log_probs``, which no loss here needs.
         """
         self.policy.set_training_mode(False)
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
@@ -320,7 +322,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         beta = self.current_beta  # +
         if beta > 0.0 and self.expert is None:
             raise ExpertError(f"beta {beta:g}: no expert to fly; call set_expert, or set_beta(0)")
-        # + The dataset holds raw observations: the statistics of VecNormalize go on changing.
+        # + The dataset stores raw observations: the statistics of VecNormalize keep changing.
         normalize = statistics_of(self)
         if normalize and normalize.observation_space.shape != self.observation_space.shape:
             raise ConfigError(
@@ -341,7 +343,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 buffer.expert_actions[step] = self._labels(env)
             labels = buffer.expert_actions[step]
 
-            # + The expert's action flies with probability β, else a sample of the agent's.
+            # + Fly the expert's action with probability β, otherwise a sample of the agent's
+            # policy.
             observations = self._last_obs
             if normalize:
                 raw[step] = normalize.get_original_obs()
@@ -360,11 +363,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 return False
 
             self._update_info_buffer(infos, dones)
-            # A time limit is no failure: V of the last observation stands for what would follow.
+            # Truncation is not failure: bootstrap with V of the last observation.
             for row in np.flatnonzero(dones):
                 last = infos[row].get("terminal_observation")
                 if last is not None and infos[row].get("TimeLimit.truncated"):
-                    # As the environment returned it: an int or a tuple, perhaps.
+                    # It is as the environment returned it, perhaps an int or a tuple.
                     last = np.asarray(last, observations.dtype)[None]
                     rewards[row] += self.gamma * state_values(network, last)[0]
 
@@ -372,7 +375,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self._last_obs = new_obs
             self._last_episode_starts = dones
 
-        # + The critic does not change in a rollout. It evaluates many states at once.
+        # + The critic does not change during a rollout, so it can evaluate many states at once.
         flown = buffer.observations.reshape(-1, *buffer.obs_shape)
         parts = np.array_split(flown, math.ceil(len(flown) / _VALUE_CHUNK))
         values = np.concatenate([state_values(network, part) for part in parts])
@@ -380,7 +383,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
         buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
-        # + Add the labels to the dataset. Without an expert, it keeps the flights of a file.
+        # + Add the labels to the dataset. Without an expert, it keeps the loaded flights.
         if self.expert is not None:
             if self.dataset_capacity == 0:
                 self.dataset.clear()
@@ -399,10 +402,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
 
-        It is PPO's loop over mini-batches, with two of them in a step, in one piece as SB3 has it.
-        Additions are marked with ``+``.
+        This is PPO's loop over mini-batches, with two of them per step, kept in one piece as in
+        SB3. Additions are marked with ``+``.
 
-        :raises TrainingError: a loss or gradient that is not finite; the parameters stay those of
+        :raises TrainingError: a loss or gradient that is not finite; the parameters remain those of
             the last good step
         """
         self.policy.set_training_mode(True)
@@ -437,7 +440,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         n_passes = self.n_epochs * math.ceil(n_rows / self.batch_size)
         n_batches = min(self.gradient_steps or n_passes, self.n_epochs * n_rows)
         actor_rows = sample_rows(len(self.dataset), n_batches * batch_size, rng, self.shuffle)
-        # + Rows of the rollout for the critic, which takes part in some of the steps
+        # + Rows of the rollout for the critic, which is updated in some of the steps
         n_critic = min(n_passes, n_batches)
         critic_rows = sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle)
         critic_batches = iter(np.array_split(critic_rows, n_critic))
@@ -449,6 +452,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
             actor_batch = self.dataset.batch(rows)._replace(observations=seen, targets=labels)
             critic_batch = None
+            # Spread the critic's steps evenly.
             if (i + 1) * n_critic // n_batches > i * n_critic // n_batches:
                 critic_batch = Batch(next(critic_batches), flown, targets)
 
@@ -458,7 +462,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 observations, experts = actor_batch.tensors(self.device)
                 try:
                     entropy: Any = self.policy.get_distribution(observations).entropy()
-                except ValueError as error:  # of a distribution whose mean is not finite
+                except ValueError as error:  # the mean of the distribution is not finite
                     raise self._diverged({"bc_loss": math.nan}) from error
                 # + The cloning term L_BC (Eq. 3.12)
                 mean = self.policy.action_dist.mode()
@@ -491,11 +495,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 losses["loss"] = loss
                 terms = {name: term.item() for name, term in losses.items()}
 
-            # + In a step without it, the critic does not move.
+            # + In a step without a critic batch, the critic does not move.
             if critic_batch is None:
                 for parameter in critic_parameters:
                     parameter.grad = None
-            # Clip grad norm, + of actor and critic each by itself
+            # Clip grad norm, + separately for actor and critic
             norm = th.nn.utils.clip_grad_norm_(actor_parameters, self.max_grad_norm)
             critic_norm = th.nn.utils.clip_grad_norm_(critic_parameters, self.max_grad_norm)
             if not np.isfinite([*terms.values(), float(norm), float(critic_norm)]).all():  # +

@@ -11,22 +11,22 @@ from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.state import STATE
 from sb3_quad.vehicles.vehicle import GRAVITY
 
-# Distances, m, at which half of the coarse and of the fine part of the position's cost is due.
+# Distances, m, at which the coarse and the fine term of the position reach half of their limit.
 COARSE, FINE = 0.5, 0.05
 # Weight of the body rates at the target. Without it an agent oscillates there with delays or motors
-# that it has not seen often.
+# that it has rarely seen.
 BODY_RATES_WEIGHT = 0.03
-# Weight of the heading's error, rad, at the target, where one is commanded
+# Weight of the heading error, rad, at the target, if a heading is commanded.
 HEADING = 0.1
 # Below this height, m, a flight is in danger.
 SAFE_HEIGHT = 1.5
-# How much the mean specific force along body z may lack of 1 g, and over how many seconds
+# How far the mean specific force along body z may fall below 1 g, in g, and the averaging time, s
 FORCE_DEFICIT = 0.45
 WINDOW = 0.8
 
 
 class FlownStates(NamedTuple):
-    """The states after each of some control steps, and the actions that led there.
+    """The states after a number of control steps, and the actions that led to them.
 
     Shapes begin with (steps, n). Vectors are in the world frame unless noted.
     """
@@ -39,7 +39,7 @@ class FlownStates(NamedTuple):
     target: th.Tensor  # (..., 3), m: the position of the reference
     target_velocity: th.Tensor  # (..., 3), m/s
     target_acceleration: th.Tensor  # (..., 3), m/s²
-    target_heading: th.Tensor  # (..., 2), cosine and sine; zeros where none is commanded
+    target_heading: th.Tensor  # (..., 2), cosine and sine; zeros if none is commanded
     target_heading_rate: th.Tensor  # (..., 1), rad/s
     target_ahead: th.Tensor  # (..., 3), m/s², the acceleration in AHEAD seconds
     actions: th.Tensor  # (..., 4), before they are clipped to [-1, 1]
@@ -56,8 +56,8 @@ class FlownStates(NamedTuple):
 
     @property
     def heading_error(self) -> th.Tensor:
-        """2 sin(e / 2) of the angle e between the heading and the commanded one, and 0 if none
-        is commanded; the vehicle's nose is projected on the ground.
+        """2 sin(e / 2), where e is the angle between the heading and the commanded one; 0 if none
+        is commanded. The heading is that of the vehicle's nose, projected onto the ground.
         """
         w, x, y, z = self.quaternion.unbind(dim=-1)
         nose = th.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], dim=-1)
@@ -78,7 +78,7 @@ def cost_and_gradients(
     """
     state_tensor = th.from_numpy(states).requires_grad_()
     action_tensor = th.from_numpy(actions).double().requires_grad_()
-    # One split: the gradients of slices would be added up in an array of all states each.
+    # Split once: for each slice, autograd would add up an array of all states.
     parts = [part.transpose(1, 2) for part in th.split(state_tensor, [*STATE.values()], dim=1)]
     costs = cost(FlownStates._make([*parts, action_tensor]))
     shape = tuple(counts.shape)
@@ -103,11 +103,11 @@ def length(vectors: th.Tensor) -> th.Tensor:
 def flight_cost(flown: FlownStates) -> th.Tensor:
     """Return the default cost of each control step, (steps, n).
 
-    The distance costs d / (d + 0.5) + d / (d + 0.05), which is steep in the last metre and flat
-    far away, so that no target is too far to matter. Body rates cost little on the way, and more
-    within half a metre of the target. Small terms stand against a tilt and against actions beyond
-    their limits, and against another heading than the commanded one. Below a height of
-    1.5 m the ground costs, since the crash itself has no gradient.
+    The distance costs d / (d + 0.5) + d / (d + 0.05), which is steep in the last metre and flat far
+    away, but never constant, so that no target is too far to matter. Body rates cost little on the
+    way, and more within half a metre of the target. Small terms penalise tilt, actions beyond their
+    limits, and a heading other than the commanded one. Below a height of 1.5 m, proximity to the
+    ground is penalised, since the crash itself has no gradient.
     """
     d = flown.distance
     cost = d / (d + COARSE) + d / (d + FINE)
@@ -121,7 +121,7 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
 
 
 def body_rates_cost(flown: FlownStates) -> th.Tensor:
-    """Return a further cost of body rates at the target, (steps, n).
+    """Return an additional cost of body rates at the target, (steps, n).
 
     It is ``|ω| / (1 + (d / 0.5)²)`` at the distance d, m.
     """
@@ -129,24 +129,24 @@ def body_rates_cost(flown: FlownStates) -> th.Tensor:
 
 
 def _farness(d: th.Tensor) -> th.Tensor:
-    """Return by how much what costs at the target costs less at a distance d, m."""
+    """Return the divisor of terms that matter near the target, at distances d, m; 1 at d = 0."""
     return 1.0 + (d / COARSE) ** 2
 
 
 def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
     """Return the cost of a specific force along body z that stays low, (steps, n).
 
-    It is the square of what the mean force of the last 0.8 s lacks of 0.55 g, in g; before the
-    flight it counts as 1 g. While each such mean is above 0.5 g, no force stays below 0.5 g for the
-    second after which a Crazyflie's firmware cuts the motors
-    (:class:`~sb3_quad.evaluation.supervisor.Supervisor`).
+    It is the square of the amount, in g, by which the mean force of the last 0.8 s falls below 0.55
+    g; before the flight, the force counts as 1 g. As long as every such mean is above 0.5 g, the
+    force never stays below 0.5 g for a whole second, after which a Crazyflie's firmware cuts the
+    motors (:class:`~sb3_quad.evaluation.supervisor.Supervisor`).
 
     :param control_step: s.
     """
     w, x, y, z = flown.quaternion.unbind(dim=-1)
     up = th.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), flown.r33], dim=-1)
     acceleration = flown.velocity.diff(dim=0) / (GRAVITY * control_step)
-    # What each force lacks of 1 g; nothing is known of the first one.
+    # By how much each force falls below 1 g; the first one is unknown.
     lack = 1.0 - flown.r33[1:] - (acceleration * up[1:]).sum(dim=-1)
     window = round(WINDOW / control_step)
     mean = avg_pool1d(pad(lack, (0, 0, window, 0)).T, window, 1).T

@@ -1,12 +1,12 @@
 """Correcting an agent in place: its own weights cancel its steady offset from the target.
 
-This is what the thesis does (4.3.1). An agent that PPO has trained hovers next to its target, by
-the same vector wherever the target is. The thesis cancels that in the scaling of the observation
-(Eq. 3.16): the measured offset goes into the position components of μ. To make an agent quicker
-near its target, σ is multiplied by an α below 1 (Eq. 4.10). Here α is a constant, so that both can
-go into the actor's first layer, since W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ / (α σ)):
-the agent flies without any wrapper, and its zip stays stock. An α well below 1 costs recoveries and
-far targets; PPO after it wins them back.
+This is what the thesis does (4.3.1). An agent that PPO has trained hovers next to its target,
+offset by the same vector wherever the target is. The thesis cancels that in the scaling of the
+observation (Eq. 3.16): the measured offset goes into the position components of μ. To make an agent
+quicker near its target, σ is multiplied by an α below 1 (Eq. 4.10). Here α is a constant, so that
+both can go into the actor's first layer, since W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ /
+(α σ)): the agent flies without any wrapper, and its zip stays stock. An α well below 1 costs
+recoveries and far targets; further training by PPO wins them back.
 """
 
 import copy
@@ -25,8 +25,8 @@ from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZ
 from sb3_quad.simulation.settings import FlightSettings
 
 _POSITION = GROUPS["position"]
-# The offset is the mean of the last positions of this many flights to random targets. It is
-# measured again after each correction.
+# The offset is the mean final offset of this many flights to random targets. It is measured again
+# after each correction.
 N_OFFSETS = 120
 ROUNDS = 3
 
@@ -34,7 +34,7 @@ ROUNDS = 3
 class Correction(NamedTuple):
     """The effect of a correction.
 
-    :param before: size of the steady offset in m.
+    :param before: length of the steady offset, m.
     :param after: the same, after the correction.
     """
 
@@ -45,13 +45,13 @@ class Correction(NamedTuple):
 def correct_offset(
     model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None, scale: float = 1.0
 ) -> Correction:
-    """Find μ for an agent and fold it into its first layer, and α before it.
+    """Find μ for an agent, and fold it into its first layer after α.
 
-    :param seed: of the flights that measure it.
+    :param seed: seed of the flights that measure the offset.
     :param settings: vehicle, noise and scaling that the agent flies with.
     :param scale: α, above 0.
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not
-        read the 18 features. It is then as it was.
+        read the 18 features. It is then left unchanged.
     """
     if not scale > 0.0:
         raise ConfigError(f"scale {scale}: must be above 0; 1 leaves distances as they are")
@@ -85,9 +85,9 @@ def hover_offset(
 ) -> FloatArray:
     """Return the mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking.
 
-    It is taken over the flights that last.
+    It averages over the flights that survive.
 
-    :param settings: how it flies; task and episode length are those of this measurement.
+    :param settings: vehicle, noise and so on; the measurement sets the task and the episode length.
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
     """
     own = {} if settings is None else settings.in_any_task()
@@ -102,9 +102,9 @@ def hover_offset(
 
 
 def shift_position(model: BaseAlgorithm, offset: FloatArray, std: FloatArray) -> None:
-    """Let the actor see its position moved by ``offset`` (m, world frame).
+    """Shift the position that the actor sees by ``offset`` (m, world frame).
 
-    :param std: of the position features, shape (3,): what they are divided by.
+    :param std: σ of the position features, (3,), by which they are divided.
     """
     layer = first_layer(model)
     with th.no_grad():
@@ -121,7 +121,7 @@ def scale_position(model: BaseAlgorithm, scale: float) -> None:
 def first_layer(model: BaseAlgorithm) -> th.nn.Linear:
     """Return the layer of an agent's actor that reads the 18 features.
 
-    :raises ConfigError: it has none.
+    :raises ConfigError: the agent has no such layer.
     """
     # SAC and TD3 have an actor, on-policy algorithms an extractor for both networks.
     policy = model.policy

@@ -44,13 +44,16 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.controllers.expert_like import ExpertLike
 
-# By default a rollout is this many mini-batches, but none has less than this many rows.
+# By default a rollout is split into this many mini-batches, but none gets fewer than this many
+# rows.
 N_MINIBATCHES = 16
 LEAST_ROWS = 64
 
 
 class _LabellingForward:
-    """The policy's forward pass of a rollout: once a step it also labels the state."""
+    """SB3's rollout loop calls the policy's ``forward`` once before each ``env.step``. This
+    replacement also labels the state there.
+    """
 
     def __init__(self, model: "PPOBC", env: VecEnv, buffer: ExpertRolloutBuffer) -> None:
         self._model = model
@@ -65,7 +68,7 @@ class _LabellingForward:
 
     def __call__(self, observations: th.Tensor, deterministic: bool = False) -> Any:
         buffer = self._buffer
-        # Callbacks, too, may call the policy, and after the step.
+        # Callbacks may call the policy, too, even after the step.
         if deterministic or buffer.full or buffer.pos == self._labelled:
             return self._stock(observations, deterministic)
         self._labelled = buffer.pos
@@ -75,7 +78,7 @@ class _LabellingForward:
         return actions.reshape(-1, *self._model.action_space.shape), values, log_prob
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        # A callback may copy or save the policy, which then has its own forward pass.
+        # If a callback copies or saves the policy, the copy has the stock forward pass.
         return self._stock.__reduce_ex__(protocol)
 
 
@@ -83,9 +86,10 @@ class PPOBC(ExpertMixin, PPO):
     """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
 
     The minimised loss is Eq. 4.4 of the thesis: PPO-clip + c_v · value loss + c_L2 · ½Σw² − c_H ·
-    entropy + c_BC · L_BC. The thesis has three errata here, followed as they are meant: Eq. 3.5
-    prints the probability ratio as a difference of logs (the ratio is its exponential); Eq. 3.6 is
-    a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
+    entropy + c_BC · L_BC. The thesis has three misprints here; they are implemented as they are
+    meant: Eq. 3.5 prints the probability ratio as a difference of logs (the ratio is its
+    exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is
+    encouraged.
 
     All arguments of :class:`stable_baselines3.PPO` keep their meaning. The defaults are those that
     we recommend for hundreds of quadcopters at once and an expert that is good near its target but
@@ -94,34 +98,33 @@ class PPOBC(ExpertMixin, PPO):
     3e-4).
 
     An update that adds nothing (a cloning weight and an ``l2_coef`` of 0, no ``critic_warmup``, and
-    either no ``clip_range_vf`` or ``max_clipped_value=False``) is PPO's, bit for bit. Any other is
-    equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved model
-    loads with ``PPO.load``, even where this package is not installed.
+    either no ``clip_range_vf`` or ``max_clipped_value=False``) is PPO's, bit for bit. Any other
+    equals PPO's to rounding, plus the additions, and is computed faster (docs/ppo_bc.md). A saved
+    model loads with ``PPO.load``, even where this package is not installed.
 
-    Where it clones or has cloned, errors of actions and log_std are those of actions scaled to
-    [-1, 1].
+    If a model clones or has cloned, action errors and log_std refer to actions scaled to [-1, 1].
 
     :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
-    :param policy_kwargs: unless it holds ``log_std_init``, that is -0.9. ``log_std_init=None``:
-        SB3's, or that of the initial policy.
-    :param expert: who labels the visited states: an object with ``actions(state)`` on the true
+    :param policy_kwargs: ``log_std_init`` is -0.9 unless it is given here. ``log_std_init=None``:
+        SB3's default, or the initial policy's ``log_std``.
+    :param expert: what labels the visited states: an object with ``actions(state)`` on the true
         state of our environments, an SB3 model, or a callable from observations to actions; or a
-        name as YAML takes it, such as ``"pid"``. Needed when learning starts with a cloning weight.
+        name, as in YAML, such as ``"pid"``. Needed when learning starts with a cloning weight.
     :param initial_policy: the agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. Its policy and critic are taken; so are its ``net_arch``,
-        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them.
+        shipped agent. Its policy and critic are copied; so are its ``net_arch``, ``activation_fn``
+        and features extractor unless ``policy_kwargs`` gives them.
     :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining
         progress (SB3's ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum
         over the action's dimensions; ``"mse"``, the squared error of the policy's mean action,
-        which leaves the deviation alone; ``"huber"``, that is linear beyond 0.05; or
-        ``"huber_mse"``, that and three times the squared error.
+        which leaves the deviation alone; ``"huber"``, quadratic up to 0.05 and linear beyond; or
+        ``"huber_mse"``, the same plus three times the squared error.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"agreement"``, where expert and
         policy differ by less than 0.3 (root mean square over the action). An expert for small
-        angles, such as the PID, then holds the agent on its way to the target, and has no say where
-        the agent has learnt to recover and the expert would crash.
+        angles, such as the PID, then guides the agent on its way to the target, but not where the
+        agent has learnt to recover and the expert would crash.
     :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std``
-        take no part.
+        are excluded.
     :param max_clipped_value: whether the value loss is that of Eq. 3.8, the larger of the clipped
         and the unclipped error, where ``clip_range_vf`` is given. False: PPO's clipped error.
     :param critic_warmup: for this many rollouts only the critic learns. A critic that comes from
@@ -129,11 +132,11 @@ class PPOBC(ExpertMixin, PPO):
         advantages.
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
         prepares them ("chronologically", 4.2.3).
-    :raises ConfigError: a value out of range, an unknown name, or a space that is not supported,
-        when built.
-    :raises ExpertError: when learning starts, or at the latest with the first rollout that is to be
-        cloned: no expert, or one whose labels do not fit.
-    :raises TrainingError: a loss or gradient that is not finite; the parameters are those of the
+    :raises ConfigError: on construction: a value out of range, an unknown name, or a space that is
+        not supported.
+    :raises ExpertError: when learning starts, or at the latest in the first rollout to be cloned:
+        no expert, or one whose labels do not fit.
+    :raises TrainingError: a loss or gradient that is not finite; the parameters remain those of the
         step before.
     """
 
@@ -182,7 +185,7 @@ class PPOBC(ExpertMixin, PPO):
             env,
             learning_rate,
             n_steps=n_steps,
-            # The default is known when the environments are. PPO warns where this is no divisor.
+            # The default depends on the environments. PPO warns if it does not divide the rollout.
             batch_size=batch_size or max(n_steps, 2),
             n_epochs=n_epochs,
             gamma=gamma,
@@ -226,7 +229,7 @@ class PPOBC(ExpertMixin, PPO):
         filters = [name for name in BC_FILTERS if name != "q"]
         refuse_unknown("bc_filter", [self.bc_filter], filters)
         self._refuse_dict_observations()
-        # SB3's own, as a zip of PPO names it, is one without labels.
+        # SB3's own buffer, which a zip of PPO names, has no labels.
         if self.rollout_buffer_class in (None, RolloutBuffer):
             self.rollout_buffer_class = ExpertRolloutBuffer
         if not issubclass(self.rollout_buffer_class, ExpertRolloutBuffer):
@@ -243,6 +246,7 @@ class PPOBC(ExpertMixin, PPO):
                 "PPOBC clones into a Box action space only, this environment has"
                 f" {self.action_space}"
             )
+        # A new actor acts in [-1, 1]; bring it to the units of the action space.
         self._scale_actions(inverse=True)
         if self.expert is not None and self.will_clone():
             self._check_cloning()
@@ -253,13 +257,13 @@ class PPOBC(ExpertMixin, PPO):
         return 0 < self.critic_warmup >= self._n_rollouts_trained
 
     def set_bc_coef(self, bc_coef: float) -> None:
-        """Weigh the cloning term with ``bc_coef`` from the next rollout on.
+        """Weight the cloning term with ``bc_coef`` from the next rollout on.
 
-        It replaces the schedule. A rollout under way keeps its weight, by which its states have
-        been labelled or not.
+        It replaces the schedule. A rollout in progress keeps its weight, which decided whether its
+        states are labelled.
 
         :raises ConfigError: a weight that is negative or not finite.
-        :raises ExpertError: a weight, and no expert.
+        :raises ExpertError: a weight above 0 without an expert.
         """
         if not 0.0 <= bc_coef < math.inf:
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
@@ -268,8 +272,8 @@ class PPOBC(ExpertMixin, PPO):
         self.bc_coef = FloatSchedule(float(bc_coef))
 
     def _scale_actions(self, inverse: bool = False) -> None:
-        # Without a cloning term it is PPO, which counts actions as they are. An agent that has had
-        # one keeps the units that its steps are made for.
+        # Without a cloning term this is PPO, which does not rescale actions. A model that has
+        # cloned keeps the units in which its optimiser has stepped.
         if self.will_clone() or self.rollout_buffer.bc_coef:
             self._has_cloned = True
         if isinstance(self.action_space, spaces.Box) and self._has_cloned:
@@ -309,14 +313,14 @@ class PPOBC(ExpertMixin, PPO):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fly a rollout by PPO's loop, and label its states where the update will clone."""
-        # The update comes at the end of this rollout and takes the weight of that time.
+        """Fly a rollout with PPO's loop, and label its states if the update will clone."""
+        # The update follows this rollout, and uses the weight that the schedule has by then.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         # The last rollout may end after the last timestep.
         buffer.bc_coef = self.bc_coef(max(1.0 - end / self._total_timesteps, 0.0))
         if buffer.bc_coef == 0.0:
-            # A recurrent expert that does not see this rollout begins again.
+            # A recurrent expert misses this rollout, so it starts afresh in the next one.
             self._labeller = None
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
 
@@ -328,9 +332,9 @@ class PPOBC(ExpertMixin, PPO):
 
     @with_unit_actions  # +
     def train(self) -> None:
-        """Update the policy on the rollout just flown, by PPO's lines. Additions are marked ``+``.
+        """Update the policy on the rollout just flown, as PPO does. Additions are marked ``+``.
 
-        It is as long as SB3's, in one piece, so that the two can be compared line by line.
+        Kept in one piece and in SB3's order, so that the two can be compared line by line.
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -349,8 +353,8 @@ class PPOBC(ExpertMixin, PPO):
             ent_coef = l2_coef = 0.0
         actor_parameters, _ = actor_and_critic_parameters(self.policy)
 
-        # + Compiled code computes the same gradients in less time, to rounding. Without additions
-        # PyTorch does it, as in PPO, bit for bit.
+        # + Compiled code computes the same gradients faster, to rounding. Without additions PyTorch
+        # computes them, so that the update is PPO's bit for bit.
         own_value_loss = clip_range_vf is not None and self.max_clipped_value
         adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
         network: Any = network_of(self.policy) if adds else self.policy
@@ -390,7 +394,7 @@ class PPOBC(ExpertMixin, PPO):
                         values, log_prob, entropy = self.policy.evaluate_actions(
                             rollout_data.observations, actions
                         )
-                    except ValueError as error:  # + of a distribution whose mean is not finite
+                    except ValueError as error:  # + the mean of the distribution is not finite
                         raise self._diverged({"mean action": math.nan}) from error
                     values = values.flatten()
                     # Normalize advantage
@@ -438,7 +442,7 @@ class PPOBC(ExpertMixin, PPO):
                         "value_loss": value_loss,
                         "entropy_loss": entropy_loss,
                     }
-                    # + The cloning term L_BC, of the rows that are cloned; the others count as 0
+                    # + The cloning term L_BC; rows that are not cloned count as 0
                     if bc_coef != 0.0:
                         mean = self.policy.action_dist.mode()
                         labels = rollout_data.expert_actions
@@ -450,7 +454,7 @@ class PPOBC(ExpertMixin, PPO):
                     # + Weight decay as a term of the loss (Eq. 2.25)
                     if l2_coef != 0.0:
                         parameters = dict(self.policy.named_parameters())
-                        # That of gSDE is a matrix.
+                        # With gSDE log_std is a matrix, too.
                         parameters.pop("log_std", None)
                         losses["l2_loss"] = l2_loss([*parameters.values()])
                         loss = loss + l2_coef * losses["l2_loss"]
@@ -480,7 +484,7 @@ class PPOBC(ExpertMixin, PPO):
                     break
 
                 # Optimization step
-                if warming_up:  # + of the critic alone
+                if warming_up:  # + only the critic learns
                     for parameter in actor_parameters:
                         parameter.grad = None
                 # Clip grad norm

@@ -47,34 +47,35 @@ class SACBC(ExpertMixin, SAC):
 
     - ``critic_layer_norm``: layer-normalised critics, which overestimate unseen actions less: RLPD,
       https://arxiv.org/abs/2302.02948
-    - ``bc_coef``: a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089;
-      weighed by the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert
-      labels every state that is visited, as in DAgger, not its own flights alone
+    - ``bc_coef``: a cloning term in the actor's loss: Nair et al.,
+      https://arxiv.org/abs/1709.10089; weighted by the mean absolute Q as in TD3+BC,
+      https://arxiv.org/abs/2106.06860. The expert labels every visited state, as in DAgger, not
+      only those of its own flights
     - ``bc_filter="q"``: only where the critic prefers the expert's action: the Q filter of Nair et
       al.
 
-    :param expert: who labels: an object with ``actions(state)`` on the true state of our
-        environments, an SB3 model, or a function from observations to actions; or a name as YAML
-        takes it, such as ``"pid"``. It is never saved. Needed when learning starts with cloning.
+    :param expert: what labels the states: an object with ``actions(state)`` on the true state of
+        our environments, an SB3 model, or a function from observations to actions; or a name, as in
+        YAML, such as ``"pid"``. It is never saved. Needed when learning starts with cloning.
     :param initial_policy: the agent to start from: a model, the path of a zip, or the name of a
-        shipped agent. One of SAC hands on all its weights, and its ``net_arch``,
-        ``activation_fn`` and features extractor where ``policy_kwargs`` does not give them. Any
-        other is imitated by the actor.
+        shipped agent. A SAC agent passes on all its weights, and its ``net_arch``,
+        ``activation_fn`` and features extractor unless ``policy_kwargs`` gives them. The actor
+        imitates any other agent.
     :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a
         schedule of the remaining progress.
-    :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear
-        beyond 0.05; ``"huber_mse"``, that and three times the squared error. Actions are those of
-        the policy, within -1 and 1.
+    :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, quadratic up
+        to 0.05 and linear beyond; ``"huber_mse"``, the same plus three times the squared error.
+        Actions are scaled to [-1, 1], as the policy's are.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's
         action is greater than Q of the policy's mean action; ``"agreement"``, where both differ by
         less than 0.3, as for :class:`PPOBC`.
-    :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that
-        comes from imitation is not moved by a critic that has learnt nothing yet.
+    :param critic_warmup: for this many gradient steps only the critic learns, so that an untrained
+        critic does not spoil an actor that comes from imitation.
     :param critic_layer_norm: whether the critics normalise the inputs of their activations, without
-        parameters. In stock ``SAC`` the zip loads and its actor is the same, but its critics do not
+        parameters. Stock ``SAC`` loads the zip with the same actor, but its critics do not
         normalise.
-    :raises ConfigError: a value out of range, an unknown name, or a space that is not supported,
-        when built.
+    :raises ConfigError: on construction: a value out of range, an unknown name, or a space that is
+        not supported.
     :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss that is not finite.
     """
@@ -169,13 +170,13 @@ class SACBC(ExpertMixin, SAC):
             self._set_up(initial)
 
     def _setup_model(self) -> None:
-        # The negative log-likelihood is no error of an action that tanh squashes.
+        # The negative log-likelihood is not meaningful for tanh-squashed actions.
         kinds = [name for name in CLONING_LOSSES if name != "nll"]
         refuse_unknown("bc_loss", [self.bc_loss], kinds)
         refuse_unknown("bc_filter", [self.bc_filter], BC_FILTERS)
         if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
             raise ConfigError(
-                f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict"
+                f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns for Dict"
                 " observations; give 1"
             )
         self._check_arguments()
@@ -187,8 +188,8 @@ class SACBC(ExpertMixin, SAC):
             )
         super()._setup_model()
         if self._clones:
-            # An action is stored with the expert's behind it, as one. So the two cannot be
-            # separated, whichever rows SB3 samples.
+            # An action is stored with the expert's action appended, so that SB3 always samples
+            # both.
             buffer: Any = self.replay_buffer
             buffer.action_dim *= 2
             buffer.actions = np.zeros((*buffer.actions.shape[:2], buffer.action_dim), np.float32)
@@ -202,14 +203,14 @@ class SACBC(ExpertMixin, SAC):
         return 0 < self.critic_warmup >= self._n_updates
 
     def will_clone(self) -> bool:
-        """Return whether the expert is needed: decided with the kind of the replay buffer."""
+        """Return whether the expert is needed, which is decided when the replay buffer is built."""
         return self._clones
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """Load a replay buffer by SB3's ``load_replay_buffer``.
 
-        :raises ConfigError: one with the expert's actions where this model does not clone, or one
-            without where it does; the present buffer then stays.
+        :raises ConfigError: the buffer has expert actions and this model does not clone, or the
+            reverse; the present buffer is kept.
         """
         present: Any = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
@@ -243,7 +244,7 @@ class SACBC(ExpertMixin, SAC):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[AnyArray, AnyArray]:
-        # Before the step: an expert that sees the true state labels the present one.
+        # Label before the step: an expert that reads the true state must see the present one.
         if self._clones:
             assert self.env is not None
             labels = self._labels(self.env)
@@ -269,13 +270,13 @@ class SACBC(ExpertMixin, SAC):
 
     @staticmethod
     def _least_q(critic: Any, observations: Any, actions: th.Tensor) -> th.Tensor:
-        """Return the least of the critics' values, (b, 1)."""
+        """Return the smallest of the critics' values, (b, 1)."""
         return th.cat(critic(observations, actions), dim=1).min(dim=1, keepdim=True).values
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Update on the replay buffer by SAC's lines. Additions are marked with ``+``.
+        """Update on the replay buffer as SAC does. Additions are marked with ``+``.
 
-        It is as long as SB3's, in one piece, so that the two can be compared line by line.
+        Kept in one piece and in SB3's order, so that the two can be compared line by line.
         """
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
@@ -288,7 +289,7 @@ class SACBC(ExpertMixin, SAC):
         if bc_coef > 0.0 and not self._clones:
             raise ConfigError(
                 f"bc_coef {bc_coef:g}: this model was built without cloning, and its replay buffer"
-                " holds no actions of an expert; build or load it with a bc_coef above 0"
+                " holds no expert actions; build or load it with a bc_coef above 0"
             )
         # The terms of each gradient step, by name
         history: History = {}
@@ -297,7 +298,7 @@ class SACBC(ExpertMixin, SAC):
             history.setdefault(name, []).append(value.item())
 
         for gradient_step in range(gradient_steps):
-            # Sample the replay buffer, + with the expert's actions where there are any
+            # Sample the replay buffer, + with the expert's actions if there are any
             data: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             actions, *labels = data.actions.split(get_action_dim(self.action_space), dim=1)
             discounts = data.discounts if data.discounts is not None else self.gamma
@@ -306,12 +307,13 @@ class SACBC(ExpertMixin, SAC):
 
             actions_pi, log_prob = self.actor.action_log_prob(data.observations)
             log_prob = log_prob.reshape(-1, 1)
-            # + The deterministic actions, before the distribution is that of the next states
+            # + The deterministic actions, before the distribution is replaced by that of the next
+            # states
             mean = self.actor.action_dist.mode() if bc_coef > 0.0 else None
             warming_up = self._n_updates + gradient_step < self.critic_warmup  # +
 
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-                # The coefficient of this step is that from before its update.
+                # This step uses the coefficient from before its update.
                 ent_coef = th.exp(self.log_ent_coef.detach())
                 assert isinstance(self.target_entropy, float)
                 ent_coef_loss = -(
@@ -378,7 +380,7 @@ class SACBC(ExpertMixin, SAC):
         :param mean: the policy's mean actions, (b, action_dim).
         :param labels: the expert's, likewise.
         """
-        # No kind of error here needs log_std.
+        # None of the losses that SACBC allows reads log_std, so that any tensor will do.
         errors = cloning_errors(self.bc_loss, mean, mean, labels)
         kept = th.ones_like(errors, dtype=th.bool)
         with th.no_grad():
@@ -394,7 +396,7 @@ class SACBC(ExpertMixin, SAC):
 def _normalise_layers(critic: Any) -> None:
     """Normalise the inputs of each activation over its layer.
 
-    Nothing is learnt there, so the names in a zip stay those of SAC.
+    The normalisation has no parameters, so the names in a zip stay SAC's.
     """
     for network in critic.q_networks:
         for i, layer in enumerate([*network][:-1]):

@@ -5,11 +5,11 @@ from typing import Any
 
 import torch as th
 
-# How slowly the second moments of a matrix's gradients change, and updates between two bases
+# Decay of the second moments of a matrix's gradients, and number of updates between two bases
 MOMENT_DECAY = 0.95
 REFRESH = 5
-# Updates after which the rate is the full one. Second moments of a few gradients say little, and an
-# update moves weights along all eigenvectors by the same length.
+# Updates until the learning rate is the full one. Second moments of a few gradients say little,
+# while an update moves the weights equally far along every eigenvector.
 WARM_UP = 30
 
 
@@ -17,17 +17,17 @@ class SOAP(th.optim.Adam):
     """Adam that scales a weight matrix in the eigenbasis of its gradients' second moments.
 
     Adam scales each weight by the size of its own gradients. Here the weights of a layer are first
-    turned to the eigenvectors of ``E[G Gᵀ]`` and ``E[Gᵀ G]``, where the gradients G hardly
+    rotated into the eigenbases of ``E[G Gᵀ]`` and ``E[Gᵀ G]``, where the gradients G hardly
     correlate, so that an update of the same length lowers the cost further. Biases have Adam's own
     updates. Source: N. Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam" (2024,
     arXiv 2409.11321).
 
-    Its state holds all that Adam's does, so that ``PPO.load`` takes it for Adam's.
+    Its state contains everything that Adam's does, so that ``PPO.load`` accepts it as Adam's.
 
     :param params: parameters to learn, or groups of them, as for ``torch.optim.Adam``.
-    :param lr: the rate. In the first ``WARM_UP`` updates it rises to that.
-    :param betas: how the momentum decays, and the second moments of biases.
-    :param eps: is added to each deviation by which an update is divided.
+    :param lr: the learning rate, which is reached after ``WARM_UP`` updates.
+    :param betas: decay of the momentum, and of the second moments of biases.
+    :param eps: added to the root of the second moments, by which an update is divided.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class SOAP(th.optim.Adam):
         assert gradient is not None
         is_matrix = parameter.ndim == 2
         state = self.state[parameter]
-        # One of Adam's, from a zip, knows nothing of the matrices.
+        # An Adam state from a zip has no matrix moments.
         if not state or (is_matrix and "moments" not in state):
             state["step"] = th.tensor(0.0)
             state["exp_avg"] = th.zeros_like(parameter)

@@ -41,21 +41,22 @@ def model_of(source: BaseAlgorithm | StrPath | None) -> BaseAlgorithm | None:
 def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> None:
     """Give ``model`` the policy and critic of another agent with the same spaces and networks.
 
-    An off-policy ``model`` also takes an agent with other networks, such as DAgger's. Its actor is
-    made to imitate that one by :func:`clone_policy`, and its critic stays new. ``model`` then needs
-    its environment.
+    An off-policy ``model`` also takes an agent with other networks, such as DAgger's. Its actor
+    then imitates that agent by :func:`clone_policy`, for which ``model`` needs its environment, and
+    its critic starts from scratch.
 
-    ``log_std`` comes from ``source``, unless the model's settings give a ``log_std_init``: then
-    that holds. The optimiser stays as it is, so a new model starts with a new one.
+    ``log_std`` comes from ``source``, unless the model's settings give a ``log_std_init``. The
+    optimiser is left as it is, so a new model starts with a new one.
 
-    A warning names what the agent observed otherwise where it was trained, if its zip says so.
+    A warning names the settings of the observation that differ from those of the agent's training,
+    if its zip records them.
 
     Statistics of VecNormalize go into the model's environment.
 
     :param source: a model of any algorithm, or what names one: the path of a zip or of a run
         folder, or a shipped agent's name.
-    :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ;
-        the message names them. An agent that computes something else with these layers.
+    :raises ConfigError: a zip that is missing, incomplete or not finite, or whose layers differ,
+        which the message names; or an agent that computes something else with the same layers.
     """
     name = str(source)
     if isinstance(source, BaseAlgorithm):
@@ -78,7 +79,7 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
     share_statistics(statistics_of(teacher), model.get_env(), training=True)
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{name}: holds parameters that are not finite")
-    # A preview that the agent did not have is read by weights of zero.
+    # The weights of a preview that the agent did not have are zero.
     added = 3 * len(getattr(model, KEY, {}).get("preview") or ())
     for key, weights in theirs.items():
         if key in ours and weights.ndim == 2 and ours[key].shape[1] == weights.shape[1] + added:
@@ -93,7 +94,7 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
             f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
             " train takes them from it unless --conf-file is given"
         ) from None
-    # Other functions may have parameters of the same names and shapes.
+    # Networks that compute something else may have parameters of the same names and shapes.
     if teacher.observation_space != model.observation_space:
         return
     for _ in range(8):
@@ -110,30 +111,29 @@ def transfer_policy(source: BaseAlgorithm | StrPath, model: BaseAlgorithm) -> No
 # A clone flies at least this many states, and at least this many steps in each environment.
 CLONE_ROWS = 20_000
 CLONE_FLIGHT = 500
-# Steps of Adam, spread over this many rounds of flying, then fitting
+# Number of Adam steps, spread over this many rounds of flying and then fitting
 CLONE_STEPS = 2_500
 CLONE_ROUNDS = 10
 CLONE_BATCH = 1024
 # The learning rate falls to a hundredth of this.
 CLONE_RATE = 2e-3
-# Of a SAC actor without log_std_init. Its sampled actions still fly.
+# log_std of a SAC actor without log_std_init, so small that its sampled actions still fly
 CLONE_LOG_STD = -2.0
 
 
 def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> float:
     """Let the actor of ``model``, SAC's or TD3's, imitate ``teacher`` in its environments.
 
-    A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped. So no
-    weights can be copied. They are fitted by the squared error of the deterministic actions; an
-    error of their arctanh would be all about the limits. One half of the environments is flown by
-    the teacher, the other by the present clone, as in DAgger, so that the clone learns from the
-    states that it gets into itself. The deviation of a SAC actor becomes e to the ``log_std_init``
-    of its ``policy_kwargs`` everywhere, e^-2 without one. Reset the environments before
-    learning.
+    A squashed Gaussian outputs tanh of its mean, a DAgger or PPO agent a clipped mean, so weights
+    cannot be copied. They are fitted to the squared error of the deterministic actions; the error
+    of their arctanh would be dominated by actions near the limits. The teacher flies one half of
+    the environments, the present clone the other, as in DAgger, so that the clone also learns from
+    states that it gets into itself. A SAC actor's ``log_std`` becomes the ``log_std_init`` of its
+    ``policy_kwargs`` in every state, or -2 without one. Reset the environments before learning.
 
     :param teacher: a source of :class:`~sb3_quad.controllers.controller.Controller`.
     :raises ConfigError: Dict observations.
-    :return: root mean squared error of the last 100 steps' actions, of a range of 2.
+    :return: root mean squared error of the actions over the last 100 steps; actions span 2.
     """
     env = model.get_env()
     assert env is not None
@@ -151,9 +151,9 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     flown_by_teacher = (np.arange(n) % 2 == 0)[:, None]
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
-    # Rows are raw, since the statistics of VecNormalize go on changing.
+    # Rows are raw, since the statistics of VecNormalize keep changing.
     normalize = statistics_of(model)
-    # The states flown, and the teacher's actions there as the actor gives them
+    # The states flown, and the teacher's actions there, scaled as the actor outputs them
     dataset = AggregatedDataset(
         steps * n, space.shape, get_action_dim(env.action_space), space.dtype
     )
@@ -168,10 +168,10 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
-        # The round is not over yet.
+        # Spread the rounds evenly; this one is not over yet.
         if (step + 1) * CLONE_ROUNDS // steps == step * CLONE_ROUNDS // steps:
             continue
-        # Fit all that has been flown so far.
+        # Fit to all states flown so far.
         for _ in range(CLONE_STEPS // CLONE_ROUNDS):
             rate = CLONE_RATE * max(1.0 - len(errors) / CLONE_STEPS, 0.01)
             update_learning_rate(optimiser, rate)

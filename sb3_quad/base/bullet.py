@@ -1,4 +1,4 @@
-"""Import PyBullet without the line about its build that it prints.
+"""Import PyBullet without the line that it prints about its build.
 
 Use ``from sb3_quad.base.bullet import p``. The package installs PyBullet where it has a wheel, up
 to Python 3.11. Elsewhere this import says how to get it.

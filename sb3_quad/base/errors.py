@@ -19,11 +19,11 @@ class ConfigError(SB3QuadError, ValueError):
 
 
 class MissingExtra(ConfigError, ImportError):
-    """A package that is not installed. Names what needs it and the extra that brings it."""
+    """A package that is not installed. Names what needs it and the extra that installs it."""
 
 
 class CannotHover(ConfigError):
-    """A vehicle whose rotors cannot give hover thrust: too weak, or unable to give as little."""
+    """A vehicle whose rotors cannot produce hover thrust: too weak, or unable to go as low."""
 
 
 class ExpertError(SB3QuadError, ValueError):
@@ -43,12 +43,12 @@ class WorkerDied(SB3QuadError, RuntimeError):
 
 
 class ExportError(SB3QuadError, RuntimeError):
-    """An exported policy that computes other actions than the trained one, or cannot be checked."""
+    """An exported policy whose actions differ from the trained one's, or that cannot be checked."""
 
 
 @contextmanager
 def raised_as(error: type[SB3QuadError], what: str) -> Iterator[None]:
-    """Turn whatever the code of others raises in this block into an ``error`` of one line.
+    """Turn whatever third-party code raises in this block into an ``error`` of one line.
 
     :param what: Whose code it is and what it does, such as "reward energy: fails".
     """
@@ -64,7 +64,7 @@ def raised_as(error: type[SB3QuadError], what: str) -> Iterator[None]:
 def refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str]) -> None:
     """Refuse names that are not among the valid ones.
 
-    :raises ConfigError: as :func:`unknown` says.
+    :raises ConfigError: with the message of :func:`unknown`.
     """
     for name in names:
         if name not in valid:
@@ -104,8 +104,8 @@ def _guesses(text: str, names: list[str]) -> list[str]:
     if words and 1 <= len(longer) <= 3:
         return longer
     by_lower_case = {name.lower(): name for name in names}
-    # Few slips change the first letter. Among all names, those of three letters and any two loss
-    # weights such as bc_coef and vf_coef are alike to difflib, so that they ask for more.
+    # Few typos change the first letter. Among all names, difflib finds those of three letters and
+    # any two loss weights, such as bc_coef and vf_coef, too similar, so they need a closer match.
     initial = text.lstrip("-")[:1]
     same_initial = [name for name in by_lower_case if name.lstrip("-").startswith(initial)]
     close = get_close_matches(text, same_initial, n=1, cutoff=0.65)

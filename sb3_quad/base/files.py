@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, with a clear error where a folder cannot be written."""
+"""Files that appear whole or not at all, with a clear error if a folder cannot be written to."""
 
 import os
 import time
@@ -20,7 +20,7 @@ LOCK = ".lock"
 def replacing(path: StrPath) -> Iterator[BinaryIO]:
     """A stream to a temporary file that replaces ``path`` once it is finished.
 
-    A reader never meets half a file. If anything fails, ``path`` keeps what it held.
+    A reader never sees half a file. If anything fails, ``path`` keeps its content.
 
     :raises ConfigError: Not the name of a file, a folder that cannot be written, or a full disk.
     """
@@ -76,7 +76,7 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         remove_half_written(folder)
         yield
     finally:
-        # Removed while it is held, so that no other process can lock a file without a name.
+        # Removed while it is locked, so that no other process can lock a file without a name.
         # Windows removes it on release, and the folder may be gone.
         with suppress(OSError):
             (folder / LOCK).unlink()
@@ -84,7 +84,7 @@ def locked(folder: Path, what: str) -> Iterator[None]:
 
 
 def remove_half_written(folder: Path, seconds: float = 0.0) -> None:
-    """Remove files that a killed process was writing, so many seconds ago or longer."""
+    """Remove files that a killed process was writing, at least this many seconds ago."""
     latest = time.time() - seconds
     for temporary in folder.rglob(".*.tmp"):
         with suppress(OSError):

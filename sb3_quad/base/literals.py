@@ -49,7 +49,8 @@ def parse_number(value: Any) -> Any:
 
 
 def parse_value(text: str, key: str = "") -> Any:
-    """Return the value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, else the text.
+    """Return the value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, otherwise the
+    text.
 
     >>> parse_value("[64, 64]"), parse_value("dict(a=1)"), parse_value("lin_1e-3")
     ([64, 64], {'a': 1}, 'lin_1e-3')
@@ -88,7 +89,7 @@ def parse_mapping(value: Any, key: str) -> StrDict:
 def put_key(data: StrDict, key: str, value: Any, where: str) -> None:
     """Set a value at a dotted key, in place. Numbers are positions in a list.
 
-    :raises ConfigError: Something on the way holds no keys.
+    :raises ConfigError: Something on the way has no keys.
     """
     *path, last = key.split(".")
     place: Any = data

@@ -115,7 +115,7 @@ def use_cpus(count: int) -> None:
 
 def available_cpus() -> int:
     """The number of CPUs that this process may use."""
-    # Only Linux knows the CPUs that a process is restricted to.
+    # Only Linux tells the CPUs that a process is restricted to.
     if hasattr(os, "sched_getaffinity"):
         return min(len(os.sched_getaffinity(0)), _most_cpus)
     return min(os.cpu_count() or 1, _most_cpus)
@@ -123,7 +123,7 @@ def available_cpus() -> int:
 
 def has_ended(process: int) -> bool:
     """Whether no process of this machine has this id. False on Windows, which cannot tell."""
-    # There, os.kill sends Ctrl-C or ends the process.
+    # On Windows, os.kill sends Ctrl-C or ends the process.
     if sys.platform == "win32":
         return False
     try:
@@ -137,13 +137,15 @@ def has_ended(process: int) -> bool:
 
 
 def trusted() -> bool:
-    """Whether files may run code of their own: after ``--trust``, or by ``SB3_QUAD_TRUST=1``."""
+    """Whether files may run their own code: after ``--trust``, or by ``SB3_QUAD_TRUST=1``."""
     return os.environ.get(TRUST_VARIABLE, "0") not in ("", "0")
 
 
 @contextmanager
 def trusting(asked: bool) -> Iterator[None]:
-    """Trust all files within the block, if ``asked``. Workers inherit it by the environment."""
+    """Trust all files within the block, if ``asked``. Workers inherit it through an environment
+    variable.
+    """
     before = os.environ.get(TRUST_VARIABLE, "")
     if asked:
         os.environ[TRUST_VARIABLE] = "1"

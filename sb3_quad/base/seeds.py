@@ -1,6 +1,6 @@
 """Every stream of random numbers, by its purpose: no agent is judged on the episodes it trained on.
 
-Streams are separated by :class:`numpy.random.SeedSequence` of a run's seed, a purpose and a row. No
+A :class:`numpy.random.SeedSequence` of a run's seed, a purpose and a row separates the streams. No
 two share numbers: seeds 0 and 1 of a training are as independent as a training and its evaluation.
 """
 
@@ -54,8 +54,8 @@ def seed_for(purpose: Purpose, seed: int = 0) -> int:
 def row_seeds(seed: int, n: int) -> list[int]:
     """Return the seeds of n rows, each for ``reset(seed=…)`` of one environment.
 
-    The seed of row i does not depend on n. All are below 2**53, which any file format and any
-    language keep exactly.
+    The seed of row i does not depend on n. All are below 2**53, which every file format and every
+    language represents exactly.
     """
     with seed_errors(seed):
         return [_hash(seed, _ROW, row) for row in range(n)]

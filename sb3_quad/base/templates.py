@@ -6,7 +6,7 @@ import jinja2
 
 
 def render(package: str, template: str, **content: Any) -> str:
-    """Return the text that a template in the folder of a package makes of its content.
+    """Return the text of a template in the folder of a package, filled with its content.
 
     In templates called ``*.html.j2`` the content is escaped.
     """

@@ -43,7 +43,7 @@ def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -
 
 
 def _kind(error: ValidationError) -> type[ConfigError]:
-    """Return the subclass of ConfigError that all errors are of, else ConfigError."""
+    """Return the subclass of ConfigError that all errors share, otherwise ConfigError."""
     kinds = {type(item.get("ctx", {}).get("error")) for item in error.errors()}
     kind = kinds.pop()
     if not kinds and issubclass(kind, ConfigError):
@@ -76,7 +76,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
             text = unknown("key", item["loc"][-1], inner.model_fields)
         if not text.startswith(key):
             text = f"{key}: {text}"
-        # Each alternative of a union has errors of its own. Only those of the first one are shown.
+        # Each alternative of a union has its own errors. Only those of the first one are shown.
         lines.setdefault(key, text)
     return "; ".join(lines.values())
 

@@ -16,8 +16,8 @@ from sb3_quad.base.types import StrDict, StrPath
 class Loader(yaml.SafeLoader):
     """PyYAML's SafeLoader, which refuses two equal keys, and reads what rl_zoo3 writes.
 
-    That is ordered mappings, tuples and names of classes. No class is imported. Aliases that make
-    much of a short text are refused.
+    That is ordered mappings, tuples and names of classes. No class is imported. Aliases that expand
+    a short text too much are refused.
     """
 
     def get_single_node(self) -> Any:
@@ -47,7 +47,7 @@ class Loader(yaml.SafeLoader):
 
 
 def _parts(node: Any) -> list[Any]:
-    """Return what a node of YAML holds, where a mapping holds pairs."""
+    """Return the parts of a YAML node, which are pairs for a mapping."""
     parts = getattr(node, "value", node)
     return [] if isinstance(parts, str) else list(parts or ())
 
@@ -100,7 +100,7 @@ class YamlFolder(NamedTuple):
     def is_path(self, source: StrPath) -> bool:
         """Whether a source is the path of a file rather than a name.
 
-        Where the suffix is part of the name, a source is a path if the user has such a file.
+        If the suffix is part of the name, a source is a path if the user has such a file.
         """
         if isinstance(source, Path):
             return True
@@ -128,7 +128,7 @@ class YamlFolder(NamedTuple):
         return not self.is_path(source) or source in self._files().values()
 
     def packaged(self, name: str) -> Any:
-        """Return the path of a file of the package, which no file of the user's replaces.
+        """Return the path of a file of the package, which a user's file does not replace.
 
         :raises ConfigError: An unknown name.
         """

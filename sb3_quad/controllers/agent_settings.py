@@ -26,19 +26,19 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle
 def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
     """Return how the agent in a zip flies, and the file that says so.
 
-    The file is the zip itself, else a ``config.yml`` in a folder next to it, where runs of this
+    The file is the zip itself, or else a ``config.yml`` in a folder next to it, where runs of this
     package and of rl_zoo3 keep their settings. If neither says how the agent flies, the settings
     are ``FlightSettings()`` and the file is None.
 
     :raises ConfigError: a zip or settings that cannot be read or do not fit; settings of several
         runs next to the zip; or of a run with wrappers, which flights here do not have.
     """
-    # Zips of this package say it themselves.
+    # Zips of this package contain the settings.
     data = saved_data(zip_file)
     if KEY in data:
         return settings_of_record(data[KEY], f"{zip_file}: {KEY}"), Path(zip_file)
 
-    # Other zips, such as those of rl_zoo3, lie in a run folder.
+    # Other zips, such as those of rl_zoo3, are in a run folder.
     configs = sorted(Path(zip_file).parent.glob("*/config.yml"))
     if not configs:
         return FlightSettings(), None
@@ -51,12 +51,13 @@ def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
 
 
 def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
-    """Return a warning if an agent was trained on another vehicle than ``flown``; else empty.
+    """Return a warning if an agent was trained on another vehicle than ``flown``; otherwise an
+    empty text.
 
     :param own: the agent's settings.
     """
     trained = first_vehicle(own.vehicle)
-    # An agent that was trained on many vehicles knows none of them in particular.
+    # An agent that was trained on many vehicles knows no particular one.
     if own.vehicles is not None or trained.flies_as(flown):
         return ""
     flies = name_beside(trained, flown)
@@ -65,17 +66,18 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
 
 def name_beside(known: Vehicle, flown: Vehicle) -> str:
     """Return the name of a vehicle that a controller flies and does not know."""
-    return flown.name + " of other parameters" * (known.name == flown.name)
+    return flown.name + " with other parameters" * (known.name == flown.name)
 
 
 def warn_of_observation(name: str, agent: Any, here: Any) -> None:
-    """Warn if an agent observed something else where it was trained, in a vector of the same size,
-    or had its rotors in another order.
+    """Warn if an agent was trained with other observations of the same size, or with its rotors in
+    another order.
 
     :param name: what the warning calls the agent.
     :param agent: a model. One that does not say how it flies gives no warning.
-    :param here: the flight settings where it is to fly, as a record or as they are; None: unknown.
-    :raises ConfigError: settings that do not fit, or rotors that are elsewhere.
+    :param here: the flight settings with which it is to fly, as a record or as an object; None:
+        unknown.
+    :raises ConfigError: settings that do not fit, or rotors in other places.
     """
     record = getattr(agent, KEY, None)
     if not record or not here:
@@ -87,9 +89,9 @@ def warn_of_observation(name: str, agent: Any, here: Any) -> None:
     theirs, ours = _observed(own), _observed(here)
     for key, before in theirs.items():
         now = ours[key]
-        # Training does without the integral that evaluations fly with. An agent may do without it
-        # and the preview first, and get them later: new weights begin at zero, and the integral
-        # changes nothing until there is a steady error.
+        # Training flies without the integral that evaluations use. An agent may start without it
+        # and the preview, and get them later: new weights begin at zero, and the integral changes
+        # nothing until there is a steady error.
         is_optional = (key == "position_integral" and not now) or (
             key in ("preview", "position_integral") and not before
         )
@@ -97,8 +99,8 @@ def warn_of_observation(name: str, agent: Any, here: Any) -> None:
             continue
         if not key.startswith("observation_"):
             differences.append(f"{key} {before}, here {now}")
-        # A scaling for each row is one of several vehicles, of which any may be the agent's. Of 18
-        # numbers the name is enough.
+        # With a scaling for each row, any of several vehicles may be the agent's. For 18 numbers,
+        # the name is enough.
         elif np.ndim(before) == np.ndim(now) == 1:
             differences.append(key)
     if find_turn(here.layout, own.layout) != Turn():
@@ -111,7 +113,7 @@ def warn_of_observation(name: str, agent: Any, here: Any) -> None:
 
 
 def _observed(settings: FlightSettings) -> StrDict:
-    """Return what is observed, with the values that a setting stands for where it is not given."""
+    """Return the settings of the observation, with the defaults of those that are not given."""
     observed = settings.observed
     observed |= {
         "history": [*settings.ages],
@@ -123,9 +125,9 @@ def _observed(settings: FlightSettings) -> StrDict:
 
 
 def settings_of_model(model: Any) -> FlightSettings | None:
-    """Return what a model says about how it flies; None: it says nothing.
+    """Return the flight settings that a model has; None: it has none.
 
-    :raises ConfigError: what it says does not fit.
+    :raises ConfigError: they do not fit.
     """
     record = getattr(model, KEY, None)
     if not isinstance(record, dict):
@@ -134,7 +136,7 @@ def settings_of_model(model: Any) -> FlightSettings | None:
 
 
 def settings_of_record(record: Any, where: str) -> FlightSettings:
-    """Return the settings that a zip or a model holds.
+    """Return the settings in a zip or a model.
 
     :param where: what messages call the record.
     :raises ConfigError: it does not fit.
@@ -144,8 +146,8 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
             f"{where}: must be a mapping of names to values, as"
             " FlightSettings(...).write_into(model) writes it"
         )
-    # A path in a stranger's zip could name a device file, which is read forever. Both a vehicle and
-    # a distribution may be given by a name, which could be a path.
+    # A path in a stranger's zip could name a device file, which would be read forever. Both a
+    # vehicle and a distribution may be given by a name, which could be a path.
     distribution = record.get("vehicles")
     if isinstance(distribution, dict):
         distribution = distribution.get("distribution")
@@ -158,7 +160,7 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
                 f"{where}: {key}: {source!r} is a path; "
                 "a zip holds such files or names those of the package"
             )
-    # A task is saved by its fields; a mixture holds weights by name instead.
+    # A task is saved by its fields; a mixture has weights by name instead.
     task = record.get("task")
     changes: StrDict = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}
     if isinstance(task, dict) and "name" in task:
@@ -173,7 +175,7 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
 def _settings_of_run(config: Path) -> FlightSettings:
     """Return the settings that the agent of a run was evaluated with.
 
-    They are ``env_kwargs`` in ``args.yml``, if it has some, else those in ``config.yml``.
+    They are ``env_kwargs`` in ``args.yml``, if it has some, otherwise those in ``config.yml``.
     """
     settings = read_yaml(config)
     parts = [settings.get("env_kwargs"), settings.get("eval_env_kwargs")]
@@ -183,7 +185,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
         if evaluated is not None:
             parts = [evaluated]
 
-    # The folder has the name of the environment, which says the task.
+    # The folder has the name of the environment, which tells the task.
     where = f"{config}: env_kwargs"
     given = {}
     if config.parent.name in ENVIRONMENTS:
@@ -194,9 +196,9 @@ def _settings_of_run(config: Path) -> FlightSettings:
 
 
 def env_kwargs(agent: StrPath | BaseAlgorithm, **changes: Any) -> StrDict:
-    """Return the keywords of environments that fly as an agent was trained to.
+    """Return the keywords of environments like those that an agent was trained in.
 
-    They are its vehicle, noise and observation.
+    These are its vehicle, noise and observation.
 
     >>> import gymnasium, sb3_quad
     >>> env = gymnasium.make("QuadTargetTracking-v0", **sb3_quad.env_kwargs("itm-robust"))
@@ -204,7 +206,7 @@ def env_kwargs(agent: StrPath | BaseAlgorithm, **changes: Any) -> StrDict:
     :param agent: a zip, a run folder, the name of a policy that comes with the package, or a model.
     :param changes: keywords of your own, which replace the agent's: ``vehicle="mine.yaml"`` flies
         it on your vehicle, also where it was trained on ``vehicles``.
-    :raises ConfigError: a zip or settings that cannot be read; an agent that holds none.
+    :raises ConfigError: a zip or settings that cannot be read; an agent without settings.
     """
     if isinstance(agent, BaseAlgorithm):
         settings = settings_of_record(getattr(agent, KEY, None), f"{type(agent).__name__}.{KEY}")

@@ -1,4 +1,4 @@
-"""One way to ask a controller for actions, whatever it is: an expert, an SB3 model, a function."""
+"""A common way to ask a controller for actions, be it an expert, an SB3 model or a function."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from sb3_quad.simulation.settings import KEY
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
-# Actions this far beyond the limits of the action space, in half ranges, are in some other unit.
+# Actions this far beyond the limits of the action space, in half ranges, must be in another unit.
 FAR = 0.5
 
 
@@ -36,24 +36,25 @@ class Controller:
     2 and 3 get the observations that a policy sees. An SB3 model that was trained behind
     ``VecNormalize`` gets raw ones, normalised by its own statistics. ``predict`` may return a state
     together with the actions, as SB3's recurrent policies do. The next call passes it back as
-    ``state``, with ``episode_start`` (n,): the rows that have just begun an episode. All rows of a
-    new Controller begin one.
+    ``state``, with ``episode_start`` (n,), the rows that have just begun an episode. For a new
+    Controller, all rows begin one.
 
     :param source: the controller, as above.
     :param action_space: the environment's action space, a Box.
     :param observation_space: the environment's observation space.
     :param true_state: returns the current true state; None: not available.
-    :param kind: what messages call the controller. With ``"expert"``, errors are ``ExpertError``.
+    :param kind: the word for the controller in messages. With ``"expert"``, errors are
+        ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
     :param env: the environment that an expert labels. It may have an action wrapper that is linear,
         such as ``RescaleAction``; :meth:`labels` then go through its inverse.
-    :raises ControllerError: the source is of no kind above, or its spaces do not fit (of an expert:
-        ``ExpertError``).
+    :raises ControllerError: the source is none of the above, or its spaces do not fit
+        (``ExpertError`` for an expert).
     """
 
-    # A VecNormalize whose raw observations the source sees instead of those that it is asked about.
+    # A VecNormalize whose raw observations the source sees instead of those it is given.
     _raw: Any = None
-    # Whether it has warned of actions outside of the action space.
+    # Whether it has warned about actions outside of the action space.
     _warned = False
 
     def __init__(
@@ -77,7 +78,7 @@ class Controller:
         name = getattr(source, "__name__", type(source).__name__)
         self._who = f"{kind} {name}"
 
-        # Refuse a controller that cannot work at once, not in the first step of a training.
+        # Refuse a controller that cannot work right away, not in the first step of a training.
         if isinstance(source, type):
             raise self._error(f"{self._who}: is a class; give an instance, such as {name}()")
         if not isinstance(action_space, spaces.Box):
@@ -87,14 +88,14 @@ class Controller:
                 f"{kind} {source!r}: must be a function of observations or have "
                 "predict(observation), or actions(state) if the environment has true_state()"
             )
-        # SB3's models and policies have spaces. Other controllers need none.
+        # SB3's models and policies have spaces; other controllers need none.
         for space, ours in (
             ("observation_space", observation_space),
             ("action_space", action_space),
         ):
             theirs = getattr(source, space, None)
             if isinstance(theirs, spaces.Space) and theirs.shape != ours.shape:
-                # An agent that says how it flies says what it observes.
+                # An agent that has flight settings also says what it observes.
                 way_out = ""
                 if space == "observation_space" and hasattr(source, KEY):
                     way_out = "; give **env_kwargs(the agent)"
@@ -106,8 +107,8 @@ class Controller:
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
         self._limits = limits_of(action_space)
-        # The source may speak of other limits: a model of those that it has learnt with, an expert
-        # of the true state of those that a quadcopter has under all wrappers.
+        # The source may use other limits: a model those that it has learnt with, an expert on the
+        # true state those of the quadcopter without wrappers.
         own = getattr(source, "action_space", None)
         through_wrapper = False
         if self._true_state is not None and env is not None and env.has_attr(KEY):
@@ -119,7 +120,7 @@ class Controller:
                 self._own_limits = limits_of(own)
                 through_wrapper = True
             if through_wrapper and not _is_straight(env, action_space, own):
-                way_out = "no wrapper such as RescaleAction leads straight from these to those"
+                way_out = "no wrapper such as RescaleAction converts one into the other"
                 if hasattr(source, "action_space"):
                     way_out = (
                         "train it within these, or give an environment with the wrapper that it"
@@ -152,7 +153,7 @@ class Controller:
                 "or call set_expert(expert); with beta=0, DAgger can clone the flights that its "
                 "dataset holds"
             )
-        # A recurrent expert keeps its state as long as it labels the same environment.
+        # A recurrent expert keeps its state while it labels the same environment.
         if present and present.made_for[0] is expert and present.made_for[1] is env:
             return present
         vehicles = env.get_attr("vehicle") if env.has_attr("vehicle") else ["itm"]
@@ -191,8 +192,8 @@ class Controller:
         :param observation: the observations of that state, (n, ...).
         :param rows: bool (n,), the rows that matter; the others get zeros. None: all.
         :param episode_start: bool (n,), the rows that have just begun an episode. None: none.
-        :raises ControllerError: the controller fails, or its actions are not finite or not of this
-            shape (of an expert: ``ExpertError``).
+        :raises ControllerError: the controller fails, or its actions are not finite or have another
+            shape (``ExpertError`` for an expert).
         """
         # A user's controller may raise anything.
         with raised_as(self._error, f"{self._who}: fails"):
@@ -213,7 +214,7 @@ class Controller:
             raise self._error(f"{self._who}: gives actions of shape {raw.shape}, must be {shape}")
         actions = raw.reshape(flat_shape).astype(np.float32)
 
-        # Rows that do not matter may hold anything, such as labels of a finished flight.
+        # Rows that do not matter may contain anything, such as labels of a finished flight.
         if rows is not None:
             actions[~rows] = 0.0
         finite = np.isfinite(actions).all(axis=1)
@@ -229,7 +230,8 @@ class Controller:
     def labels(self, observation: Any, episode_start: BoolArray | None = None) -> Float32Array:
         """Return the labels that an agent imitates.
 
-        They are :meth:`actions`, as the environment's wrapper takes them, within the action space.
+        They are :meth:`actions`, converted by the environment's action wrapper, within the action
+        space.
         """
         actions = self.actions(observation, episode_start=episode_start)
         low, high = self._limits
@@ -239,7 +241,7 @@ class Controller:
         return actions.clip(low, high)
 
     def _warn_of_units(self, actions: Float32Array) -> None:
-        """Warn once of actions that are far outside of the limits that the source knows."""
+        """Warn once if actions are far outside of the source's limits."""
         if self._warned:
             return
         low, high = self._limits if self._own_limits is None else self._own_limits
@@ -263,7 +265,8 @@ class Controller:
             observation = self._statistics.normalize_obs(observation)
         if not hasattr(self.source, "predict"):
             return self.source(observation)
-        # Without a state yet, the policy begins by itself. Many policies take no such keywords.
+        # As long as there is no state, the policy starts by itself. Many policies do not take these
+        # keywords.
         keywords = {}
         if self._predict_state is not None:
             keywords["state"] = self._predict_state
@@ -276,14 +279,14 @@ class Controller:
 
 
 def warn_of_vehicle(source: Any, vehicles: Sequence[Any]) -> None:
-    """Warn of an expert that is made for another vehicle than one that it flies.
+    """Warn if an expert is made for another vehicle than one that it flies.
 
-    :param vehicles: those of all rows.
+    :param vehicles: the vehicles of all rows.
     """
     known = getattr(source, "vehicle", None)
     if not isinstance(known, Vehicle) or getattr(source, "is_privileged", False):
         return
-    # Many rows have the same one.
+    # Many rows share a vehicle.
     for flown in {id(vehicle): vehicle for vehicle in vehicles}.values():
         if isinstance(flown, Vehicle) and not known.flies_as(flown):
             name = type(source).__name__
@@ -307,8 +310,8 @@ def _is_straight(env: VecEnv | None, space: spaces.Box, own: spaces.Box) -> bool
     """
     if env is None or not env.has_attr("action"):
         return False
-    # Within the limits, where every component has another share, a wrapper that bends or renumbers
-    # them is seen.
+    # Inside the limits, with another share for each component, a wrapper that is not linear or
+    # reorders components is noticed.
     inner = np.linspace(0.2, 0.8, space.low.size).reshape(space.shape)
     for share in (0.0, 1.0, inner, 0.7 * inner):
         action = space.low + share * (space.high - space.low)
@@ -321,7 +324,7 @@ def _is_straight(env: VecEnv | None, space: spaces.Box, own: spaces.Box) -> bool
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     """Return a function that returns the true state of all rows; None if ``env`` has no state."""
-    # The batched environment has the state of all rows; others have one for each environment.
+    # The batched environment has the state of all rows; others have one per environment.
     base: Any = env.unwrapped
     if hasattr(base, "true_state"):
         return base.true_state  # type: ignore[no-any-return]

@@ -19,5 +19,5 @@ class StateExpert(Protocol):
 ExpertLike = StateExpert | BaseAlgorithm | Callable[[Any], Any] | str
 """An expert on the true state, an SB3 model, or a function from observations to actions.
 
-Or a name as :func:`~sb3_quad.controllers.resolve.resolve_expert` takes it, such as ``"pid"``.
+It may also be a name for :func:`~sb3_quad.controllers.resolve.resolve_expert`, such as ``"pid"``.
 """

@@ -19,7 +19,7 @@ EXPERTS = {
     "privileged_derived": "sb3_quad.experts.geometric:privileged_derived",
 }
 DEFAULT_EXPERT = "pid"
-"""The expert that is imitated by default, the thesis's."""
+"""The expert that is imitated by default: the thesis's."""
 
 
 def resolve_expert(
@@ -30,13 +30,12 @@ def resolve_expert(
 ) -> Any:
     """Return the expert that ``spec`` names.
 
-    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model or of a
+    :param spec: a name of ``EXPERTS``, such as ``"pid"``; the path of an SB3 ``.zip`` model or of a
         safetensors file, or the name of a policy that comes with the package
-        (:func:`sb3_quad.pretrained`);
-        ``"package.module:factory"``, where ``factory(vehicle)`` returns an expert; or an expert
-        itself, returned as it is.
+        (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)``
+        returns an expert; or an expert itself, returned as it is.
     :param vehicle: the vehicle that a named expert is designed for; of several, the first.
-    :param kind: what messages call it.
+    :param kind: the word for it in messages.
     :param layout: ``rotor_layout`` of the environments that it flies in.
     :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be
         imported.
@@ -45,7 +44,7 @@ def resolve_expert(
     if not isinstance(spec, (str, Path)):
         return spec
     text = str(spec)
-    # A policy of the package and a run folder stand for a zip.
+    # The name of a policy of the package and a run folder stand for a zip.
     path = agent_path(text)
     if path.endswith(AGENTS):
         refuse_settings(path)

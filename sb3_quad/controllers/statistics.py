@@ -7,8 +7,8 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_quad.base.errors import ConfigError
 
-# The attribute of a model. It is the wrapper itself, whose pickle is its statistics: so every zip
-# of the model holds those of its time.
+# The attribute of a model. It is the wrapper itself, which pickles its statistics, so that every
+# zip of the model contains the current ones.
 STATISTICS = "vec_normalize"
 
 
@@ -24,10 +24,10 @@ def statistics_of(model: Any) -> Any:
 def share_statistics(statistics: Any, env: Any, training: bool = False) -> None:
     """Let an environment normalise by the statistics of another VecNormalize.
 
-    :param statistics: that one, or None.
+    :param statistics: the other VecNormalize, or None.
     :param env: a VecEnv, or None.
-    :param training: whether they go on learning there; else rewards stay raw, too, as in the
-        environments of SB3's EvalCallback.
+    :param training: whether they continue to learn there; otherwise rewards stay raw, too, as in
+        the environments of SB3's EvalCallback.
     :raises ConfigError: only one of the two normalises observations.
     """
     own = unwrap_vec_normalize(env)

@@ -1,4 +1,4 @@
-"""Agents as safetensors files: the weights, and as JSON what else a zip says of an agent.
+"""Agents as safetensors files: the weights, and as JSON the other attributes in a zip.
 
 Nothing in such a file is a pickle. ``sb3-quad export --format safetensors`` writes them.
 """
@@ -15,14 +15,13 @@ from sb3_quad.base.types import StrDict, StrPath
 
 ENDING = ".safetensors"
 AGENTS = (".zip", ENDING)
-"""The endings of files that hold an agent."""
+"""The suffixes of files that contain an agent."""
 
 
 def write_tensors(model: Any, data: StrDict) -> bytes:
     """Return a safetensors file of a model.
 
-    :param data: the attributes of its zip, of which those that are pickled are left out; and
-        further ones.
+    :param data: the attributes of its zip, and further ones; pickled ones are left out.
     :raises ConfigError: safetensors is not installed.
     """
     safetensors = require("safetensors.torch", "export", "--format safetensors")
@@ -33,7 +32,7 @@ def write_tensors(model: Any, data: StrDict) -> bytes:
     }
     plain |= {
         "observation_size": model.observation_space.shape[0],
-        # The module of its class tells the algorithm's family.
+        # The module of the policy's class tells the algorithm's family.
         "policy_class": {"__module__": type(model.policy).__module__},
         "policy_kwargs": model.policy_kwargs,
     }

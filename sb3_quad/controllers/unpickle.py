@@ -1,13 +1,13 @@
 """A strict reader of the pickles in SB3's zips.
 
-Python's own reader calls any function that a pickle names (docs/security.md). This one is made of
-it, but knows only the opcodes that SB3's pickles use. It looks names up in the tables of this file
-alone. It calls only functions of this file, which check their arguments, and changes only objects
-that the same pickle has made. So nothing outside the result changes.
+Python's own reader calls any function that a pickle names (docs/security.md). This one is derived
+from it, but knows only the opcodes that SB3's pickles use. It looks names up only in the tables of
+this file. It calls only functions of this file, which check their arguments, and changes only
+objects that the same pickle has made, so nothing outside the result changes.
 
-Small pickles can hold objects whose hash, copy or text crashes Python or never ends: very deep
-ones, and those that hold others many times, or themselves. So keys are plain, and what is used or
-returned is a tree of limited size.
+Small pickles can contain objects whose hash, copy or text crashes Python or never ends: very deep
+ones, and those that contain others many times, or themselves. Therefore keys are plain, and what is
+used or returned is a tree of limited size.
 """
 
 import base64
@@ -36,14 +36,14 @@ _STEPS = 1_500_000
 
 
 def unpickle(content: str | bytes, where: str) -> Any:
-    """Return the object that an entry of an SB3 zip holds. :func:`trusted` files may hold any.
+    """Return the object in an entry of an SB3 zip. :func:`trusted` files may contain any.
 
     Tensors become None.
 
     :param content: a pickle, or its text in base64, as SB3 writes it.
-    :param where: what messages call the entry.
-    :raises ConfigError: the pickle names or does something that SB3's own pickles do not. Nothing
-        of that has been imported or called.
+    :param where: the name of the entry in messages.
+    :raises ConfigError: the pickle names or does something that SB3's own pickles do not. None of
+        it has been imported or called.
     """
     try:
         if isinstance(content, str):
@@ -51,7 +51,7 @@ def unpickle(content: str | bytes, where: str) -> Any:
         if trusted():
             return pickle.loads(content)
         steps = _Steps(content)
-        # Those of SB3 need up to two for each byte.
+        # SB3's pickles need up to two steps for each byte.
         steps.left = min(_STEPS, 10_000 + 5 * len(content))
         reader = _Reader(steps)
         reader.steps = steps
@@ -60,8 +60,9 @@ def unpickle(content: str | bytes, where: str) -> Any:
         return value
     except _Refusal as error:
         fault = str(error)
-    except Exception as error:  # what wrong types raise depends on the types
-        # Its message may show an object of the pickle, and to show it is to call it.
+    except Exception as error:  # wrong types may raise anything
+        # Do not show its message, which may contain an object of the pickle, and showing that calls
+        # it.
         fault = f"{_UNLIKE_SB3} ({type(error).__name__})"
     raise ConfigError(f"{where} {fault}; {WAY_OUT}")
 
@@ -81,7 +82,7 @@ def _is_one_of(value: Any, names: StrDict) -> bool:
 
 
 def held(item: Any) -> Collection[Any]:
-    """Return what an object of a pickle holds. Keys are plain."""
+    """Return what an object of a pickle contains. Keys are plain."""
     if _is_one_of(type(item), _WITH_ATTRIBUTES):
         item = vars(item)
     if isinstance(item, dict):
@@ -89,7 +90,7 @@ def held(item: Any) -> Collection[Any]:
     return item if isinstance(item, (list, tuple, deque)) else ()
 
 
-# Functions that stand for those that SB3's pickles call.
+# Functions that replace those that SB3's pickles call.
 
 
 def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> Any:
@@ -102,30 +103,30 @@ def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) ->
 
 
 def _dtype(code: Any, *_: Any) -> Any:
-    """Make a dtype of numbers; an array of objects made of bytes would read memory as it likes."""
+    """Make a dtype of numbers; an array of objects made from bytes would read arbitrary memory."""
     _check(type(code) is str and re.fullmatch(r"[biufc]\d{1,2}", code) is not None, "a dtype")
     return np.dtype(code)
 
 
 def _check_tensor(stored: Any, offset: Any, shape: Any, *_: Any) -> None:
-    """Refuse a tensor of more numbers than a file stores for it, which repeats them."""
+    """Refuse a tensor with more numbers than the file stores for it, which would repeat them."""
     _check({*map(type, (stored, offset, *shape))} == {int}, "a tensor")
     _check(offset + math.prod(shape) <= stored, "a tensor")
 
 
-# A member of this enumeration is called for by its value. The enumeration itself would show a wrong
-# value in its message.
+# Pickles look up a member of this enumeration by its value. The enumeration itself would show a
+# wrong value in its message.
 _unit = TrainFrequencyUnit._value2member_map_.__getitem__
 
 
 def _unit_by_name(enumeration: Any, name: Any) -> TrainFrequencyUnit:
-    """Return it by its name, as Python 3.11.0 to 3.11.3 pickle it, and nothing else."""
+    """Return a unit by its name, as Python 3.11.0 to 3.11.3 pickle it, and nothing else."""
     _check(enumeration is _unit and type(name) is str, "an enumeration")
     return TrainFrequencyUnit[name]
 
 
 def _none(*_: Any) -> None:
-    """Stand for what is not needed."""
+    """Replace what is not needed."""
 
 
 # Tables: what a pickle may name.
@@ -153,7 +154,7 @@ _WITH_ATTRIBUTES = _by_name(
     stable_baselines3.common.vec_env.vec_normalize.VecNormalize
     """
 )
-# The others of these are only named, but for TrainFreq, a named tuple.
+# The others are only named, except for TrainFreq, a named tuple.
 _CLASSES = _WITH_ATTRIBUTES | _by_name(
     """
     numpy.float32
@@ -202,7 +203,8 @@ _CLASSES = _WITH_ATTRIBUTES | _by_name(
     torch.optim.sgd.SGD
     """
 )
-# The function that is called for a name. Items and state of its result follow in the pickle.
+# The function that is called for a name. The items and the state of its result follow in the
+# pickle.
 _FUNCTIONS = {
     "numpy.dtype": _dtype,
     # Random numbers: a space without a generator makes its own, which SB3 seeds.
@@ -221,7 +223,7 @@ _FUNCTIONS = {
     "stable_baselines3.common.type_aliases.TrainFrequencyUnit": _unit,
     "builtins.getattr": _unit_by_name,
 }
-# Arguments of these functions, which know by themselves what they make.
+# Arguments of these functions, which need no other information.
 _ARGUMENTS = {
     "numpy.ndarray": "an array",
     "numpy.random._pcg64.PCG64": "a bit generator",
@@ -232,8 +234,8 @@ _ARGUMENTS = {
     "torch.LongStorage": "numbers",
 }
 _KNOWN = _CLASSES | _FUNCTIONS | _ARGUMENTS
-# Opcodes that only put plain values on the stack, or move what is there, also from and to the memo,
-# by which a pickle names an object twice; and those that ask _Reader.find_class or
+# Opcodes that only put plain values on the stack, or move values, including from and to the memo,
+# by which a pickle refers to an object again; and those that ask _Reader.find_class or
 # _Reader.persistent_load.
 _HARMLESS = """
     PROTO STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT
@@ -259,7 +261,7 @@ class _Reader(pickle._Unpickler):
     """Python's reader for few opcodes, which checks what they name, call and change."""
 
     steps: _Steps
-    # Python's, which have no public types.
+    # Attributes of Python's reader, which have no public types.
     stack: list[Any]
     read: Callable[[int], bytes]
     pop_mark: Callable[[], list[Any]]
@@ -302,23 +304,23 @@ class _Reader(pickle._Unpickler):
         kind = type(instance)
         self.walk(state)
         if isinstance(instance, np.dtype):
-            # A plain dtype in this machine's byte order is so already.
+            # A plain dtype in this machine's byte order needs no change.
             _check(state[1:5] == (instance.str[0], None, None, None), "a dtype")
         elif kind is np.ndarray:
             _, shape, dtype, by_columns, content = state
             # The content is copied.
             self.steps.left -= len(content) // 128
-            # NumPy itself trusts the state of an array, but for one that an array has given.
+            # NumPy does not check the state of an array, so use one that an array has returned.
             values = _array(content, dtype, shape, "F" if by_columns is True else "C")
             _, _, checked_state = values.__reduce__()
             instance.__setstate__(checked_state)
-        # None stands for random numbers; PyTorch notes versions at its OrderedDict.
+        # None stands for random numbers; PyTorch attaches versions to its OrderedDict.
         elif instance is not None and kind is not OrderedDict:
             _check(_is_one_of(kind, _WITH_ATTRIBUTES) and type(state) is dict, "a state")
             are_plain = all(type(name) is str and not name.startswith("__") for name in state)
             _check(are_plain, "attributes")
             vars(instance).update(state)
-            # It may hold itself now.
+            # It may contain itself now.
             self.walk(instance)
             if hasattr(kind, "__setstate__"):
                 kind.__setstate__(instance, state)
@@ -326,7 +328,7 @@ class _Reader(pickle._Unpickler):
                 _check(instance.low.shape == instance.high.shape == instance._shape, "a Box")
 
     def read_array(self) -> None:
-        # Python's makes room for whatever size is named.
+        # Python's own method allocates whatever size the pickle names.
         self.stack.append(bytearray(self.read(int.from_bytes(self.read(8), "little"))))
 
     def extend(self, new: list[Any]) -> None:
@@ -349,7 +351,7 @@ class _Reader(pickle._Unpickler):
         # A frame says how much to read at once.
         pickle.FRAME[0]: lambda self: self.read(8),
         pickle.BYTEARRAY8[0]: read_array,
-        # Python's would also take a mark, which no pickler writes.
+        # Python's own method would also pop a mark, which no pickler writes.
         pickle.POP[0]: lambda self: self.stack.pop(),
         pickle.REDUCE[0]: call,
         pickle.NEWOBJ[0]: make,

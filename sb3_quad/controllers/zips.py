@@ -34,36 +34,37 @@ _FAMILIES = {
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
 }
-# This package's algorithms with their family, and a setting that only they save. Apart from that
-# their zips are those of the stock algorithm.
+# This package's algorithms with their family, and a setting that only they save. Otherwise their
+# zips are those of the stock algorithm.
 _OURS = {
     "PPOBC": ("PPO", "bc_coef"),
     "DAgger": ("PPO", "beta"),
     "SACBC": ("SAC", "bc_coef"),
     "APG": ("PPO", "carry_on"),
 }
-# Of the pickles of an agent, ``predict`` needs only these.
+# ``predict`` needs only these of an agent's pickles.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs", STATISTICS)
 # SB3 pickles NumPy numbers; these prefixes mark them.
 _NUMBERS = ("<class 'numpy.int", "<class 'numpy.float")
 # The others become None, or these values where SB3 cannot load None.
 _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}
-# SB3 and this package never save these, and loading them would import what they name.
+# SB3 and this package never save these, and loading them would import the modules that they name.
 _NEVER_READ = ("env", "expert", "_labeller")
 DAMAGED = "not a complete SB3 zip"
 WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
-# What SB3 saves apart from policies and optimisers. Loading another one would set any attribute.
+# The variables that SB3 saves besides policies and optimisers. Loading others would set any
+# attribute.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 _VARIABLE_FILES = ("pytorch_variables.pth", "tensors.pth")
-# Values in spaces and in the policy's keywords; each layer takes time.
+# Largest number of values in spaces and in the policy's keywords; each layer takes time.
 _LARGEST = 1000
-# Keywords that say nothing of a policy's layers, and that not all policies or devices take.
+# Keywords that do not affect a policy's layers, and that not all policies or devices accept.
 _WITHOUT_SIZE = ("device", "optimizer_class", "optimizer_kwargs", "squash_output", "use_sde")
 
 
 def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
-    """Return the attributes of the model in an SB3 ``.zip``, or in a safetensors file, as its JSON
-    has them.
+    """Return the attributes of the model in an SB3 ``.zip``, or in a safetensors file, as in its
+    JSON.
 
     Attributes that are pickled there stay pickled.
 
@@ -79,13 +80,13 @@ def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
         if not Path(path).is_file():
             guess = did_you_mean(path, pretrained_names())
             raise ConfigError(f"{where}: no such file; {guess}".rstrip("; "))
-    # What a damaged archive raises depends on where the damage is.
+    # A damaged archive may raise anything.
     with raised_as(ConfigError, f"{where}: {DAMAGED}"), _open(path, where) as archive:
         return dict(json.loads(archive.read("data")))
 
 
 def _open(file: Any, where: str) -> zipfile.ZipFile:
-    """Open a zip whose parts need no more memory than it has bytes, as SB3 and PyTorch write it.
+    """Open a zip whose parts need no more memory than its size, as SB3 and PyTorch write it.
 
     :raises ConfigError: parts are compressed, or overlap.
     """
@@ -100,8 +101,8 @@ def _open(file: Any, where: str) -> zipfile.ZipFile:
 def saved_algorithm(path: StrPath) -> str:
     """Return the name of the algorithm that made an SB3 ``.zip``.
 
-    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, SACBC, DAgger or APG of this package.
-    A zip does not name its algorithm. The policy class and the settings in it tell.
+    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, SACBC, DAgger or APG of this package. A zip does not
+    name its algorithm; the policy class and the settings in it tell which one it is.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an
         unknown family.
@@ -132,18 +133,18 @@ def load_zip(
     where: str = "",
     **kwargs: Any,
 ) -> Algorithm:
-    """Return ``algorithm.load(path, **kwargs)``, without running any code of the file's own.
+    """Return ``algorithm.load(path, **kwargs)``, without running any code from the file.
 
     PyTorch reads the weights with ``weights_only``; :func:`unpickle` reads the pickles that are
-    saved with them. If the user has declared files :func:`trusted`, SB3 reads all of it.
+    saved with them. If the user has declared files :func:`trusted`, SB3 reads everything.
 
     :param to_fly: load for ``predict`` only. Schedules, noise and the like, which may be functions,
         are then not read at all.
     :param where: what messages call the file; empty: its path.
-    :raises ConfigError: a missing or damaged file, or one that may run code of its own.
+    :raises ConfigError: a missing or damaged file, or one that may run code.
     """
     where = where or f"model {path}"
-    # What stands in ``custom_objects`` is not unpickled by SB3.
+    # SB3 does not unpickle what is in ``custom_objects``.
     objects: StrDict = {}
     data = {} if trusted() else saved_data(path, where)
     for key, entry in data.items():
@@ -155,11 +156,11 @@ def load_zip(
                 objects[key] = _STAND_INS.get(key)
             else:
                 objects[key] = unpickle(entry[":serialized:"], f"{where}: its {key}")
-    # A zip whose parts do not fit raises whatever its parts raise.
+    # A zip with parts that do not fit may raise anything.
     with raised_as(ConfigError, f"{where}: cannot be loaded"), warnings.catch_warnings():
-        # SB3 takes the buffer of n-step returns, its own choice, for the user's.
+        # SB3 mistakes the buffer of n-step returns, its own choice, for the user's.
         warnings.filterwarnings("ignore", "`n_steps=")
-        # It reads the layers of older zips, too.
+        # SB3 reads the layers of older zips, too.
         warnings.filterwarnings("ignore", "As shared layers")
         if data:
             with _open(path, where) as archive:
@@ -168,7 +169,9 @@ def load_zip(
 
 
 def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> None:
-    """Check what PyTorch and the policy's class make of a zip, neither of which limits its size."""
+    """Check the parameters and the policy in a zip, since neither PyTorch nor the policy's class
+    limits their size.
+    """
     for part in archive.namelist():
         if not part.endswith(".pth"):
             continue
@@ -185,7 +188,7 @@ def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> No
                 f"{where}: holds variables that no algorithm has; "
                 f"known are {', '.join(sorted(_VARIABLES))}"
             )
-    # Half precision is the least that somebody may have saved.
+    # Half precision is the smallest format that somebody may have saved.
     _check_size(data, archive.getinfo("policy.pth").file_size // 2, where)
 
 
@@ -193,7 +196,7 @@ def _check_size(data: StrDict, most: int, where: str) -> None:
     """Check how many parameters a policy asks for, without making it.
 
     :param data: the attributes of its model, unpickled.
-    :param most: that its file may hold.
+    :param most: the most parameters that its file can contain.
     """
     walk([data.get(key) for key in _TO_FLY], held, _LARGEST)
     given = data["policy_kwargs"]
@@ -220,7 +223,7 @@ def _build_model(algorithm: Any, path: StrPath, device: str) -> Any:
         keywords = parse_mapping(data["policy_kwargs"], "policy_kwargs")
         model = algorithm("MlpPolicy", None, policy_kwargs=keywords, _init_setup_model=False)
         model.device = th.device(device)
-        # A policy cannot see more than its file holds weights.
+        # A policy cannot observe more numbers than its file has weights.
         most = sum(tensor.numel() for tensor in tensors.values())
         seen = min(data["observation_size"], most)
         model.observation_space, model.action_space = quadcopter_spaces(seen)
@@ -239,10 +242,10 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     """Return the model in an SB3 ``.zip``, or in a safetensors file, ready for ``predict``.
 
     It may be of PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, or of this package. Its
-    ``vec_normalize`` are the statistics of VecNormalize that it was trained with, if any.
+    ``vec_normalize`` has the statistics of VecNormalize that it was trained with, if any.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown
-        family, parameters that are not finite, or a file that may run code of its own.
+        family, parameters that are not finite, or a file that may run code.
     """
     name = saved_algorithm(path)
     # ``predict`` of this package's algorithms is that of the stock ones.
@@ -259,7 +262,7 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
             raise ConfigError(
                 f"model {path}: {parameter} contains NaN or infinity; the model is unusable"
             )
-    # A zip of this package holds all that its agent needs.
+    # A zip of this package contains all that its agent needs.
     if not {KEY, STATISTICS} & vars(model).keys():
         setattr(model, STATISTICS, _statistics_beside(path))
     return model
@@ -268,9 +271,9 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
 def _statistics_beside(path: StrPath) -> VecNormalize | None:
     """Return what is in the ``vecnormalize.pkl`` that rl_zoo3 keeps in a folder next to a zip.
 
-    None: the agent was trained without.
+    None: the agent was trained without statistics.
 
-    :raises ConfigError: a file that cannot be read, or none where the run had statistics.
+    :raises ConfigError: a file that cannot be read, or no file although the run had statistics.
     """
     for file in Path(path).parent.glob("*/vecnormalize.pkl"):
         statistics = unpickle(file.read_bytes(), str(file))
@@ -282,11 +285,11 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
 
 
 def refuse_settings(path: StrPath, keys: Sequence[str] = WRAPPERS) -> None:
-    """Check that an agent was trained without some settings, by the run in whose folder it lies.
+    """Check that an agent was trained without some settings, according to its run folder.
 
-    A zip of this package that says how its agent flies was.
+    A zip of this package with flight settings always was.
 
-    :param keys: of settings files, of this package and of rl_zoo3.
+    :param keys: keys of settings files, of this package and of rl_zoo3.
     :raises ConfigError: it was trained with one of them.
     """
     if KEY in saved_data(path):

@@ -31,13 +31,13 @@ from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.tasks import Task, in_words
 from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
-THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
+THESIS_VEHICLE = "itm"  # the thesis has metrics of no other one
 
 
 class Comparison(dict[str, dict[str, Metrics]]):
     """The metrics by label and task; ``str``, ``rich`` and notebooks show them as tables.
 
-    ``tables`` (one for each task) are what is shown.
+    ``tables`` has the table of each task.
     """
 
     tables: list[Table]
@@ -49,7 +49,7 @@ class Comparison(dict[str, dict[str, Metrics]]):
         return Group(*self.tables)
 
     def _repr_markdown_(self) -> str:
-        # Notebooks render this; a table in Markdown has no title of its own.
+        # Notebooks render this; a table in Markdown has no title.
         return "\n\n".join(f"**{table.title}**\n\n{table.markdown()}" for table in self.tables)
 
 
@@ -66,9 +66,9 @@ def compare(
 
     Each agent flies as it was trained: with the vehicle, the noise and the observation that its zip
     or ``model.flight_settings`` names. Experts, functions and agents that name none fly the vehicle
-    and the noise of the first agent that names them. So does what a factory makes; a model keeps
-    its own observation. Experts see the true state. A warning names those that fly another vehicle
-    than they know.
+    and the noise of the first agent that names them. So do controllers that a factory makes, except
+    that a model keeps its own observation. Experts see the true state. A warning names those that
+    fly another vehicle than they know.
 
     >>> from sb3_quad.evaluation.compare import compare
     >>> result = compare({"PID": "pid", "agent": "itm-recovery"}, ["state_recovery"], n_flights=48)
@@ -80,20 +80,20 @@ def compare(
     ┃             ┃                 PID ┃                 agent ┃
     ...
 
-    :param controllers: by label: the name of an expert (``"pid"``) or of an agent that comes with
-        the package (``"itm-robust"``), the path of a zip, ``"package.module:factory"``, an SB3
-        model, an expert, or a function from observations (n, 18) to actions (n, 4).
+    :param controllers: controllers by label: the name of an expert (``"pid"``) or of an agent that
+        comes with the package (``"itm-robust"``), the path of a zip, ``"package.module:factory"``,
+        an SB3 model, an expert, or a function from observations (n, 18) to actions (n, 4).
     :param tasks: names, :class:`~sb3_quad.simulation.tasks.Task` or mixtures ``{name: weight}``, or
-        one of these alone.
+        only one of these.
     :param n_flights: episodes of each task.
-    :param seed: of the episodes, as :func:`~sb3_quad.evaluation.flights.fly` takes it; None: one
+    :param seed: seed of the episodes, as for :func:`~sb3_quad.evaluation.flights.fly`; None: one
         that no training flies.
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) as
         :func:`~sb3_quad.evaluation.flights.fly` takes it, or ``"package.module:function"``. Its
-        mean stands below that of the task.
-    :param thesis_columns: columns of the thesis to add where its vehicle flies one of its tasks:
+        mean is shown below that of the task.
+    :param thesis_columns: columns of the thesis to add if its vehicle flies one of its tasks:
         ``"expert"``, ``"IL-agent"``, ``"RL-agent"``.
-    :param env_kwargs: fields of :class:`~sb3_quad.simulation.settings.FlightSettings` that hold for
+    :param env_kwargs: fields of :class:`~sb3_quad.simulation.settings.FlightSettings` that apply to
         all controllers, such as ``vehicle`` or ``noise``.
     :return: ``result[label][task]`` are :class:`~sb3_quad.evaluation.metrics.Metrics`, each with
         its 95 % interval; ``print(result)`` shows the tables.
@@ -123,7 +123,7 @@ def compare(
     for label, how in settings.items():
         pilot = resolve_expert(controllers[label], how.vehicle, "controller", how.rotor_layout)
         own = settings_of_model(pilot)
-        # A model from a factory says only now what it observes.
+        # What a model from a factory observes is known only now.
         if own is not None:
             settings[label] = how.with_changes(**{**own.carried, **env_kwargs})
         refuse_several_limits(settings[label])
@@ -145,7 +145,7 @@ def compare(
 
 
 def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, FlightSettings]:
-    """Return how each controller flies, the task excepted."""
+    """Return the flight settings of each controller, except for the task."""
     shared: StrDict = {}
     own = {}
     for label, controller in controllers.items():
@@ -155,9 +155,9 @@ def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, Flig
         else:
             known = settings_of_model(controller)
         if known is not None:
-            # On another vehicle the agent still finds its rotors where it knows them.
+            # On another vehicle, the agent still has its rotors where it knows them.
             own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
-            # The first agent decides for all that do not say how they fly.
+            # The first agent decides for all controllers that do not say how they fly.
             if not shared:
                 shared = {
                     "vehicle": known.vehicle,
@@ -180,7 +180,7 @@ def _task_table(
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task.
 
-    :param suite: the thesis's, which has the rows and what it published.
+    :param suite: the thesis's suite, which has the rows and the published metrics.
     """
     vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
     first, *others = vehicles.values()
@@ -188,7 +188,7 @@ def _task_table(
     scenario = suite.scenario(THESIS_SCENARIOS.get(task, "tracking"))
     reference = settings[next(iter(settings))].reference
     if reference is not None:
-        # Nothing is published of targets that move.
+        # Nothing is published for moving targets.
         scenario = scenario.model_copy(update={"reference": reference, "published": {}})
     names = []
     if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):

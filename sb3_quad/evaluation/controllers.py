@@ -25,7 +25,7 @@ from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 class ControllerSpec:
     """A controller as named.
 
-    :param label: heads its column.
+    :param label: heading of its column.
     :param spec: ``pid``, ``geometric``, the path of an SB3 zip, or ``package.module:factory``.
     """
 
@@ -34,19 +34,19 @@ class ControllerSpec:
 
     @property
     def is_zip(self) -> bool:
-        """Whether it is an agent in a zip or a safetensors file."""
+        """Whether it is an agent in a zip or in a safetensors file."""
         return self.spec.endswith(AGENTS)
 
     @property
     def kind(self) -> Literal["expert", "model", "factory"]:
-        """What it is, as :class:`~sb3_quad.evaluation.results.ControllerRecord` has it."""
+        """Its kind, as in :class:`~sb3_quad.evaluation.results.ControllerRecord`."""
         if self.is_zip:
             return "model"
         return "expert" if self.spec in EXPERTS else "factory"
 
     @cached_property
     def own(self) -> FlightSettings | None:
-        """The settings that the agent's zip holds; None: experts, factories, and zips without any.
+        """The settings in the agent's zip; None for experts, factories, and zips without settings.
 
         :raises ConfigError: see :func:`agent_settings`.
         """
@@ -66,8 +66,8 @@ class ControllerSpec:
     def notice(self, vehicle: VehicleSource) -> str:
         """Return a warning if the agent was trained on another vehicle, or does not say on which.
 
-        :return: the warning, in one line; else empty.
-        :raises ConfigError: it cannot fly the vehicle, whose rotors are elsewhere.
+        :return: the warning, in one line; empty if there is none.
+        :raises ConfigError: it cannot fly the vehicle, whose rotors are in other places.
         """
         flown = load_vehicle(vehicle)
         if self.own is not None:
@@ -86,11 +86,11 @@ class ControllerSpec:
 def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
     """Read controllers from ``spec`` or ``label=spec``.
 
-    Without a label it is the spec; of a zip, the file's name.
+    Without a label, the label is the spec; for a zip, it is the file's name.
 
-    :raises ConfigError: two controllers of the same label, or a label that cannot be printed.
+    :raises ConfigError: two controllers with the same label, or a label that cannot be printed.
     """
-    # Labels that differ may still be the same as names of files.
+    # Different labels may still become the same file name.
     specs: dict[str, ControllerSpec] = {}
     for text in texts:
         label, equals, path = text.partition("=")
@@ -130,7 +130,7 @@ def controller_record(spec: ControllerSpec) -> ControllerRecord:
 
 
 def load_reward(reward: OwnReward) -> Reward | None:
-    """Return a reward of the user's own.
+    """Return a user's reward.
 
     :param reward: a function, returned as it is; or ``package.module:function``.
     :raises ConfigError: it cannot be imported, or is not a function.

@@ -1,5 +1,5 @@
-"""A suite for any number of controllers: scenario by scenario flown, summed up and written into a
-folder of its own.
+"""A suite for any number of controllers: flown scenario by scenario, summarised, and written into a
+folder.
 """
 
 import hashlib
@@ -47,15 +47,15 @@ from sb3_quad.executors import start_executor
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
-# Flights whose trajectories are kept, at most: of a scenario that is the same each time, and of
-# others.
+# The number of flights whose trajectories are kept: of a scenario that is the same each time, and
+# of others
 RECORDED_FIXED = 24
 RECORDED_RANDOM = 8
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, the last one done
 
 
 class Job(NamedTuple):
-    """A controller in a scenario, as the suite has it.
+    """A controller in a scenario.
 
     :param reward: your own, as a function or ``package.module:function``; None: none.
     """
@@ -67,7 +67,7 @@ class Job(NamedTuple):
 
     @property
     def name(self) -> tuple[str, str]:
-        """Scenario and controller, as :class:`~sb3_quad.evaluation.results.Entry` has it."""
+        """Scenario and controller, as in :class:`~sb3_quad.evaluation.results.Entry`."""
         return self.scenario.name, self.spec.label
 
 
@@ -84,19 +84,19 @@ def evaluate(
     address: str | None = None,
     reward: OwnReward = None,
 ) -> Results:
-    """Fly all scenarios of a suite by all controllers, on the same episodes.
+    """Fly all scenarios of a suite with all controllers, on the same episodes.
 
     A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the
-    others still fly. Repeat an interrupted call and it resumes. Only factories, and all controllers
-    where there is an own reward, fly again, since their code may have changed.
+    others still fly. Repeat an interrupted call and it resumes. Only factories, or all controllers
+    if there is a reward of your own, fly again, since their code may have changed.
 
-    :param folder: of the results; where no controller can be loaded, it is not made.
+    :param folder: folder of the results; it is not made if no controller can be loaded.
     :param workers: processes that fly at the same time; with one, and no Ray, this process flies.
-    :param overwrite: remove the results that the folder holds, instead of refusing it, and start
-        from scratch.
+    :param overwrite: remove the results in the folder, instead of refusing it, and start from
+        scratch.
     :param report: gets a line for each agent that flies another vehicle than it was trained on, or
         does not say on which.
-    :param executor: of the workers, see :func:`~sb3_quad.executors.start_executor`, as is
+    :param executor: executor of the workers, see :func:`~sb3_quad.executors.start_executor`, as for
         ``address``.
     :param reward: a reward of your own, see :func:`~sb3_quad.evaluation.flights.fly`, or
         ``package.module:function``.
@@ -105,7 +105,7 @@ def evaluate(
     """
     refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
-        # A missing PyBullet is one error here, not one for each controller.
+        # Here a missing PyBullet is a single error, rather than one for each controller.
         from sb3_quad.base import bullet  # noqa: F401
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
@@ -113,7 +113,7 @@ def evaluate(
     load_reward(reward)
 
     records, failures = _load_controllers(suite, controllers, report)
-    # Scenario by scenario, so that a suite that is interrupted compares all controllers.
+    # Go scenario by scenario, so that even an interrupted suite compares all controllers.
     jobs = [
         Job(spec, scenario, backend, reward) for scenario in suite.scenarios for spec in records
     ]
@@ -181,12 +181,12 @@ def _fly_missing(
     address: str | None,
 ) -> Results:
     """Fly the jobs without an entry, and write everything into the folder."""
-    # Workers finish in any order; the entries stand in that of the suite.
+    # Workers finish in any order; the entries are in that of the suite.
     order = [job.name for job in jobs]
     done = {entry.name for entry in results.entries}
     missing = [job for job in jobs if job.name not in done]
     progress(len(done), len(jobs), "")
-    # Closed, so that the workers end at once where an outcome cannot be written.
+    # Closed, so that the workers end at once if an outcome cannot be written.
     with closing(_fly_jobs(missing, workers, executor, address)) as flown:
         for number, (job, outcome) in enumerate(flown, len(done) + 1):
             if isinstance(outcome, Failure):
@@ -196,7 +196,7 @@ def _fly_missing(
                 write_arrays(place / entry.flights, compressed=True, **arrays)
                 results.entries.append(entry)
                 results.entries.sort(key=lambda entry: order.index(entry.name))
-                # After each job, so that an interrupted evaluation can resume.
+                # Write after each job, so that an interrupted evaluation can resume.
                 results.write(place, finished=False)
             progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
     if results.entries:
@@ -215,8 +215,8 @@ def fly_scenario(
 ) -> Flights:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
 
-    :param controller: as :func:`~sb3_quad.evaluation.flights.fly` takes it, as is ``reward``.
-    :param hooks: are called along the first flights, at most ``PART_SIZES``.
+    :param controller: as for :func:`~sb3_quad.evaluation.flights.fly`, like ``reward``.
+    :param hooks: are called during the first flights, at most ``PART_SIZES``.
     :param own: settings that go with the controller: its ``FlightSettings.observed``.
     :raises ConfigError: an unknown backend, or a controller of an unknown kind.
     :raises ControllerError: a controller or reward that fails in flight.
@@ -244,10 +244,10 @@ def fly_scenario(
 
 
 def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
-    """Fly a job and sum it up.
+    """Fly a job and summarise it.
 
-    :return: the entry, and the arrays of its flights (``flightlog.py``); or the failure of a
-        controller that fails.
+    :return: the entry, and the arrays of its flights (``flightlog.py``); or the failure of the
+        controller.
     """
     start = time.perf_counter()
     own = job.spec.own
@@ -300,7 +300,7 @@ def _fly_jobs(
 
 
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
-    """The vehicle that a controller flies in a scenario: the scenario's, else its own."""
+    """The vehicle that a controller flies in a scenario: the scenario's, otherwise its own."""
     if scenario.vehicle is not None or spec.own is None:
         return scenario.nominal_vehicle()
     return first_vehicle(spec.own.vehicle)
@@ -309,8 +309,9 @@ def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
 def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> list[Entry]:
     """Return the entries that an interrupted call of the same evaluation has left.
 
-    A finished one has flown all, so that its table can be shown again. Jobs that may not repeat
-    are not among them, and a finished evaluation with such jobs is other results.
+    A finished evaluation has flown all jobs, so that its table can be shown again. Jobs that may
+    not repeat exactly are left out, and a finished evaluation with such jobs counts as other
+    results.
 
     :raises ConfigError: the folder holds other results that are not to be overwritten, or damaged
         ones.
@@ -324,13 +325,13 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
         # Start from scratch: all numbers in a folder are those of one command.
         for name in WRITTEN:
             (folder / name).unlink(missing_ok=True)
-        # Those of the results alone; a reader may keep files of their own beside them.
+        # Only files of the results; users may keep other files beside them.
         made = [folder / entry.flights for entry in before.entries]
         for file in (folder / FLIGHTS).glob("*/*.npz"):
             if file in made:
                 file.unlink()
         return []
-    # Code outside of this package may have changed: a factory's, and that of an own reward.
+    # Code outside of this package may have changed: that of a factory or of a user's reward.
     kept = {job.name for job in jobs if job.spec.kind != "factory" and job.reward is None}
     if before.digest != digest or (before.finished and len(kept) < len(jobs)):
         raise ConfigError(
@@ -360,7 +361,7 @@ def _digest(
 def _failure(name: tuple[str | None, str], error: SB3QuadError) -> Failure:
     """Return the record of an error, in one line.
 
-    :param name: of the job; without a scenario the controller did not load.
+    :param name: name of the job; without a scenario, the controller did not load.
     """
     scenario, controller = name
     return Failure(controller=controller, scenario=scenario, message=" ".join(str(error).split()))

@@ -22,9 +22,9 @@ ENV_ID = "QuadTargetTracking-v0"
 class Fleet(QuadcopterBatch):
     """n vehicles in their first episodes; a lost row stays lost.
 
-    :param seeds: of the episodes, (n,).
-    :param settings: how they fly; ``max_episode_steps`` has no meaning here, since flights end by
-        their plan.
+    :param seeds: seeds of the episodes, (n,).
+    :param settings: how they fly; ``max_episode_steps`` is ignored here, since flights end by their
+        plan.
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
@@ -36,7 +36,7 @@ class Fleet(QuadcopterBatch):
     def begin(self, start: Mapping[str, FloatArray]) -> Float32Array:
         """Begin the episodes; return the observations, (n, observation.size).
 
-        :param start: replaces the episodes' own sample: any of position, velocity, body_rates,
+        :param start: replaces what the episodes sample: any of position, velocity, body_rates,
             target (n, 3) and quaternion (n, 4).
         """
         self.reset()
@@ -45,11 +45,11 @@ class Fleet(QuadcopterBatch):
         return self.observe()
 
     def close(self) -> None:
-        """Release the environments, where there are any."""
+        """Release the environments, if there are any."""
 
 
 class PyBulletFleet(Fleet):
-    """Its vehicles are moved by a PyBullet environment per row, one after the other.
+    """A fleet whose vehicles are moved by one PyBullet environment per row, one after the other.
 
     The batch samples the same episodes as they do from the same seeds, and scores what they fly.
     """
@@ -57,8 +57,8 @@ class PyBulletFleet(Fleet):
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
         super().__init__(seeds, settings)
         self._seeds = seeds
-        # Flights end by their plan; -1 switches Gymnasium's time limit off.
-        # The batch moves the targets, so that no environment needs tables of its own.
+        # Flights end by their plan; -1 switches Gymnasium's time limit off. The batch moves the
+        # targets, so that no environment needs tables of references.
         keywords = {
             **dict(settings),
             "max_episode_steps": -1,
@@ -72,13 +72,13 @@ class PyBulletFleet(Fleet):
             keywords["observation_mean"] = scaling[:OBSERVATION_SIZE]
             keywords["observation_std"] = scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
             keywords["noise"] = {"relative": scaling[-2], "additive": scaling[-1]}
-            # By its id, since PyBullet may be missing, which matters here only.
+            # Made by its id, since PyBullet may be missing, which matters only here.
             self._envs.append(gymnasium.make(ENV_ID, **keywords).unwrapped)
 
     def begin(self, start: Mapping[str, FloatArray]) -> Float32Array:
         super().begin(start)
         for row, env in enumerate(self._envs):
-            # The target, which is no part of an environment's state, matters to the score only.
+            # The target is not part of an environment's state; it matters only to the score.
             state = {name: values[row] for name, values in start.items() if name != "target"}
             env.reset(seed=self._seeds[row], options={"state": state})
             self._read(row)
@@ -94,7 +94,7 @@ class PyBulletFleet(Fleet):
         return self.score(actions)
 
     def _read(self, row: int) -> None:
-        """Read the state of a row, all but its target, from its environment."""
+        """Read the state of a row, except for its target, from its environment."""
         self.state[: TARGET.start, row] = self._envs[row].batch.state[: TARGET.start, 0]
 
     def close(self) -> None:

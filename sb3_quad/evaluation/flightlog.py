@@ -25,7 +25,7 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
 OUTCOMES = ("success", "missed", "collision", "out_of_range")
-# How a flight ends that is lost.
+# The outcomes of a lost flight.
 LOST = OUTCOMES[2:]
 STATES = ("position", "quaternion", "velocity", "body_rates", "target")
 # Fields of Flights that become arrays of the same name.
@@ -46,7 +46,7 @@ EPISODES = (
 
 
 class Recorder(Hook):
-    """Samples the first ``m`` flights at about 50 Hz, as float32: they are for looking at."""
+    """Samples the first ``m`` flights at about 50 Hz, as float32, which is enough for plots."""
 
     def __init__(self, m: int) -> None:
         self._m = m
@@ -57,7 +57,7 @@ class Recorder(Hook):
         self._log: list[Arrays] = []
         self._samples = np.zeros(min(self._m, state.n), dtype=np.int64)
         self._wrench = np.zeros((len(self._samples), 6))
-        # No action has been given at the start.
+        # There is no action at the start.
         self._sample(state, np.full((state.n, 4), np.nan), np.ones(state.n, bool))
 
     def before_step(
@@ -107,8 +107,8 @@ class Recorder(Hook):
 
 
 def episode_arrays(flights: Flights, seeds: Sequence[int]) -> Arrays:
-    """Return the ``episode_`` arrays, of all flights."""
-    # The first condition that holds decides.
+    """Return the ``episode_`` arrays of all flights."""
+    # The first condition that is true decides.
     conditions = [flights.success, flights.survival, flights.collision]
     arrays = {name: getattr(flights, name) for name in EPISODES}
     arrays |= {
@@ -132,7 +132,7 @@ class Track(NamedTuple):
     times: FloatArray  # (k,), s
     position: Float32Array  # (k, 3), world frame, m; target likewise
     target: Float32Array
-    # (k, 6), mean since the sample before: force, world frame, N; torque, body frame, N m
+    # (k, 6), mean since the previous sample: force, world frame, N; torque, body frame, N m
     wrench: Float32Array
     lost: bool
 

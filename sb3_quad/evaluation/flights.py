@@ -1,8 +1,8 @@
 """Fly a controller over fresh episodes, and measure the true state along the way.
 
 Two conventions follow from the expert's numbers in the thesis (4.3.1). The time to a tolerance is
-the end of the first control step after which |r - r_T| is within it. The path is that of the whole
-episode, 15 s, not only of the way until arrival.
+the end of the first control step after which |r - r_T| is within it. The path length is that of the
+whole episode of 15 s, not only of the way until arrival.
 """
 
 import inspect
@@ -40,23 +40,23 @@ from sb3_quad.simulation.state import TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
-NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance where it is not one
+NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance if it is not among them
 ACTIONS = quadcopter_spaces()[1]
 # A vehicle is stable while its tilt (rad) and its rate of roll and pitch together (rad/s) are below
 # these for at least HOLD (s).
 TILT = np.radians(45.0)
 RATE = 2.0
 HOLD = 0.2
-LARGEST_SEED = 2**53  # Seeds that the package itself makes are below it.
+LARGEST_SEED = 2**53  # Seeds that the package itself makes are smaller.
 
 Reward: TypeAlias = Callable[[QuadcopterState, Float32Array], npt.ArrayLike]
-"""A reward of your own: the state after a control step and the actions (n, 4) that led to it, to
-rewards (n,).
+"""A reward of your own: a function from the state after a control step and the actions (n, 4) that
+led to it to rewards (n,).
 """
 
 
 OwnReward: TypeAlias = str | Reward | None
-"""A reward of your own as it is given: a function, ``package.module:function``, or None: none."""
+"""A reward of your own as it is given: a function or ``package.module:function``; None: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,34 +70,35 @@ class Flights:
     reward: FloatArray  #: (n,), sum of the rewards
     own_reward: FloatArray  #: (n,), sum of your own reward; NaN if you gave none
     length: IntArray  #: (n,), control steps
-    flown: FloatArray  #: (n,), s until lost or the end
-    #: By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was. On a
-    #: course it counts from the last waypoint on.
+    flown: FloatArray  #: (n,), time flown until the loss or the end, s
+    #: By tolerance (m): time until |r - r_T| is first within it, s, (n,); NaN if it never was. On a
+    #: course, only the distance to the last waypoint counts.
     time_to: Mapping[float, FloatArray]
-    #: By tolerance (m): s after which |r - r_T| stays within it to the end, (n,), NaN if the flight
-    #: ended outside or was lost.
+    #: By tolerance (m): time after which |r - r_T| stays within it to the end, s, (n,); NaN if the
+    #: flight ended outside or was lost.
     settling_time: Mapping[float, FloatArray]
     #: (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
     overshoot: FloatArray
     path_length: FloatArray  #: (n,), m, over the whole episode
     final_error: FloatArray  #: (n,), |r - r_T| at the end, m
-    #: (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    #: (n, 3), r - r_T at the end, world frame, m; NaN if the flight was lost
     final_offset: FloatArray
-    recovery_time: FloatArray  #: (n,), s until it was stable again, NaN if it never was, see Motion
-    #: (n,), largest distance from the straight line to the target, m; NaN where there is no line
+    #: (n,), time until it was stable again, s; NaN if it never was, see Motion
+    recovery_time: FloatArray
+    #: (n,), largest distance from the straight line to the target, m; NaN if there is no line
     cross_track_error: FloatArray
-    #: (n,), of flights whose target moves or turns, after the first 2 s: root mean square of
-    #: |r - r_T|, m, as of the others NaN where a flight was lost or its target rests
+    #: (n,), root mean square of |r - r_T|, m. This and the next four are for targets that move or
+    #: turn, after the first 2 s; NaN if the flight was lost or its target rests.
     rms_error: FloatArray
     greatest_error: FloatArray  #: (n,), largest |r - r_T|, m
     path_error: FloatArray  #: (n,), root mean square of its part across the target's velocity, m
     lag: FloatArray  #: (n,), how late the flight is on its path, s, see Following
-    heading_error: FloatArray  #: (n,), root mean square, degrees; NaN where none is commanded
+    heading_error: FloatArray  #: (n,), root mean square, degrees; NaN if none is commanded
     cut_by_supervisor: BoolArray  #: (n,), whether the firmware would have cut it, see Supervisor
-    #: (n,), longest time that the specific force along body z stayed below 0.5 g, s; NaN where the
+    #: (n,), longest time that the specific force along body z stayed below 0.5 g, s; NaN if the
     #: vehicle has no supervisor
     low_force_time: FloatArray
-    #: (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
+    #: (n, W), time until each waypoint was reached, s; NaN if it never was; W = 0 without waypoints
     waypoint_times: FloatArray
     #: (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
     #: (body); SI
@@ -111,12 +112,12 @@ class Flights:
 
     @staticmethod
     def concatenate(parts: Sequence["Flights"]) -> "Flights":
-        """Join several parts in their order."""
+        """Join several parts in order."""
         return Flights(**_joined([vars(part) for part in parts]))
 
 
 def _joined(parts: Sequence[Any]) -> Any:
-    """Join arrays, also those within mappings."""
+    """Join arrays, including those within mappings."""
     if not isinstance(parts[0], Mapping):
         return np.concatenate(parts)
     joined = {}
@@ -131,10 +132,10 @@ def arrival_tolerance(tolerances: Iterable[float]) -> float:
 
 
 class Hook:
-    """Called along a flight; a subclass overrides the methods that it needs."""
+    """Called during a flight; a subclass overrides the methods that it needs."""
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        """See the state that the flights start in."""
+        """See the state in which the flights start."""
 
     def before_step(
         self,
@@ -146,7 +147,7 @@ class Hook:
         """See the state before a control step.
 
         :param observation: (n, observation size).
-        :param wrench: (n, WRENCH_SIZE), acts during the step.
+        :param wrench: (n, WRENCH_SIZE), that acts during the step.
         :param flying: (n,), the flights that are still in the air.
         """
 
@@ -155,7 +156,7 @@ class Hook:
     ) -> None:
         """See the state after control step ``step``.
 
-        :param actions: (n, 4), led to this state.
+        :param actions: (n, 4), that led to this state.
         :param flying: (n,), the flights that continue.
         """
 
@@ -235,7 +236,7 @@ def fly(
 
 
 def refuse_several_limits(settings: FlightSettings) -> None:
-    """Refuse a limit for each row: flights end together."""
+    """Refuse a limit for each row, since flights end together."""
     if isinstance(settings.max_episode_steps, list):
         raise ConfigError(
             f"max_episode_steps {settings.max_episode_steps}: must be one number, the limit of all"
@@ -244,7 +245,7 @@ def refuse_several_limits(settings: FlightSettings) -> None:
 
 
 def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
-    """Warn of a controller that flies another vehicle than it knows, or observes something else.
+    """Warn if a controller flies another vehicle than it knows, or observes something else.
 
     :param name: what the warning calls it.
     """
@@ -263,13 +264,13 @@ def warn_of_differences(name: str, controller: Any, settings: FlightSettings) ->
 def episode_seeds(seed: int, n_flights: int) -> list[int]:
     """Return the seed of each flight.
 
-    :raises ConfigError: something else than whole numbers, a seed below 0, or no flights.
+    :raises ConfigError: anything but whole numbers, a seed below 0, or no flights.
     """
     n = whole_number("n_flights", n_flights, 1, MAX_ROWS)
     return row_seeds(whole_number("seed", seed, 0, LARGEST_SEED), n)
 
 
-# It is long because a split would hand over a dozen arrays that each step changes.
+# It is long because its parts would share a dozen arrays that each step changes.
 def fly_settings(
     controller: Any,
     settings: FlightSettings,
@@ -282,15 +283,16 @@ def fly_settings(
     reward: Reward | None = None,
     record: StrPath | None = None,
 ) -> Flights:
-    """Fly the first episode of each seed, as :func:`fly` does, by one record of settings.
+    """Fly the first episode of each seed, as :func:`fly` does, with one record of settings.
 
-    :param plan: what happens to the episodes along the way.
+    :param plan: the events of the episodes.
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
     refuse_unknown("backend", [backend], FLEETS)
     plan = plan or Plan()
     if isinstance(reward, type):
-        # A reward that remembers, such as the last actions, begins afresh with these episodes.
+        # A stateful reward, for example of changing actions, is instantiated afresh for these
+        # episodes.
         reward = reward()
     with closing(FLEETS[backend](seeds, settings)) as fleet:
         observations, _ = quadcopter_spaces(fleet.observation.size)
@@ -304,7 +306,7 @@ def fly_settings(
         start = state.copy()
         position = start.position
         fleet.clear_outcome()
-        # What became of the flights so far; of a lost one it stays as it is then.
+        # The outcome of the flights so far; for a lost flight it no longer changes.
         outcome = fleet.outcome.copy()
         distance = outcome["distance"]
         flying = outcome["truncated"].copy()  # a flight survives until it is lost
@@ -335,12 +337,12 @@ def fly_settings(
                 hook.before_step(state, observation, fleet.total_wrench().T, flying)
             if record is not None:
                 observed.append(observation[flying])
-                # The environment clips them, too.
+                # Clip them as the environment does.
                 acted.append(actions[flying].clip(-1.0, 1.0))
             observation, rewards, _ = fleet.step(actions)
             state = fleet.true_state()
 
-            # This step counts also for the flights that it has ended.
+            # This step also counts for the flights that it has ended.
             outcome[flying] = fleet.outcome[flying]
             total += np.where(flying, rewards, 0.0)
             if reward is not None:
@@ -358,11 +360,11 @@ def fly_settings(
                 following.update(step, state, flying)
             for hook in hooks:
                 hook.after_step(step, state, actions, flying)
-            # The outcome of the last step is that of the target until then.
+            # The outcome of the last step refers to the target until then.
             on_last = course.on_last
             if not flying.any():
                 break
-            # Whoever has reached a waypoint sees the next one from the next step on.
+            # Rows that have reached a waypoint see the next one from the next step on.
             onward = course.update(time, distance, flying)
             if onward.size and step < settings.longest_episode:
                 fleet.state[TARGET, onward] = plan.waypoints[course.next[onward]].T
@@ -372,10 +374,10 @@ def fly_settings(
             write_arrays(
                 record, observations=np.concatenate(observed), actions=np.concatenate(acted)
             )
-        # A flight that was lost has no time after which it stays at its target.
+        # A lost flight has no time after which it stays at its target.
         settling_time = np.where(flying, arrivals.settling_time, np.nan)
         offset = state.position - state.target
-        # Neither a course nor a target that moves has a straight line to deviate from.
+        # Neither a course nor a moving target has a straight line to deviate from.
         has_no_line = following.moves | (plan.waypoints.size > 0)
         return Flights(
             success=outcome["success"] & on_last,
@@ -405,9 +407,9 @@ def fly_settings(
 def _ask_reward(
     reward: Reward, state: QuadcopterState, actions: Float32Array, flying: BoolArray
 ) -> FloatArray:
-    """Return the rewards of a function of the user's, which may do anything, as (n,) numbers.
+    """Return the rewards of a user's function, which may do anything, as (n,) numbers.
 
-    :param flying: (n,), the flights of which they are asked; those of the others are 0.
+    :param flying: (n,), the flights whose rewards count; the others get 0.
     """
     name = f"reward {reward_name(reward)}"
     with raised_as(ControllerError, f"{name}: fails"):
@@ -421,19 +423,19 @@ def _ask_reward(
 
 
 def reward_name(reward: OwnReward) -> str:
-    """Return the name of a reward of your own; empty without any."""
+    """Return the name of a reward of your own; empty if there is none."""
     if reward is None or isinstance(reward, str):
         return reward or ""
-    # Instances of a class have no name of their own.
+    # Instances of a class have no ``__name__``.
     return str(getattr(reward, "__name__", type(reward).__name__))
 
 
 class Arrivals:
     """Tracks when n flights come within T tolerances of their targets.
 
-    ``time_to`` (T, n): s until |r - r_T| is first within each tolerance. ``settling_time`` (T, n):
-    s since when it has stayed within it. ``overshoot`` (n,): the largest |r - r_T|, m, since it was
-    first within :func:`arrival_tolerance`. NaN where that has not happened.
+    ``time_to`` (T, n): time until |r - r_T| is first within each tolerance, s. ``settling_time``
+    (T, n): time since when it has stayed within it, s. ``overshoot`` (n,): the largest |r - r_T|,
+    m, since it was first within :func:`arrival_tolerance`. NaN if that has not happened.
 
     :param tolerances: m.
     :param distance: |r - r_T| at the start, (n,), m; infinite before the last waypoint.
@@ -446,14 +448,14 @@ class Arrivals:
         self.overshoot = np.full(len(distance), np.nan)
         self._first = self.overshoot.copy()
         if tolerances:
-            # A view, which shows the arrivals that follow.
+            # A view, which shows later arrivals.
             self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
         self.update(0.0, distance)
 
     def update(self, time: float, distance: FloatArray) -> None:
         """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s.
 
-        Of a flight that was lost it is the last one.
+        For a lost flight, it is the last value.
         """
         inside = distance <= self._limits
         np.fmin(self.time_to, np.where(inside, time, np.nan), out=self.time_to)
@@ -463,15 +465,17 @@ class Arrivals:
 
 
 def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
-    """Return since when a condition has held, given that it ``holds`` now; else NaN."""
+    """Return the time since when a condition has held, given whether it ``holds`` now; otherwise
+    NaN.
+    """
     return np.where(holds, np.fmin(times, time), np.nan)
 
 
 class Waypoints:
     """The waypoints of n flights: which of them each has reached, and when.
 
-    ``times`` (n, W): s until each of W waypoints was reached, NaN: not yet. ``next`` (n,): the
-    number of the present one.
+    ``times`` (n, W): time until each of W waypoints was reached, s; NaN: not yet. ``next`` (n,):
+    the number of the present one.
     """
 
     def __init__(self, plan: Plan, n: int) -> None:
@@ -494,20 +498,22 @@ class Waypoints:
         return self.next >= self._count - 1
 
     def to_last(self, distance: FloatArray) -> FloatArray:
-        """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
+        """Return |r - r_T|, (n,), m, of the flights on the way to their last target; inf for the
+        others.
+        """
         return np.where(self.on_last, distance, np.inf)
 
 
 class Motion:
-    """Tracks when n flights become stable and how far they deviate from their line.
+    """Tracks when n flights become stable, and how far they deviate from their straight line.
 
-    ``recovery_time`` (n,): s until the tilt has come below 45° and the body rate across z, of roll
-    and pitch together, below 2 rad/s, for at least 0.2 s, whose beginning counts; NaN if that never
-    was. The thesis reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest
-    distance from the straight line through start and target, m, on the way and beyond: the
-    oscillations of 4.3.1; NaN where both are one point.
+    ``recovery_time`` (n,), s: the beginning of the first 0.2 s in which the tilt stays below 45°
+    and the body rate of roll and pitch together below 2 rad/s; NaN if there is none. The thesis
+    reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from the
+    straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1; NaN
+    if both are the same point.
 
-    :param state: at the start.
+    :param state: state at the start.
     :param control_step: s.
     """
 
@@ -530,10 +536,10 @@ class Motion:
         upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
         stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
         self._stable_since = _since(self._stable_since, stable, time)
-        # Half a step of tolerance, since times are multiples of steps only up to rounding.
+        # Allow half a step, since times are multiples of steps only up to rounding.
         held = flying & (time - self._stable_since > HOLD - 0.5 * self._control_step)
         np.fmin(self.recovery_time, self._stable_since, out=self.recovery_time, where=held)
-        # The part of the way flown that is across the line.
+        # The part of the way flown that lies across the line.
         flown = state.position - self._start
         along = (flown * self._direction).sum(axis=1, keepdims=True) * self._direction
         across = np.linalg.norm(flown - along, axis=1)

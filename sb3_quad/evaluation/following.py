@@ -5,7 +5,7 @@ import numpy as np
 from sb3_quad.base.types import BoolArray, FloatArray
 from sb3_quad.simulation.state import QuadcopterState
 
-SETTLED = 2.0  # s after which the errors count
+SETTLED = 2.0  # time after which errors count, s
 FOLLOWED = ("rms_error", "greatest_error", "path_error", "heading_error", "lag")
 
 
@@ -13,9 +13,9 @@ class Following:
     """Tracks how far n flights are from references that move or turn.
 
     With the error e = r - r_T and the reference's velocity v, over all that is flown after the
-    first 2 s: ``rms_error`` is the root mean square of the length of e, ``greatest_error`` the
+    first 2 s: ``rms_error`` is the root mean square of the length of e, ``greatest_error`` its
     greatest length, and ``path_error`` the root mean square of the part of e across v, or of all of
-    it where v is zero; m. ``lag`` is -mean(e·v) / mean(v²), s: the delay after which the reference
+    e where v is zero; m. ``lag`` is -mean(e·v) / mean(v²), s: the delay with which the reference
     fits the flight best, as long as it is short. ``heading_error`` is the root mean square of the
     angle between the body's x axis, seen from above, and the commanded heading, degrees.
 
@@ -35,7 +35,7 @@ class Following:
         velocity = state.target_velocity
         speed = np.linalg.norm(velocity, axis=1)
         cosine, sine = state.target_heading.T
-        # One where a heading is commanded, else zero.
+        # 1 where a heading is commanded, otherwise 0.
         commanded = np.hypot(cosine, sine)
         self.moves |= speed + commanded > 0.0
         if step < self._first:
@@ -44,7 +44,7 @@ class Following:
         distance = state.distance
         along = (error * velocity).sum(axis=1)
         on_path = np.divide(along, speed, out=np.zeros_like(along), where=speed > 0.0)
-        # The azimuth of the body's x axis, from the commanded heading.
+        # The azimuth of the body's x axis, relative to the commanded heading.
         x, y = state.rotation[:, :2, 0].T
         turn = np.arctan2(cosine * y - sine * x, cosine * x + sine * y)
         np.fmax(self._greatest, distance, out=self._greatest, where=flying)
@@ -55,7 +55,7 @@ class Following:
         self._sums += np.where(flying, counted, 0.0)
 
     def errors(self, survival: BoolArray) -> dict[str, FloatArray]:
-        """Return the errors by name, (n,) each; NaN where a flight was lost or its target rested.
+        """Return the errors by name, (n,) each; NaN if a flight was lost or its target rested.
 
         :param survival: (n,).
         """

@@ -1,4 +1,4 @@
-"""Learning curves: the evaluations that a training noted in its run folder, read without
+"""Learning curves: the evaluations that a training wrote into its run folder, read without
 matplotlib.
 """
 
@@ -12,8 +12,8 @@ from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_arrays
 from sb3_quad.base.types import FloatArray, StrPath
 
-# The arrays of a file, (k, episodes), by what they are called here. Environments of others may not
-# report the last two.
+# The arrays of a file, (k, episodes), by their names here. Third-party environments may not report
+# the last two.
 EPISODES = {"reward": "results", "success": "successes", "survival": "survivals"}
 OPTIONAL = ("successes", "survivals")
 
@@ -23,8 +23,8 @@ class Curve(NamedTuple):
 
     timesteps: FloatArray  # (k,)
     seconds: FloatArray  # of training, evaluations along the way included, (k,)
-    # By name, (k,): the mean reward, the shares success and survival where the environment reports
-    # them, and losses of the update before each evaluation, NaN where there was none.
+    # By name, (k,): the mean reward, the shares of success and survival if the environment reports
+    # them, and losses of the update before each evaluation, NaN if there was none.
     measures: Mapping[str, FloatArray]
 
     @property
@@ -51,7 +51,7 @@ def read_curve(run: StrPath, task: str | None = None) -> Curve:
         )
     arrays = read_arrays(path)
     measures = {}
-    # A file of another program may hold anything.
+    # A third-party file may contain anything.
     with raised_as(ConfigError, f"{path}: cannot be read"):
         for name, key in EPISODES.items():
             if key in arrays or key not in OPTIONAL:

@@ -1,4 +1,4 @@
-"""Tables of metrics: a column for each controller, then columns of others' metrics."""
+"""Tables of metrics: a column for each controller, then columns of published metrics."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
@@ -31,7 +31,7 @@ MEDIAN = Row("final error, median", "m", decimals=3)
 QUANTILE = Row("final error, 95 %", "m", decimals=3)
 RECOVERY_TIME = Row("recovery time", "s", verb="recover")
 CROSS_TRACK_ERROR = Row("cross-track error", "m")
-# Of targets that move, in the order of FOLLOWED
+# For moving targets, in the order of FOLLOWED
 FOLLOWING = (
     Row("position error, rms", "m", decimals=3),
     Row("position error, greatest", "m", decimals=3),
@@ -42,7 +42,7 @@ FOLLOWING = (
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
 COURSE_TIME = Row("time of the course", "s", verb="complete")
-# The rows of fields of Metrics; those of Published have the same names.
+# The rows of the fields of Metrics; fields of Published have the same names.
 ROWS = {
     "success": SUCCESS,
     "survival": SURVIVAL,
@@ -59,7 +59,7 @@ ROWS = {
     "recovery_time": RECOVERY_TIME,
     **dict(zip(FOLLOWED, FOLLOWING, strict=True)),
 }
-# Flights that are lost end early, which makes other rows incomparable.
+# Lost flights end early, which makes the other rows incomparable.
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD, OWN_REWARD}
 MOST_TOLERANCES = 6
@@ -67,7 +67,7 @@ CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
 
 NOTHING = Cell()
 
-Cells = Mapping[Row, Cell]  # by the rows they stand in
+Cells = Mapping[Row, Cell]  # by row
 
 
 def time_row(tolerance: float) -> Row:
@@ -81,7 +81,7 @@ def settling_row(tolerance: float) -> Row:
 
 
 def estimate_cell(row: Row, estimate: Estimate | None, none: str = "–") -> Cell:
-    """Return the cell of an estimate with its interval in a row; the words ``none`` for None."""
+    """Return the cell of an estimate with its interval in a row; for None, the words ``none``."""
     if estimate is None:
         return Cell(words=none)
     ends = (row.factor * estimate.low, row.factor * estimate.high)
@@ -89,15 +89,15 @@ def estimate_cell(row: Row, estimate: Estimate | None, none: str = "–") -> Cel
 
 
 def metric_cells(metrics: Metrics) -> Cells:
-    """Return all that was measured of a controller in a scenario.
+    """Return everything that was measured of a controller in a scenario.
 
-    What does not exist of these flights, such as the error of survivors without any, has no cell.
+    Values that do not exist, such as the error of survivors if there are none, have no cell.
     """
     values = {row: getattr(metrics, name) for name, row in ROWS.items()}
     near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
     for arrival in metrics.arrivals:
         values[time_row(arrival.tolerance)] = arrival
-        # Settling and overshoot are shown of one tolerance only.
+        # Settling and overshoot are shown for one tolerance only.
         if arrival.tolerance == near:
             values[settling_row(near)] = arrival.settling
             values[OVERSHOOT_RATE] = arrival.overshoot_rate
@@ -113,11 +113,11 @@ def _measured(row: Row, value: Any) -> Cell:
     if isinstance(value, float):
         return Cell(value, decimals=row.decimals)
     if not isinstance(value, Moment):
-        # A share has as many digits as a single flight takes to show.
+        # A share has as many digits as it takes for a single flight to show.
         if row.unit == "%":
             row = row._replace(decimals=len(str(value.n // 200)))
         return estimate_cell(row, value)
-    # A mean time says how many flights it is of, unless it is all or none.
+    # The note of a mean time says how many flights it covers, unless it is all or none.
     note = ""
     if 0.0 < value.share.value < 1.0:
         note = f"{100 * value.share.value:.3g} % {row.verb}"
@@ -141,7 +141,7 @@ def published_cells(published: Published) -> Cells:
             cells[rows[name]] = _printed(rows[name], number)
     for row in cells.keys() & {SUCCESS, SURVIVAL}:
         cells[row] = cells[row]._replace(note=published.note)
-    # Here None has a meaning: never within the tolerance.
+    # Here None means: never within the tolerance.
     for tolerance, time in published.time_to.items():
         row = time_row(tolerance)
         cells[row] = _printed(row, time)
@@ -151,9 +151,10 @@ def published_cells(published: Published) -> Cells:
 def metric_rows(
     scenario: Scenario, measured: Sequence[Cells | None], published: Iterable[Published] = ()
 ) -> list[Row]:
-    """Return the rows of a scenario, the best of each marked: controllers first, then others.
+    """Return the rows of a scenario, with the best of each marked: controllers first, then
+    published columns.
 
-    :param measured: of each controller; None: it failed.
+    :param measured: cells of each controller; None: it failed.
     """
     # A controller that failed has one cell, which says so.
     ours = [cells or {SUCCESS: Cell(words="failed")} for cells in measured]
@@ -162,7 +163,7 @@ def metric_rows(
     rows = []
     for row in _rows_of(scenario):
         own = [cells.get(row, NOTHING) for cells in ours]
-        # A row without any number of ours is left out, whatever others measured.
+        # A row without a number of ours is left out, whatever was published.
         if own == [NOTHING] * len(own):
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
@@ -177,17 +178,18 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     if row in HIGHER_IS_BETTER:
         sign = 1.0
     elif row in FOLLOWING[:-1] or (row.verb and not any(cell.note for cell in cells)):
-        # A note says that a mean time is of some flights alone, perhaps of the nearest ones.
+        # A note means that a mean time covers only some flights, perhaps those with the nearest
+        # targets.
         sign = -1.0
     else:
         return list(cells)
-    # The intervals, turned so that more is better; NaN without a number, which cannot win.
+    # The intervals, with signs such that more is better; NaN without a number, which cannot win.
     ends = np.array([cell.ends or (cell.value, cell.value) for cell in cells], np.float64)
     low, high = np.sort(sign * ends, axis=1).T
     marked = []
     for number, cell in enumerate(cells):
         others = np.fmax.reduce(np.delete(high, number), initial=-np.inf)
-        # A cell that is alone is not the best.
+        # A single cell is not the best.
         marked.append(cell._replace(best=bool(low[number] > others > -np.inf)))
     return marked
 
@@ -195,7 +197,7 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
 def overview(results: Results, labels: Sequence[str]) -> list[Table]:
     """Return the tables of all scenarios for a terminal; the last one says how to read them.
 
-    :param labels: of the controllers, in the order of their columns.
+    :param labels: labels of the controllers, in the order of their columns.
     """
     tables = []
     for heading, scenarios in scenario_groups(results):
@@ -206,7 +208,9 @@ def overview(results: Results, labels: Sequence[str]) -> list[Table]:
 
 
 def _narrowed(table: Table, count: int) -> Table:
-    """Return a table with its columns after the first ``count``, those of others, in one."""
+    """Return a table with its columns after the first ``count``, the published ones, merged into
+    one.
+    """
     others = table.columns[count:]
     if not others:
         return table
@@ -257,7 +261,7 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 
 
 def _rows_of(scenario: Scenario) -> list[Row]:
-    """The rows that mean something in a scenario."""
+    """The rows that have a meaning in a scenario."""
     shares = [SUCCESS, SURVIVAL, CUT, LOW_FORCE]
     rewards = [REWARD, OWN_REWARD]
     if scenario.target.waypoints is not None:
@@ -269,12 +273,12 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     if scenario.group is not None:
         return [*shares, OWN_REWARD, MEDIAN]
     if scenario.target.distance == 0.0:
-        # An episode that starts at its target has no way to it.
+        # An episode that starts at its target does not fly to it.
         flown = [FLOWN] if scenario.is_fixed else []
         return [*shares, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = {*scenario.tolerances}
     if len(tolerances) > MOST_TOLERANCES:
-        # Only the main ones and published ones; a plot shows the others.
+        # Only the main and the published ones; a plot shows the others.
         kept = {min(tolerances), *TOLERANCES}
         for published in scenario.published.values():
             kept |= {*published.time_to}
@@ -285,7 +289,7 @@ def _rows_of(scenario: Scenario) -> list[Row]:
 
 
 def _printed(row: Row, value: Printed) -> Cell:
-    """A number as its source prints it; a pair is a range, None a time that never came."""
+    """A number as its source prints it; a pair is a range, None an event that never happened."""
     if value is None:
         return Cell(words="never")
     ends = map("{:g}".format, row.factor * np.atleast_1d(value))

@@ -1,4 +1,4 @@
-"""Many flights in a few metrics."""
+"""Many flights, summarised in a few metrics."""
 
 from functools import partial
 
@@ -26,7 +26,8 @@ class Arrival(Moment):
     tolerance: float
     """m"""
     settling: Moment
-    """settling time: flights that end within the tolerance, and when they leave it no more"""
+    """settling time: flights that end within the tolerance, and the time from which they stay in it
+    """
     overshoot_rate: Estimate | None
     """share of the flights that arrived and then left the tolerance again, or were lost"""
 
@@ -60,7 +61,7 @@ class Metrics(Frozen):
     own_reward: Estimate | None
     """mean sum of your own reward; None: no own reward was given"""
     flown: Estimate
-    """mean time flown, until lost or the end, s"""
+    """mean time flown until the loss or the end, s"""
     arrivals: list[Arrival]
     """by tolerance, the tightest first"""
     overshoot: float | None
@@ -78,22 +79,23 @@ class Metrics(Frozen):
     cross_track_error: Estimate | None
     """mean largest distance from the straight line to the target, m; None: there is no line"""
     rms_error: Estimate | None
-    """mean root mean square of |r - r_T| after the first 2 s, m; as the next four only of targets
-    that move or turn"""
+    """mean root mean square of |r - r_T| after the first 2 s, m; like the next four, only for
+    targets that move or turn
+    """
     greatest_error: Estimate | None
     """mean largest |r - r_T| after the first 2 s, m"""
     path_error: Estimate | None
-    """mean root mean square of its part across the target's velocity, m"""
+    """mean root mean square of the part of r - r_T across the target's velocity, m"""
     lag: Estimate | None
     """mean delay along the path, s"""
     heading_error: Estimate | None
-    """mean root mean square, degrees; None: no heading is commanded"""
+    """mean root mean square of the heading error, degrees; None: no heading is commanded"""
     cut_by_supervisor: Estimate | None = None
-    """share that the firmware would have cut, see Supervisor; None: it has no supervisor"""
+    """share that the firmware would have cut, see Supervisor; None: no supervisor"""
     low_force_time: float | None = None
     """longest time of any flight that the specific force along body z stayed below 0.5 g, s"""
     course: Course | None
-    """only of scenarios with waypoints"""
+    """only for scenarios with waypoints"""
 
 
 def summarise(flights: Flights) -> Metrics:

@@ -1,10 +1,10 @@
-"""How far a vehicle departs from real flights when it flies the commands that their motors got.
+"""How far a simulated vehicle departs from real flights when it flies the recorded motor commands.
 
 A log is a CSV file with the columns of NanoBench (Ullah and Baca 2026, arXiv 2603.09908), which
 docs/vehicles.md lists. It is resampled to the vehicle's control step. Three things are calibrated
-by the whole flight: the clock of the vehicle's own columns, by the shift at which gyro and attitude
-agree best; how the markers of the motion capture are mounted, so that the mean specific force lies
-along z; and the motors against each other, so that the mean commands give no moment.
+from the whole flight: the clock of the vehicle's own columns, by the shift at which gyro and
+attitude agree best; how the markers of the motion capture are mounted, so that the mean specific
+force lies along z; and the motors against each other, so that the mean commands yield no moment.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -32,19 +32,20 @@ from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import GRAVITY, Vehicle, first_vehicle
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
-# Commands before a window that turn the rotors, s.
+# Time before a window whose commands spin up the rotors, s
 WARM_UP = 0.5
-# Below it rows do not count, since the ground changes the thrust, m.
+# Rows below this height do not count, since the ground changes the thrust, m
 LEAST_HEIGHT = 0.3
-# Longer gaps between rows are not filled, s.
+# Longer gaps between rows are not filled, s
 LONGEST_GAP = 0.05
-# Differences of clocks that are tried, s.
+# Clock offsets that are tried, s
 OFFSETS = np.arange(-0.1, 0.1005, 0.001)
-# Thrust of a motor, N, by powers of its voltage from the 0th: crazyflie-firmware 2025.12,
-# platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM / 65,535 of the battery's.
+# Thrust of a motor, N, as coefficients of the powers of its voltage, from the 0th:
+# crazyflie-firmware 2025.12, platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM
+# / 65,535 of the battery's.
 THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
 FULL_PWM = 65_535.0
-# By the motion capture, in the order of the state's first rows
+# Columns of the motion capture, in the order of the state's first rows
 CAPTURE_COLUMNS = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
 GYRO_COLUMNS = ["imu_gyro_x", "imu_gyro_y", "imu_gyro_z"]
 THRUSTS = ["thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4"]
@@ -66,7 +67,7 @@ class Log:
     motion: FloatArray
     thrusts: FloatArray  #: (n, 4), commanded, M1 to M4, N
     flying: BoolArray  #: (n,), in the air
-    offset: float  #: s, by which the vehicle's clock was behind that of the motion capture
+    offset: float  #: how far the vehicle's clock was behind that of the motion capture, s
 
 
 def read_logs(folder: StrPath, step: float) -> list[Log]:
@@ -92,11 +93,11 @@ def read_log(path: Path, step: float) -> Log:
         raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
     if len(table) < 2:
         raise ConfigError(f"{path}: fewer than two rows")
-    # Commands may be missing where none came, and do not count there.
+    # Commands may be missing; such rows do not count.
     refuse_gaps(path, table[measured])
     time = table["t"]
     refuse_falling_times(path, time)
-    # q and -q are the same attitude, but in between lie others.
+    # q and -q are the same attitude, but interpolation between them would pass through others.
     quaternions = table[CAPTURE_COLUMNS[QUATERNION]]
     cosines = (quaternions * quaternions.shift()).sum(axis=1)
     signs = np.where(cosines < 0.0, -1.0, 1.0).cumprod()
@@ -116,12 +117,12 @@ def read_log(path: Path, step: float) -> Log:
     attitude = motion[:, QUATERNION]
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     flying = motion[:, 2] > LEAST_HEIGHT
-    # From each row to the next; none follows the last one.
+    # Gaps from each row to the next; the last one has none.
     gaps = np.diff(time, append=time.iloc[-1])
     flying &= gaps[np.searchsorted(time, grid, side="right") - 1] < LONGEST_GAP
     # Some logs are extrapolated after the radio was lost.
     flying &= np.isfinite(commanded()).all(axis=1)
-    # Rᵀ dR/dt has the body rates in three places.
+    # Three elements of Rᵀ dR/dt are the body rates.
     rotation = rotation_matrices(attitude)
     turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, step, axis=0))
     rates = turning[flying][:, [2, 0, 1], [1, 2, 0]]
@@ -146,9 +147,9 @@ def read_log(path: Path, step: float) -> Log:
 
 
 def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
-    """Return the thrusts, N, that the Crazyflie's firmware expects of its commands.
+    """Return the thrusts, N, that the Crazyflie's firmware expects from its commands.
 
-    :param pwm: (n, 4), 0 to 65,535; others and motors that stand become NaN.
+    :param pwm: (n, 4), 0 to 65,535; other values and motors at rest become NaN.
     :param battery: (n, 1), V.
     """
     thrusts = np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(pwm / FULL_PWM * battery)
@@ -170,18 +171,18 @@ def open_loop(
 ) -> Iterator[tuple[float, list[FloatArray], FloatArray]]:
     """Fly recorded commands from recorded states.
 
-    Each row from which a log flies on for long enough begins a window. Its rotors begin as the
-    commands of the ``WARM_UP`` before have turned them.
+    Each row from which a log flies on for long enough begins a window. Its rotors begin with the
+    speeds that the commands of the preceding ``WARM_UP`` lead to.
 
-    :param logs: with rows at the vehicle's control step.
-    :param stride: rows from a window to the next.
+    :param logs: logs with rows at the vehicle's control step.
+    :param stride: rows from one window to the next.
     :param before_step: called with the batch before each control step; it may set a wrench.
-    :return: horizon by horizon: its s, the predictions in the order of ``HEADINGS``, and the
-        record, each (windows, 13) as in ``Log.motion``.
-    :raises ConfigError: no log flies for long enough, or the rotors do not lie as M1 to M4 do.
+    :return: for each horizon: its time, s; the predictions in the order of ``HEADINGS``; and the
+        recorded motion, each (windows, 13) as in ``Log.motion``.
+    :raises ConfigError: no log flies for long enough, or the rotors are not placed as M1 to M4.
     """
     crazyflie = first_vehicle("crazyflie")
-    # A log has the axes of its vehicle, and they do not turn.
+    # A log is in the axes of its vehicle, which cannot be turned.
     if find_turn(vehicle, crazyflie).angle != 0.0:
         raise ConfigError(
             f"{vehicle.name}: logs are of an X whose rotors turn as those of the Crazyflie do,"
@@ -192,7 +193,7 @@ def open_loop(
     before = round(WARM_UP / step)
     ends = [round(horizon / step) for horizon in HORIZONS]
     length = before + ends[-1]
-    # All rows around it fly.
+    # A window is valid only if all of its rows fly.
     flights = [pd.Series(log.flying).rolling(length).sum().shift(-ends[-1]) for log in logs]
     rows = np.flatnonzero(np.concatenate(flights) == length)[::stride]
     if rows.size == 0:

@@ -1,9 +1,10 @@
-"""The results of an evaluation in its folder; every file appears whole or not at all.
+"""The results of an evaluation in its folder; every file is written whole or not at all.
 
 - ``results.json``, a :class:`Results`: scenarios, controllers, metrics with their intervals;
 - ``flights/<controller>/<scenario>.npz``, the flights as arrays, with sampled trajectories
   (``flightlog.py``);
-- ``episodes.csv``, at the end, one line per flight: seed, start, outcome, times, path, final error.
+- ``episodes.csv``, written at the end, one line per flight: seed, start, outcome, times, path,
+  final error.
 
 A number that does not exist is None, never NaN.
 """
@@ -31,7 +32,7 @@ EPISODES = "episodes.csv"
 FLIGHTS = "flights"
 # Files that are removed together with the results; a report writes the last two.
 WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
-# Columns of episodes.csv that are one array each, and those that are several numbers.
+# Columns of episodes.csv: arrays of one column each, and those of several numbers
 _FLOWN = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
 _COLUMNS = (*_FLOWN, *FOLLOWED, *SUPERVISED)
 _AXES = {
@@ -58,8 +59,8 @@ NAMED = re.compile(
 def colours_of(names: Sequence[str]) -> dict[str, str]:
     """Return a colour, ``#rrggbb``, for each label of a controller.
 
-    A well-known controller has the same one everywhere. The others take what is left, in their
-    order, and share colours where more than eight fly.
+    A well-known controller has the same one everywhere. The others take the remaining ones in
+    order, and share colours if more than eight fly.
     """
     colours = dict.fromkeys(names, "")
     for name in names:
@@ -91,7 +92,7 @@ class Entry(Frozen):
     scenario: str
     """name"""
     seed: int
-    """of the scenario; the files hold that of each episode"""
+    """seed of the scenario; the files hold that of each episode"""
     backend: str
     seconds: float
     """wall-clock time of the flights"""
@@ -114,7 +115,7 @@ class Failure(Frozen):
 
     controller: str
     scenario: str | None
-    """None: it could not be loaded"""
+    """None: the controller could not be loaded"""
     message: str
 
 
@@ -176,7 +177,7 @@ def file_name(label: str) -> str:
 
 
 def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
-    """Write ``episodes.csv``, empty where there is no number.
+    """Write ``episodes.csv``, with empty cells where there is no number.
 
     :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
     """

@@ -15,7 +15,7 @@ from sb3_quad.base.validate import Frozen
 Z = 1.959963984540054  # the 97.5 % quantile of the normal distribution
 RESAMPLES = 1000
 Statistic = Callable[..., Any]
-BLOCK = 2**21  # values that a bootstrap holds at once, 16 MiB
+BLOCK = 2**21  # values of a bootstrap in memory at once, 16 MiB
 
 
 class Estimate(Frozen):
@@ -45,7 +45,7 @@ def share(hits: npt.ArrayLike) -> Estimate:
 
 
 def mean(values: FloatArray, statistic: Statistic = np.mean) -> Estimate | None:
-    """Return the :func:`bootstrap` of the finite values; None without any."""
+    """Return the :func:`bootstrap` of the finite values; None if there are none."""
     finite = values[np.isfinite(values)]
     return bootstrap(finite, statistic) if finite.size else None
 
@@ -53,7 +53,7 @@ def mean(values: FloatArray, statistic: Statistic = np.mean) -> Estimate | None:
 def bootstrap(values: FloatArray, statistic: Statistic = np.mean) -> Estimate:
     """Estimate a statistic with the percentile bootstrap's interval (Efron, 1979).
 
-    The same values give the same interval: the resamples are those of a fixed seed.
+    The same values yield the same interval, since the seed of the resamples is fixed.
 
     :param values: finite, (n,), n at least 1.
     :param statistic: a function of an array (..., n) and ``axis``.
@@ -63,7 +63,7 @@ def bootstrap(values: FloatArray, statistic: Statistic = np.mean) -> Estimate:
     random = np.random.default_rng(0)
     resampled = np.empty(RESAMPLES)
     # A million values would make arrays of 7.5 GiB: take as many resamples at once as fit into a
-    # block. The generator draws the same numbers however they are divided.
+    # block. The generator draws the same numbers however they are split.
     rows = max(1, BLOCK // n)
     for first in range(0, RESAMPLES, rows):
         part = resampled[first : first + rows]

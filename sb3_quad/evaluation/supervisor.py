@@ -1,6 +1,6 @@
 """Whether the supervisor in a flight controller's firmware would have cut the motors of flights.
 
-The rule is that of Crazyflie's: ``isTumbledCheck`` in ``src/modules/src/supervisor.c`` of
+The rule is the Crazyflie's: ``isTumbledCheck`` in ``src/modules/src/supervisor.c`` of
 bitcraze/crazyflie-firmware (commit 2a18fc2, 2026), with the constants ``SUPERVISOR_TUMBLE_CHECK_…``
 of ``src/platform/interface/platform_defaults.h``.
 """
@@ -23,19 +23,19 @@ SUPERVISED = ("cut_by_supervisor", "low_force_time")
 
 
 class Supervisor:
-    """Tracks the specific force of n flights: what an accelerometer shows.
+    """Tracks the specific force of n flights, which is what an accelerometer shows.
 
-    The motors are cut where its part along body z has stayed below 0.5 g for more than 1.0 s, or is
-    below -0.2 g after more than 0.1 s of that. Free fall, where no part reaches 0.1 g, does not
-    count, and ends the time. A flight that would be cut continues here.
+    The motors are cut once its component along body z has stayed below 0.5 g for more than 1.0 s,
+    or has done so for more than 0.1 s and is below -0.2 g. Free fall, where no component reaches
+    0.1 g, does not count, and restarts the time. A flight that would be cut continues here.
 
-    ``cut`` (n,) says which were. ``longest`` (n,) is the longest time below 0.5 g, s; NaN where the
+    ``cut`` (n,) says which were. ``longest`` (n,) is the longest time below 0.5 g, s; NaN if the
     vehicle's file names no ``supervisor``.
 
-    The firmware looks every 40 ms, at a sensor with a filter of 30 Hz; here each control step
-    counts, and the sensor has no noise.
+    The firmware checks every 40 ms, with a sensor filtered at 30 Hz; here every control step is
+    checked, and the sensor has no noise.
 
-    :param vehicles: of the flights, (n,).
+    :param vehicles: vehicles of the flights, (n,).
     """
 
     def __init__(self, vehicles: Sequence[Vehicle]) -> None:
@@ -56,6 +56,6 @@ class Supervisor:
         self._steps *= (along_z < LOW) & ~falls & flying & self._watched
         time = self._steps * self._control_step
         self.longest = np.maximum(self.longest, time)
-        # A sum of control steps is a round number only up to rounding.
+        # A sum of control steps is exact only up to rounding.
         allowed = np.where(along_z < UPSIDE_DOWN, UPSIDE_DOWN_TIME, LOW_TIME) + 1e-9
         self.cut |= time > allowed

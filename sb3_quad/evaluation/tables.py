@@ -12,15 +12,16 @@ from rich.markup import escape
 from rich.text import Text
 
 Align = Literal["left", "right"]
-WIDTH = 200  # characters of a line of a table as plain text, at most
+WIDTH = 200  # maximum characters in a line of a table as plain text
 
 
 class Cell(NamedTuple):
-    """A metric with the ends of its 95 % interval, or words in its place.
+    """A metric with its 95 % interval, or words instead.
 
-    :param ends: of the interval.
-    :param note: small print after it.
-    :param best: better than all others of its row, and the intervals are apart.
+    :param ends: ends of the interval.
+    :param note: small print after the value.
+    :param best: whether it is better than all others in its row, with intervals that do not
+        overlap.
     """
 
     value: float | None = None
@@ -39,7 +40,7 @@ class Cell(NamedTuple):
 
     @property
     def interval(self) -> str:
-        """The interval in words; empty where it is narrower than the last digit."""
+        """The interval in words; empty if it is narrower than the last digit."""
         if self.ends is None:
             return ""
         low, high = map(self._rounded, self.ends)
@@ -66,7 +67,7 @@ class Cell(NamedTuple):
 class Column(NamedTuple):
     """The head of a column of cells.
 
-    :param colour: of the controller it stands for, ``#rrggbb``.
+    :param colour: colour of its controller, ``#rrggbb``.
     :param source: where the metrics come from, if they were not measured here.
     """
 
@@ -84,8 +85,8 @@ class Column(NamedTuple):
 class Row(NamedTuple):
     """A metric with its unit, and a cell for each column.
 
-    :param decimals: of its cells.
-    :param verb: what the flights do whose mean time it holds, of which less is better.
+    :param decimals: number of decimals in its cells.
+    :param verb: for a mean time, of which less is better: what the flights do at that time.
     """
 
     name: str
@@ -101,14 +102,14 @@ class Row(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """From values to cells, which give shares in %."""
+        """The factor from values to cells, which show shares in %."""
         return 100.0 if self.unit == "%" else 1.0
 
 
 class Table(NamedTuple):
     """Rows of cells. ``rich`` prints it as it is; ``page.html.j2`` makes HTML of it.
 
-    :param corner: heads the rows' names.
+    :param corner: heading of the row names.
     :param title: above the table and ``caption`` below it, in terminals.
     """
 
@@ -121,7 +122,7 @@ class Table(NamedTuple):
     def markdown(self) -> str:
         """Return the lines of the table in Markdown; the best of a row is bold.
 
-        Names are escaped, so that none becomes HTML.
+        Names are escaped, so that none of them becomes HTML.
         """
         rows = [[self.corner, *self._headings], ["---"] * (1 + len(self.columns))]
         for row in self.rows:
@@ -129,7 +130,7 @@ class Table(NamedTuple):
             rows.append([row.heading, *texts])
         lines = []
         for texts in rows:
-            # The bar that divides cells may not be in them.
+            # Cells must not contain the bar that divides them.
             line = "\t".join(texts).replace("|", "/").replace("\t", " | ")
             lines.append(f"| {line} |")
         return escape_html("\n".join(lines), quote=False)
@@ -168,7 +169,7 @@ def text_table(
 ) -> Table:
     """Return a table of words.
 
-    :param heads: of all columns, that of the rows' names first.
+    :param heads: headings of all columns, that of the row names first.
     :param rows: each begins with its name.
     """
     corner, *names = heads

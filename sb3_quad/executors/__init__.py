@@ -28,11 +28,10 @@ Arguments and results are pickled too. A future raises
 def start_executor(
     kind: str, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
 ) -> Executor:
-    """Return an executor to use as a context manager, at whose end all workers end at once.
+    """Return an executor to use as a context manager, which ends all workers when it exits.
 
     :param kind: ``local`` or ``ray``.
-    :param workers: Number of concurrent calls. A cluster at an ``address`` has as many as it has
-        room for.
+    :param workers: Number of concurrent calls. A cluster at an ``address`` runs as many as fit.
     :param address: Address of a Ray cluster: ``auto``, ``host:port`` or ``ray://host:port``. With
         None, a cluster is started on this machine.
     :param num_cpus: Cores that Ray reserves for a call.

@@ -23,10 +23,10 @@ _KILL = getattr(signal, "SIGKILL", signal.SIGTERM)
 class LocalExecutor:
     """Up to ``workers`` processes, each started when it is first needed.
 
-    A thread of this process waits for each worker. Each worker is a pool of its own, so that one
-    that dies does not take the calls of others with it; its own call is tried once more. Workers
-    end with the process that started them, even if that is killed. They ignore Ctrl-C, which this
-    process handles.
+    A thread of this process waits for each worker. Each worker is a separate pool, so that one that
+    dies does not end the calls of others; its own call is tried once more. Workers end with the
+    process that started them, even if that is killed. They ignore Ctrl-C, which this process
+    handles.
     """
 
     def __init__(self, workers: int) -> None:
@@ -63,14 +63,14 @@ class LocalExecutor:
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function in the worker of the present thread."""
         worker = self._worker
-        # A worker that dies is replaced once, as for want of memory that others have released.
+        # A worker that dies is replaced once: it may have lacked memory that others have released.
         for _ in range(2):
             with suppress(BrokenProcessPool):
                 if not hasattr(worker, "pool") and not self._stopped:
                     worker.pool = ProcessPoolExecutor(1, _context(), _begin)
                     worker.process = worker.pool.submit(os.getpid).result()
                     self._processes.add(worker.process)
-                # A worker that was not known yet when the executor stopped got no signal.
+                # A worker that was still unknown when the executor stopped got no signal.
                 if self._stopped:
                     break
                 return worker.pool.submit(function, *arguments).result()
@@ -80,8 +80,8 @@ class LocalExecutor:
 
 
 def _context() -> Any:
-    """Return how workers start: on Linux forked from a server that has imported what takes seconds,
-    elsewhere as new processes.
+    """Return how workers start: on Linux, forked from a server that has done the slow imports;
+    elsewhere, as new processes.
     """
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")

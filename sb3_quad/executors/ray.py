@@ -19,7 +19,7 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.process import TRUST_VARIABLE
 from sb3_quad.base.types import StrDict
 
-# Times that Ray repeats a call whose node or worker process dies.
+# How often Ray repeats a call whose node or worker process dies.
 RETRIES = 3
 
 
@@ -54,7 +54,7 @@ class RayExecutor:
             if address is None:
                 # Ray warns about a variable that this package does not use.
                 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-                # With Ray's niceness of 15, workers get no time next to other work.
+                # With Ray's niceness of 15, workers would get no time next to other work.
                 os.environ.setdefault("RAY_worker_niceness", "0")
                 options = {"num_cpus": workers * num_cpus, "include_dashboard": False}
             else:
@@ -79,7 +79,9 @@ class RayExecutor:
         future = Future[Any]()
 
         def hand_over(done: "Future[Any]") -> None:
-            """Give the future the outcome of Ray's, with an error that is not of Ray's classes."""
+            """Give the future the outcome of Ray's future, with an error that is not one of Ray's
+            classes.
+            """
             error = done.exception()
             if error is None:
                 future.set_result(done.result())

@@ -20,7 +20,7 @@ from sb3_quad.vehicles.gains import GeometricGains
 from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
-# Half of the drag by the vehicle's own motion stays uncompensated, because it damps.
+# Half of the drag from the vehicle's own motion is not compensated, because it damps.
 _DRAG_LEFT = 0.5
 
 
@@ -32,18 +32,18 @@ class GeometricExpert(Expert):
     one of Chaturvedi, Sanyal and McClamroch, "Rigid-body attitude control" (IEEE Control Systems
     31(3), 2011): it turns the thrust direction first and then the yaw, as in Brescianini and
     D'Andrea, "Tilt-prioritized quadrocopter attitude control" (IEEE Trans. Control Systems
-    Technology 28(2), 2020): a heading is followed with the thrust that is left.
+    Technology 28(2), 2020): a heading is followed with the remaining thrust.
 
-    It adds to them: velocities and body rates that the vehicle can brake from; the attitude at the
-    time when the command acts; the long way round where the spin makes that quicker; and rotor
-    thrusts that give up yaw before thrust and thrust before tilt. It has no state: its actions are
-    a function of the 18 observed features and the reference.
+    It adds: velocities and body rates from which the vehicle can brake; a prediction of the
+    attitude for the time when the command acts; the long way round if the spin makes that quicker;
+    and an allocation that gives up yaw before thrust, and thrust before tilt. It has no state: its
+    actions are a function of the 18 observed features and the reference.
 
     :param vehicle: name, YAML path or Vehicle that it is designed for.
     :param gains: the :class:`GeometricGains`; None: those in the vehicle's YAML
         (``geometric_gains``), or :func:`derived_gains` if it has none.
     :param privileged: whether it uses each vehicle's true parameters and compensates the external
-        wrench, if the state holds them (``state.vehicles``, ``state.wrench``). Its gains then scale
+        wrench, if the state has them (``state.vehicles``, ``state.wrench``). Its gains then scale
         with the vehicle as :func:`derived_gains` do.
     """
 
@@ -79,10 +79,10 @@ class GeometricExpert(Expert):
 
     @staticmethod
     def _to_compensate(state: QuadcopterState, wrench: FloatArray) -> FloatArray:
-        """Return the external wrench less a part of the vehicles' own drag."""
+        """Return the external wrench without a part of the drag from the vehicles' own motion."""
         if state.vehicles is None or not state.vehicles[P.drag_x : P.drag_z + 1].any():
             return wrench
-        # Drag against air that moves as the reference does is that of errors of the velocity.
+        # The drag in air that moves with the reference is caused by velocity errors.
         air = state.target_velocity.T
         wrench = wrench.copy()
         wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, air)
@@ -97,8 +97,8 @@ def privileged_geometric(vehicle: VehicleSource = "itm") -> GeometricExpert:
 def privileged_derived(vehicle: VehicleSource = "itm") -> GeometricExpert:
     """Return a privileged expert with the derived gains of each vehicle.
 
-    It is meant for distributions of vehicles unlike this one. Where commands act late, its outer
-    loop is slower and its inner one faster: agents that learn from it can cope with slow motors.
+    It is meant for distributions of vehicles unlike this one. If commands act late, its outer loop
+    is slower and its inner one faster: agents that learn from it can cope with slow motors.
     """
     expert = GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), privileged=True)
     expert._true = TrueConstants(expert.vehicle, expert.gains, is_gentle=True)

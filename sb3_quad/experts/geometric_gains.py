@@ -1,4 +1,4 @@
-"""The constants of the geometric expert's law: gains, and what follows from a vehicle."""
+"""The constants of the geometric expert's law: gains, and values that follow from a vehicle."""
 
 from typing import NamedTuple
 
@@ -11,11 +11,11 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 
-# The yaw gain is this many times larger where the external torque is known. An error in the moment
-# that compensates it then makes a smaller yaw rate.
+# The yaw gain is this many times larger if the external torque is known, so that an error in
+# compensating it causes a smaller yaw rate.
 PRIVILEGED_YAW = 4.0
-# Where commands act late, ``privileged_derived`` slows the outer loop and makes the inner one
-# faster, by these factors of its gains.
+# If commands act late, ``privileged_derived`` slows down the outer loop and speeds up the inner one
+# by these factors of the gains.
 _LATE = {
     "position": 0.85,
     "velocity": 0.85,
@@ -25,13 +25,13 @@ _LATE = {
     "descent": 0.5,
     "body_rates": 1.25,
 }
-# Command lags, s, from which on they begin to act and act fully.
+# Command lags, s, at which these factors set in and at which they apply in full.
 _LATE_FROM = 0.085
 _LATE_TO = 0.125
 
 
 class LawConstants(NamedTuple):
-    """Constants of n vehicles, one column for each, in the layout that the law is compiled for."""
+    """Constants of n vehicles, a column each, in the layout that the law is compiled for."""
 
     vehicles: FloatArray
     """Parameters, (len(PARAMETER_NAMES), n)."""
@@ -62,7 +62,7 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
 
     :param v: parameters of n vehicles, (len(PARAMETER_NAMES), n).
     """
-    # How quickly the vehicle can turn: the weaker of roll and pitch counts.
+    # How quickly the vehicle can turn, by the weaker of roll and pitch
     gravity = v[P.gravity]
     lag = command_lag(v, control_step)
     roll_pitch_arms = v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)
@@ -70,7 +70,7 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
     turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
     rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
 
-    # In hover thrusts of the rotor that has least room. Worn motors and a low battery may not even
+    # In hover thrusts of the rotor with the least margin. Worn motors or a low battery may not even
     # lift the vehicle.
     hovers = v[P.hover_share_0 : P.hover_share_0 + 4] * v[P.hover_thrust]
     least = (v[P.thrust_middle] - v[P.thrust_half_range]) / hovers.min(axis=0)
@@ -99,7 +99,8 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
 
 
 def command_lag(v: FloatArray, control_step: float) -> FloatArray:
-    """Return the times τ from a command to its thrust, s, of parameters as for the others.
+    """Return the times τ from a command to its thrust, (n,), s, for parameters
+    (len(PARAMETER_NAMES), n).
 
     It is the delay, half the control step it is held for, and the motors' time constant: 1/k_m, the
     mean of a rotor that speeds up and one that slows down.
@@ -118,7 +119,7 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
     arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
     mixers = np.concatenate([np.ones_like(arms[:1]), arms])
     inverse = np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0)
-    # A randomized centre of mass may lie beyond the rotors: a share would be negative.
+    # A randomized centre of mass may lie outside the rotors, where a share would be negative.
     inverse[:, 0] = np.maximum(inverse[:, 0], 0.01)
     lag = command_lag(v, control_step)
     return LawConstants(v.copy(), gains, lag, np.ascontiguousarray(inverse))
@@ -127,12 +128,12 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
 class TrueConstants:
     """The law's constants for vehicles whose true parameters are known.
 
-    They are kept, and computed again only for vehicles that have changed: in each control step of a
-    training few rows begin a new episode with another vehicle.
+    They are kept, and recomputed only for vehicles that have changed: in each control step of a
+    training, only a few rows begin a new episode with another vehicle.
 
-    :param vehicle: the vehicle that ``gains`` are for. Those of the others scale with their control
-        authority, as :func:`derived_gains` do.
-    :param is_gentle: whether the gains change where commands act late.
+    :param vehicle: the vehicle that ``gains`` are for. The gains of other vehicles scale with their
+        control authority, as :func:`derived_gains` do.
+    :param is_gentle: whether the gains change if commands act late.
     """
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains, is_gentle: bool = False) -> None:
@@ -145,7 +146,7 @@ class TrueConstants:
 
     def of(self, vehicles: FloatArray) -> LawConstants:
         """Return the constants for parameters (len(PARAMETER_NAMES), n)."""
-        # Another number of vehicles is another environment.
+        # Another number of vehicles means another environment.
         if self._kept.vehicles.shape != vehicles.shape:
             self._kept = self._compute(vehicles)
         changed = np.flatnonzero((self._kept.vehicles != vehicles).any(axis=0))

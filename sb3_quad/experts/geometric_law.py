@@ -32,7 +32,7 @@ def fly_geometric(state, constants, wrench, actions):
     """
     tilting = np.empty(4)
     for i in range(actions.shape[0]):
-        # One column stands for all.
+        # A single column serves all vehicles.
         k = min(i, constants.gains.shape[1] - 1)
         j = min(i, wrench.shape[1] - 1)
         gains = constants.gains[:, k]
@@ -42,15 +42,16 @@ def fly_geometric(state, constants, wrench, actions):
         body_to_world = rotation(state[X.quaternion :], i)
         omega = vector_at(state, X.body_rates, i)
 
-        # What the external wrench does: an acceleration in the world frame, a torque in the body's.
+        # The effect of the external wrench: an acceleration in the world frame, a torque in the
+        # body frame.
         pushed = to_world(body_to_world, vector_at(wrench, W.force_body, j))
         force = total(vector_at(wrench, W.force_world, j), pushed)
         turned = to_body(body_to_world, vector_at(wrench, W.torque_world, j))
         torque = total(vector_at(wrench, W.torque_body, j), turned)
 
-        # The force that the rotors should give per mass, and its direction b as the body will see
-        # it when the command acts.
-        # All motion is relative to the reference: its acceleration pushes the vehicle backwards.
+        # The desired force of the rotors per mass, and its direction b as the body will see it when
+        # the command acts. All motion is relative to the reference, whose acceleration pushes the
+        # vehicle backwards.
         f = desired_force(
             difference(vector_at(state, X.target, i), vector_at(state, X.position, i)),
             difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i)),
@@ -82,9 +83,10 @@ def fly_geometric(state, constants, wrench, actions):
 
 @compiled
 def reference_acceleration(state, i, lag, attitude):
-    """Return the acceleration of the reference when the vehicle can have it, world frame, m/s².
+    """Return the acceleration of the reference at the time when the vehicle can have it, world
+    frame, m/s².
 
-    Upwards that is when a command acts, sideways when the vehicle has turned, too.
+    Upwards, that is when a command acts; sideways, only after the vehicle has also turned.
     """
     now = vector_at(state, X.target_acceleration, i)
     dx, dy, dz = difference(vector_at(state, X.target_ahead, i), now)
@@ -121,7 +123,7 @@ def desired_force(e, v, a, gains, g):
     vx, vy, vz = v
     ax, ay, az = a
 
-    # Plan to brake with less where the external force accelerates the vehicle towards the target.
+    # Plan for less deceleration if the external force accelerates the vehicle towards the target.
     distance = math.sqrt(ex * ex + ey * ey)
     along = 0.0
     if distance > 0.0:
@@ -140,9 +142,9 @@ def desired_force(e, v, a, gains, g):
     fy = gains[G.velocity] * (speed * ey - vy)
     fz = max(-gains[G.descent], gains[G.height_velocity] * (climb_speed * ez - vz))
 
-    # The force may be as great as the one that holds the height at the greatest tilt. The largest
-    # λ that keeps |λ (fx, fy, fz) + (0, 0, g) - a| within that solves a quadratic equation:
-    # λ² square + 2 λ across = room.
+    # The force may be as large as the one that keeps the height at the greatest tilt. The largest λ
+    # that keeps |λ (fx, fy, fz) + (0, 0, g) - a| within that solves a quadratic equation: λ² square
+    # + 2 λ across = room.
     weight = g - az
     square = dot((fx, fy, fz), (fx, fy, fz))
     across = fz * weight - fx * ax - fy * ay
@@ -161,14 +163,14 @@ def desired_force(e, v, a, gains, g):
 def braking_profile(gain, distance_by_deceleration):
     """Return the speed per distance from which the vehicle can still brake.
 
-    Near the target it is the gain, far away that of √(2 deceleration distance).
+    Near the target it is the gain; far away it follows from the speed √(2 deceleration distance).
     """
     return 2.0 * gain / (1.0 + math.sqrt(1.0 + 2.0 * gain * gain * distance_by_deceleration))
 
 
 @compiled
 def left_to_brake(deceleration, forward):
-    """Return the deceleration to plan with where something else accelerates by ``forward``."""
+    """Return the deceleration to plan with if something else accelerates by ``forward``."""
     return max(0.1 * deceleration, deceleration - max(0.0, forward))
 
 
@@ -209,8 +211,8 @@ def turn_moments(b, omega, gains, inertia):
         nx = -b[1] / sine
         ny = b[0] / sine
 
-    # Go the long way round where the present spin makes that quicker. Both are the times, times
-    # the deceleration, in which a double integrator comes to rest at the direction.
+    # Go the long way round if the present spin makes that quicker. What is compared is the time in
+    # which a double integrator comes to rest at the direction, times the deceleration.
     along = p * nx + q * ny
     half_square = 0.5 * along * along
     short = -along + 2.0 * math.sqrt(half_square + deceleration * alpha)
@@ -221,7 +223,8 @@ def turn_moments(b, omega, gains, inertia):
         alpha = 2.0 * math.pi - alpha
     rate = alpha * braking_profile(gains[G.attitude], alpha / deceleration)
 
-    # The desired rates stay fixed in the world while the body yaws; then Euler's gyroscopic terms.
+    # The desired rates stay fixed in the world while the body yaws. Then add Euler's gyroscopic
+    # terms.
     p_dot = gains[G.body_rates] * (rate * nx - p) + r * rate * ny
     q_dot = gains[G.body_rates] * (rate * ny - q) - r * rate * nx
     return ixx * p_dot + (izz - iyy) * q * r, iyy * q_dot + (ixx - izz) * r * p
@@ -229,20 +232,20 @@ def turn_moments(b, omega, gains, inertia):
 
 @compiled
 def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, tilting, actions):
-    """Write the actions of one vehicle that make a thrust, N, and moments, N m.
+    """Write the actions of one vehicle that produce a thrust, N, and moments, N m.
 
-    Roll and pitch come before the thrust, and the thrust before yaw, all within the limits of every
-    rotor, ``thrust_middle`` ± ``thrust_half_range``, N.
+    Roll and pitch take precedence over the thrust, and the thrust over yaw, all within the limits
+    of every rotor, ``thrust_middle`` ± ``thrust_half_range``, N.
 
-    :param tilting: scratch for what roll and pitch ask of the rotors, (4,), N.
+    :param tilting: scratch memory for the rotor thrusts that roll and pitch require, (4,), N.
     """
     low = thrust_middle - thrust_half_range
     high = thrust_middle + thrust_half_range
 
-    # Rotors give their shares of the thrust, and what roll and pitch ask of them. All of it is in
-    # terms of the whole thrust: the rotor with the greatest share bounds it from above, and the one
-    # with the smallest from below. Scale what roll and pitch ask until it fits; then shift the
-    # thrust.
+    # Rotors provide their shares of the thrust, and what roll and pitch require of them. All of it
+    # is in terms of the whole thrust: the rotor with the greatest share bounds it from above, and
+    # the one with the smallest from below. Scale what roll and pitch require until it fits; then
+    # shift the thrust.
     shares = mixer_inverse[:, 0]
     least = 0.0
     most = 0.0
@@ -258,8 +261,8 @@ def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, t
         scale = (highest - lowest) / (most - least)
     thrust = min(highest - scale * most, max(lowest - scale * least, thrust))
 
-    # The share of the yaw moment that every rotor has room for. The thrusts without it take the
-    # place of those that tilt.
+    # The share of the yaw moment that every rotor has room for. The thrusts without yaw overwrite
+    # those in ``tilting``.
     share = 1.0
     without_yaw = tilting
     for rotor in range(4):

@@ -12,7 +12,7 @@ from sb3_quad.simulation.state import QuadcopterState, X
 from sb3_quad.simulation.vectors import difference, vector_at
 from sb3_quad.vehicles.vehicle import VehicleSource
 
-# The thesis takes φ_des and θ_des at a quarter, "to ensure smoother rotations" (3.2.1).
+# The thesis scales φ_des and θ_des to a quarter, "to ensure smoother rotations" (3.2.1).
 ANGLE_FACTOR = 0.25
 
 
@@ -20,8 +20,8 @@ class PIDExpert(Expert):
     """Position PID around an attitude PD controller, on the true state (thesis 2.1.2 and 3.2.1).
 
     It also tracks the velocity, acceleration and heading of a moving reference; the thesis's PID
-    does not.
-    It is made for small angles: from a random attitude it recovers less than a third of the time.
+    does not. It is made for small angles: from a random attitude it recovers less than a third of
+    the time.
     The attitude gains are I ωn² and 2 ξ ωn I (Eq. 3.15), so they fit any vehicle. With ITM's
     inertia they are those of Table A.1.
 
@@ -96,9 +96,9 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
         pitch = math.asin(min(1.0, max(-1.0, -r31)))
         yaw = math.atan2(r21, r11)
 
-        # Position: desired accelerations, and the angles that make the horizontal ones. The thesis
-        # takes the body for aligned with the world: here, with the heading. Accelerations of the
-        # reference need their whole angles, when the body has turned to them.
+        # Position: desired accelerations, and the angles for the horizontal ones. The thesis
+        # assumes that the body is aligned with the world; here it is aligned with the heading.
+        # Accelerations of the reference need the full angle, by the time the body has turned.
         ax = kp * position_error[0] - kd * (c * vx - s * vy) + ahead[0] / ANGLE_FACTOR
         ay = kp * position_error[1] - kd * (c * vy + s * vx) + ahead[1] / ANGLE_FACTOR
         az = kp * position_error[2] - kd * vz + ahead[2]

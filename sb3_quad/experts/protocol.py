@@ -23,7 +23,7 @@ Floats = npt.NDArray[np.floating]
 
 
 class Expert(ABC):
-    """A controller of a known vehicle. A subclass has to write :meth:`actions` only.
+    """A controller of a known vehicle. A subclass has to implement only :meth:`actions`.
 
     >>> class Hover(Expert):
     ...     def actions(self, state):
@@ -41,7 +41,7 @@ class Expert(ABC):
     observation_mean: FloatArray = DEFAULT_MEAN
     observation_std: FloatArray = DEFAULT_STD
 
-    # Whether it flies by each vehicle's true parameters rather than by those of ``vehicle``.
+    # Whether it uses each vehicle's true parameters rather than those of ``vehicle``.
     is_privileged = False
 
     def __init__(self, vehicle: VehicleSource = "itm") -> None:
@@ -60,7 +60,7 @@ class Expert(ABC):
     ) -> tuple[Actions, tuple[Floats, ...] | None]:
         """Return the actions for observations of shape (18,) or (n, 18), as SB3's ``predict`` does.
 
-        Noise of the observations stays in.
+        Noise of the observations is not removed.
 
         :raises ExpertError: observations of another shape.
         """
@@ -103,9 +103,9 @@ def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -
 def _nearest_quaternion(matrices: FloatArray) -> FloatArray:
     """Return the unit quaternions (n, 4) of the rotations nearest to matrices (n, 3, 3).
 
-    They are (w, x, y, z), body to world, with w at least 0. This is Davenport's q-method: the
-    trace of R(q)ᵀ M is qᵀ K q, with a symmetric matrix K made of M. Of all unit quaternions the
-    eigenvector to the greatest eigenvalue makes it greatest.
+    They are (w, x, y, z), body to world, with w at least 0. This is Davenport's q-method: the trace
+    of R(q)ᵀ M is qᵀ K q, with a symmetric matrix K built from M. Among unit quaternions, the
+    eigenvector of the greatest eigenvalue maximises it.
     """
     trace = np.trace(matrices, axis1=1, axis2=2)[:, None, None]
     transposed = matrices.transpose(0, 2, 1)

@@ -24,16 +24,15 @@ def c_name(text: str) -> str:
 
 def write_header(network: Network, metadata: StrDict, name: str, half: bool = False) -> bytes:
     """Return the header, with ``static inline void NAME_policy(const float observation[18], float
-    thrust[4])``, and ``NAME_relate``, which makes an observation relative to a reference that
-    moves.
+    thrust[4])``, and ``NAME_relate``, which makes an observation relative to a moving reference.
 
-    For a policy with a state the function takes a ``NAME_state *`` before these, which
-    ``NAME_reset`` lets begin a flight.
+    For a policy with a state, the function takes a ``NAME_state *`` before these, which
+    ``NAME_reset`` prepares for a flight.
 
-    :param network: for speeds the second parameter is called ``rotor_speed``.
+    :param network: if it outputs speeds, the second parameter is called ``rotor_speed``.
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
-    :param half: whether the weights stand in half precision, in half the flash.
+    :param half: whether the weights are in half precision, which takes half the flash.
     """
     return render(
         "sb3_quad.export",
@@ -52,7 +51,7 @@ def write_header(network: Network, metadata: StrDict, name: str, half: bool = Fa
 def _comment(metadata: StrDict) -> list[str]:
     lines = []
     for key, value in metadata.items():
-        # A file may have any name, but the name must neither end the comment nor leave ASCII.
+        # A file may have any name, but here it must be ASCII and must not end the comment.
         text = f"{key}: {value}".replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
         text = text.encode("ascii", "backslashreplace").decode("ascii")
         lines += textwrap.wrap(text, WIDTH - 3, subsequent_indent="    ", break_on_hyphens=False)
@@ -60,7 +59,7 @@ def _comment(metadata: StrDict) -> list[str]:
 
 
 def _number(value: Any) -> str:
-    """The fewest digits that tell a float32 from any other."""
+    """The fewest digits that distinguish a float32 from any other."""
     return f"{np.float32(value)!s}f"
 
 

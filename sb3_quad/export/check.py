@@ -1,5 +1,5 @@
-"""An exported file against the policy it came from, in flights of the policy: the largest
-difference.
+"""An exported file compared with the policy that it came from, in flights of the policy: the
+largest difference.
 """
 
 from typing import Any
@@ -24,10 +24,11 @@ from sb3_quad.vehicles.layout import find_turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
-# Control steps of a flight: of a policy that sees the present features only, of one with a state.
+# Control steps of a flight: for a policy that sees only the present features, and for one with a
+# state
 SHORT, LONG = 2, 1000
-# Of the range between least and greatest output: above rounding, which grows along a flight where
-# an agent reacts strongly to its last actions, and far below any mistake.
+# A share of the range between least and greatest output: above rounding, which grows along a flight
+# if an agent reacts strongly to its last actions, and far below any mistake
 TOLERANCE = 1e-3
 WIDE = TASKS["recovery_and_tracking"].model_copy(
     update={
@@ -37,7 +38,7 @@ WIDE = TASKS["recovery_and_tracking"].model_copy(
         "body_rates_std": 8.0,
     }
 )
-# Here the position integral is at work from the first step on.
+# Here the position integral is active from the first step on.
 NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)
 # References that files are checked with, slow enough to be followed for long.
 MOVING = {
@@ -47,26 +48,26 @@ MOVING = {
     "heading": "random",
     "heading_rate": 1.0,
 }
-ROUNDING = 2e-6  # relative, of the limits within which the position integral is at work
+ROUNDING = 2e-6  # relative to the limits within which the position integral is active
 
 
 class TrainedPolicy:
-    """A trained policy in its own environment: an exported file must agree with it.
+    """A trained policy in its own environment, with which an exported file must agree.
 
-    :ivar own: the vehicle in its own layout, which is the file's; ``vehicle`` in the one that the
-        policy knows.
-    :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std`` σ, likewise;
-        ``own_mean`` μ in the body frame of ``own``.
-    :ivar clip: VecNormalize's bound of the scaled features, whose statistics are in μ and σ; 0:
-        none.
+    :ivar own: the vehicle in its own layout, which is the file's; ``vehicle``: in the layout that
+        the policy knows.
+    :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std``: σ, likewise;
+        ``own_mean``: μ in the body frame of ``own``.
+    :ivar clip: VecNormalize's bound of the scaled features; 0: none. Its statistics are part of μ
+        and σ.
     :ivar observation: the frames that the policy sees.
     :ivar turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
 
     :param settings: how the policy flies.
-    :param vehicle: that it flies; its layout may be another.
+    :param vehicle: the vehicle that it flies; its layout may differ.
     :param output: ``thrusts`` (N) or ``speeds`` (rad/s).
-    :raises ConfigError: settings that the environment refuses, a layout that does not fit;
-        statistics of more than the present features.
+    :raises ConfigError: settings that the environment refuses; a layout that does not fit;
+        statistics for more than the present features.
     """
 
     def __init__(
@@ -117,17 +118,17 @@ def compare(
 ) -> tuple[float, int]:
     """Compare a file with the policy that it came from, in the policy's flights.
 
-    The flights start at any attitude, up to 30 m from references that move and turn, with
-    velocities of N(0, 4 m/s) and body rates of N(0, 8 rad/s) per axis, twice what an episode starts
-    with. A policy of the present features flies two steps each time, so that half of the
-    observations are such starts. The flights of a policy with a state are longer, and half of them
-    start within 1 m.
+    The flights start at any attitude, up to 30 m from references that move and turn, with normal
+    velocities of σ = 4 m/s and body rates of σ = 8 rad/s per axis, twice those at the start of an
+    episode. A policy that sees only the present features flies two steps each time, so that half of
+    the observations are such starts. The flights of a policy with a state are longer, and half of
+    them start within 1 m.
 
     :param by: the program that runs the file, for the message.
-    :param n: observations, at most: a flight may end early.
+    :param n: maximum number of observations, since a flight may end early.
     :param relates: whether the file also makes observations relative to references.
-    :return: the largest difference of any rotor, N or rad/s, and how many observations the file
-        has seen.
+    :return: the largest difference of any rotor, N or rad/s, and the number of observations that
+        were compared.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
     """
@@ -148,11 +149,11 @@ def compare(
         reference=MOVING,
     )
     batch = QuadcopterBatch(max(n // steps, 1), settings, seed=0, autoreset=False)
-    # What a file sees of the same states: the present features, without the position integral.
+    # What a file observes of the same states: the present features, without the position integral
     present = settings.with_changes(history=None, last_action=False, position_integral=None)
     shown = QuadcopterBatch(batch.n, present)
     if relates:
-        # As if the target rested; apart from that the file is given what the target does.
+        # As if the target rested; its motion is passed to the file separately.
         for part in ("target_velocity", "target_heading", "target_heading_rate"):
             shown.tracks[:, row_slices(REFERENCE_PARTS)[part]] = 0.0
     ahead = np.zeros(3 * len(batch.previews))
@@ -189,7 +190,7 @@ def compare(
         difference = np.abs(results[:, trained.turn.order] - trained.results(actions))
         error = float(np.max(difference[compared], initial=error))  # NaN stays
         count += compared.sum()
-        # What follows of a flight that is lost is not compared.
+        # After a flight is lost, it is no longer compared.
         observation, _, lost = batch.step(actions)
         compared &= ~lost
     allowed = TOLERANCE * np.ptp(trained.results([-1.0, 1.0]))

@@ -4,15 +4,15 @@ from typing import NamedTuple
 
 from sb3_quad.export.network import Network
 
-# Instructions of a call, compiled for a Cortex-M4F by arm-none-eabi-gcc 12.2 -Os: least squares of
-# what examples/microcontroller/measure.py counts in QEMU.
+# Instructions of a call, compiled for a Cortex-M4F by arm-none-eabi-gcc 12.2 -Os: a least-squares
+# fit to the counts of examples/microcontroller/measure.py in QEMU
 PER_MULTIPLICATION = 4.36
 PER_UNIT = {"tanh": 104.0, "relu": 12.0, "none": 0.0}
 PER_CALL = 2365.0
 
 
 class Cost(NamedTuple):
-    """Of one call, but for the memory."""
+    """The cost of one call, and the memory."""
 
     flash: int  # bytes, of the weights and the scaling
     ram: int  # bytes between calls
@@ -33,7 +33,7 @@ def cost_of(network: Network) -> Cost:
         multiplications += layer["inputs"] * layer["outputs"]
         instructions += PER_UNIT[layer["activation"]] * layer["outputs"]
     instructions += PER_MULTIPLICATION * multiplications
-    # The struct of the template: a ring of frames with its place, the integral.
+    # The struct of the template: a ring of frames with its position, and the integral
     ram = 0
     observation = network.observation
     if observation.is_extended:

@@ -9,10 +9,10 @@ from sb3_quad.export.network import Network
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 FILES = ("Makefile", "Kbuild", "app-config", "README.md", "src/Kbuild", "src/sb3quad.c")
-CALL = 0.001  # s between calls of the firmware, each of which has so many cycles of its STM32F405:
-CYCLES = 168_000
-# Of these the policy may take a quarter in instructions, and a half where it cannot do with less:
-# an instruction may take two cycles, and the firmware has other things to do.
+CALL = 0.001  # time between calls of the firmware, s
+CYCLES = 168_000  # of its STM32F405 between two calls
+# The policy's instructions may use a quarter of these cycles, or a half if it needs more: an
+# instruction may take two cycles, and the firmware has other work to do.
 SHARE = 0.25
 MOST = 0.5
 # THRUST_MIN and THRUST_MAX of the firmware's platforms, N: src/platform/interface in its repository
@@ -25,11 +25,11 @@ PLATFORMS = (
 
 
 def plan_app(network: Network) -> StrDict:
-    """Return what the templates of the files need besides names.
+    """Return the variables of the file templates, except for names.
 
     :param network: its vehicle's rotors are M1 to M4 of the firmware.
-    :raises ConfigError: thrusts that no platform gives; a policy that is too slow, or whose control
-        step is not a number of calls.
+    :raises ConfigError: thrusts that no platform provides; a policy that is too slow, or whose
+        control step is not a multiple of the time between calls.
     """
     vehicle = network.trained.own
     high = vehicle.thrust_range[1]
@@ -47,7 +47,7 @@ def plan_app(network: Network) -> StrDict:
             f"control_step {step:g} s: the Crazyflie's firmware calls every {CALL:g} s; "
             "train with a multiple of that"
         )
-    # In calls of the firmware
+    # In units of the firmware's calls
     time = cost.instructions / CYCLES
     if time > MOST * period:
         raise ConfigError(
@@ -55,7 +55,7 @@ def plan_app(network: Network) -> StrDict:
             f"half of the {1000 * step:g} ms between calls; train one with a smaller net_arch"
         )
     slices = min(math.ceil(time / SHARE), period)
-    # A row's products stay together, so that a slice may end a row early.
+    # The products of a row stay together, so that a slice may end up to a row early.
     longest_row = max(layer["inputs"] for layer in network.shapes)
     return {
         "network": network,

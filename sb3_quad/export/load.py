@@ -1,4 +1,4 @@
-"""Exported files as their users run them: loaded by torch, by onnxruntime, or compiled."""
+"""Exported files, run as their users do: loaded by torch, by onnxruntime, or compiled."""
 
 import ctypes
 import io
@@ -20,16 +20,16 @@ from sb3_quad.base.types import Float32Array
 COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 Call = Callable[..., tuple[Float32Array, Any]]
-"""From observations in physical units, (n, numbers), and states to results, (n, 4), and the next
-states. The state None begins flights. That of a header also takes references, (n, 5): velocity,
-heading and heading rate.
+"""A function from observations in physical units, (n, numbers), and states to results, (n, 4), and
+the next states. The state None begins flights. That of a header also takes references, (n, 5):
+velocity, heading and heading rate.
 """
 
 
 def load_torchscript(content: bytes, state_size: int) -> tuple[Call, str]:
-    """Load the file by torch on the CPU. Return its call and torch's version.
+    """Load the file with torch on the CPU. Return its call and torch's version.
 
-    :param state_size: numbers in a state; 0: the file takes and gives none.
+    :param state_size: numbers in a state; 0: the file has no state.
     """
     module = th.jit.load(io.BytesIO(content), "cpu")  # type: ignore[no-untyped-call]
 
@@ -43,7 +43,7 @@ def load_torchscript(content: bytes, state_size: int) -> tuple[Call, str]:
 
 
 def load_onnx(content: bytes, state_size: int) -> tuple[Call, str]:
-    """Load the file by onnxruntime on one thread of the CPU, see :func:`load_torchscript`.
+    """Load the file with onnxruntime on one thread of the CPU, see :func:`load_torchscript`.
 
     :raises ConfigError: it is not installed.
     """
@@ -71,7 +71,7 @@ def _call(run: Callable[..., Any], state_size: int) -> Call:
 
 
 def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
-    """Load a C header by the machine's compiler, see :func:`load_torchscript`.
+    """Load a C header with the machine's compiler, see :func:`load_torchscript`.
 
     :param name: the beginning of the header's identifiers.
     :raises ConfigError: there is no compiler.
@@ -101,7 +101,7 @@ def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
             references = np.zeros((len(rows), 5), np.float32)
         begins = state is None
         if begins:
-            # A new struct holds anything before its reset.
+            # A new struct may contain anything before its reset.
             state = np.full((len(rows), library.size()), 0xFF, np.uint8)
         results = np.empty((len(rows), 4), np.float32)
         arrays = map(np.ctypeslib.as_ctypes, (rows, references, results, state))

@@ -1,5 +1,5 @@
-"""A policy's computation as one torch module, and the files that torch traces of it: TorchScript
-and ONNX.
+"""A policy's computation as one torch module, and the files that torch makes from it by tracing:
+TorchScript and ONNX.
 """
 
 import copy
@@ -27,26 +27,26 @@ from sb3_quad.simulation.tracks import ACCELERATION_STD
 
 ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
-"""Each output with the name and the unit of one of its four numbers."""
+"""Each output, with the name and the unit of its four numbers."""
 
 
 class Network(nn.Module):
     """A deterministic policy from features in physical units to the four rotors, all of it float32,
     on the CPU.
 
-    ``a = clip(layers((features - mean) * inverse_std), -1, 1)``, where statistics of VecNormalize
-    bound what the layers get by ``clip``, then ``q = middle + half_range *
-    a`` (Eq. 3.18): thrusts, N. For speeds, middle and half_range are divided by kF, and the result
-    is the root of q, rad/s (Eq. 2.4).
+    ``a = clip(layers((features - mean) * inverse_std), -1, 1)``, where VecNormalize bounds the
+    input of the layers by ``clip``. Then ``q = middle + half_range * a`` (Eq. 3.18): thrusts, N.
+    For speeds, middle and half_range are divided by kF, and the result is the root of q, rad/s (Eq.
+    2.4).
 
     A policy that sees more than the present features keeps the frames of
-    :mod:`sb3_quad.simulation.frames` in a state, float32 (batch, ``state_size``). The state is
-    zeros as a flight begins. It holds as much of these as the policy sees: the last action (4); the
+    :mod:`sb3_quad.simulation.frames` in a state, float32 (batch, ``state_size``). The state is zero
+    when a flight begins. It has those of these parts that the policy sees: the last action (4); the
     integral s (3), m, with a 1 once a flight has begun; the earlier frames, scaled, the latest
     first.
 
-    A policy that previews its reference takes the accelerations behind the features of
-    ``observation``, m/s²: (batch, OBSERVATION_SIZE + 3 * previews).
+    A policy that previews its reference takes the accelerations, m/s², after the features of
+    ``observation``: (batch, OBSERVATION_SIZE + 3 * previews).
 
     :param layers: linear layers, each with the activation that follows it, if any; they are copied.
     :param trained: its scaling, vehicle, output and ``observation``; features and rotors are
@@ -92,16 +92,16 @@ class Network(nn.Module):
         self.actions = 4 * observation.last_action
         self.newest = self.actions + 4 * bool(integral)
         self.state_size = self.newest + observation.ages[-1] * observation.frame_size
-        # From the integral to what it adds to the scaled features.
+        # Maps the integral to its contribution to the scaled features.
         self.shift = th.diag(self.inverse_std[:OBSERVATION_SIZE])[GROUPS["position"]]
-        # An example of what the files take.
+        # An example of the inputs of the files
         self.examples: tuple[th.Tensor, ...] = (th.zeros(2, len(self.mean)),)
         if observation.is_extended:
             self.examples += (th.zeros(2, self.state_size),)
         self.eval()
 
     def forward(self, observation: th.Tensor, state: th.Tensor | None = None) -> Any:
-        """Rotor thrusts or speeds, (batch, 4), of observations; with a state also the next one."""
+        """Rotor thrusts or speeds, (batch, 4), for observations; with a state also the next one."""
         scaled = (observation - self.mean) * self.inverse_std
         if self.clip:
             scaled = scaled.clamp(-self.clip, self.clip)
@@ -122,7 +122,7 @@ class Network(nn.Module):
             following = [s, begun.clamp(min=1.0)]
         # The present frame ends with the last action; the earlier frames follow it.
         frames = th.cat([frame, state[:, : self.actions], state[:, self.newest :]], dim=1)
-        # The policy sees the frames of some ages; all but the oldest stay in the state.
+        # The policy sees the frames of some ages; all except for the oldest stay in the state.
         size = self.observation.frame_size
         ages = self.observation.ages
         seen = frames.view(-1, ages[-1] + 1, size)[:, ages].flatten(1)
@@ -132,11 +132,11 @@ class Network(nn.Module):
         return self.command(action), th.cat(following, dim=1)
 
     def command(self, action: th.Tensor) -> th.Tensor:
-        """Rotor thrusts or speeds, (batch, 4), of actions."""
+        """Rotor thrusts or speeds, (batch, 4), for actions."""
         value: th.Tensor = self.middle + self.half_range * action
         if self.trained.output == "thrusts":
             return value
-        # Rounding may leave a rotor that can stand still a hair below zero.
+        # Rounding may put a rotor that can stand still slightly below zero.
         return value.relu().sqrt()
 
     @property
@@ -157,8 +157,8 @@ def build_network(trained: TrainedPolicy, where: str = "model", features: str = 
     """Build the network of an SB3 model with ``MlpPolicy``, on-policy, SAC's or TD3's, with its
     scaling and its rotors.
 
-    :param where: the model in messages.
-    :param features: that it must have been trained with.
+    :param where: the name of the model in messages.
+    :param features: the features that it must have been trained with.
     :raises ConfigError: an unknown output, other features or spaces than the quadcopter's, a policy
         that :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
@@ -201,7 +201,8 @@ def own_layers(layers: nn.Sequential, trained: TrainedPolicy) -> nn.Sequential:
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
     turn = trained.turn
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
-    # Every observed frame is turned alike; the weights absorb it, so that files stay as fast.
+    # Every observed frame is turned in the same way; the weights absorb the turn, so that files
+    # stay as fast.
     shape = (len(trained.observation.ages), trained.observation.frame_size)
     frames = linear[0].weight[:, : math.prod(shape)].view(-1, *shape)
     features = frames[..., :OBSERVATION_SIZE]
@@ -232,7 +233,7 @@ def deterministic_layers(policy: Any, where: str) -> nn.Sequential:
             return nn.Sequential(*actor.latent_pi, actor.mu, nn.Tanh())
     check_policy(policy, where)
     layers = [*policy.mlp_extractor.policy_net, policy.action_net]
-    # gSDE's squashed actions are the tanh of the mean; without squashing the mean is clipped.
+    # gSDE's squashed actions are the tanh of the mean; without squashing, the mean is clipped.
     if policy.squash_output:
         layers.append(nn.Tanh())
     return nn.Sequential(*layers)
@@ -240,7 +241,7 @@ def deterministic_layers(policy: Any, where: str) -> nn.Sequential:
 
 def check_policy(policy: Any, where: str) -> None:
     """:raises ConfigError: a policy that is not ``MlpPolicy`` of an on-policy algorithm, or has
-    extractors of its own.
+    custom extractors.
     """
     kinds = [
         type(policy),
@@ -260,7 +261,7 @@ def write_torchscript(network: Network, metadata: StrDict) -> bytes:
     """Return the file that ``torch.jit.load`` reads, in Python and in C++, with ``metadata`` as the
     extra file ``metadata.json``.
     """
-    # Tracing writes out the computation of an example, without this package's classes.
+    # Tracing records the computation for an example, without this package's classes.
     buffer = io.BytesIO()
     traced = th.jit.trace(network, network.examples)  # type: ignore[no-untyped-call]
     th.jit.save(traced, buffer, _extra_files={"metadata.json": json.dumps(metadata)})
@@ -268,16 +269,16 @@ def write_torchscript(network: Network, metadata: StrDict) -> bytes:
 
 
 def write_onnx(network: Network, metadata: StrDict) -> bytes:
-    """Return the model: ``observation`` float32 (batch, numbers) to ``thrust`` or ``rotor_speed``,
-    float32 (batch, 4).
+    """Return the model: from ``observation``, float32 (batch, numbers), to ``thrust`` or
+    ``rotor_speed``, float32 (batch, 4).
 
-    Of a policy with a state also ``state`` to ``next_state``, float32 (batch, state_size).
+    For a policy with a state, also from ``state`` to ``next_state``, float32 (batch, state_size).
 
     :param metadata: stored as the model's ``metadata_props``.
     :raises ConfigError: onnx is not installed.
     """
     onnx = require("onnx", "export", "--format onnx")
-    # A policy without a state takes and gives one thing only.
+    # A policy without a state has only one input and one output.
     inputs = ["observation", "state"][: len(network.examples)]
     outputs = [network.result, "next_state"][: len(network.examples)]
     buffer: Any = io.BytesIO()

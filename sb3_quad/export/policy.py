@@ -1,4 +1,4 @@
-"""A trained zip as a file that flies by itself, checked."""
+"""A trained zip as a self-contained policy file, checked."""
 
 import hashlib
 import re
@@ -27,7 +27,7 @@ from sb3_quad.simulation.observation import FEATURES, GROUPS
 from sb3_quad.simulation.settings import KEY
 from sb3_quad.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
 
-# With the endings of their files, or of their folders.
+# Formats, with the suffixes of their files or folders
 FORMATS = {
     "onnx": ".onnx",
     "torchscript": ".pt",
@@ -36,9 +36,9 @@ FORMATS = {
     "px4": "_px4",
     "safetensors": ENDING,
 }
-# Those that are folders, with the file that holds the policy.
+# Formats that are folders, with the file that contains the policy
 FOLDERS = {"crazyflie": "src/policy.h", "px4": "control_net.tflite"}
-# And the others in them; the template of FILE is FORMAT.FILE.j2, with . for /.
+# The other files in them; the template of FILE is FORMAT.FILE.j2, with . for /.
 FILES = {"crazyflie": crazyflie.FILES, "px4": px4.FILES}
 
 
@@ -47,9 +47,9 @@ class Export(NamedTuple):
 
     content: bytes  # the file
     metadata: dict[str, str]  # what it says about itself
-    max_error: float  # the largest difference to the policy, in `unit`
+    max_error: float  # the largest difference from the policy, in `unit`
     unit: str  # N or rad/s
-    settings: Path | None  # the file that vehicle and scaling came from, where they were not given
+    settings: Path | None  # the file that vehicle and scaling came from, if not given
     files: dict[str, bytes] | None  # all files of an app, by their paths in its folder
 
 
@@ -62,30 +62,31 @@ def export_policy(
     n_observations: int = N_OBSERVATIONS,
     half: bool = False,
 ) -> Export:
-    """Make a file that flies by itself of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC,
-    APG; ``MlpPolicy``).
+    """Export an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC, APG; ``MlpPolicy``) as a
+    self-contained policy file.
 
-    It takes the features of an observation in physical units, see ``metadata["observation"]``,
-    relative to a reference that moves, see ``metadata["reference"]``. It gives the four rotors'
-    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the
-    policy sees are in a state, ``metadata["state"]``. A vehicle that is not given, and the scaling,
-    are those that :func:`agent_settings` finds in the zip or next to it. If it finds none, the
-    vehicle must be given, and the scaling is that of Table A.2.
+    The file takes the features of an observation in physical units, see
+    ``metadata["observation"]``, relative to a moving reference, see ``metadata["reference"]``. It
+    returns the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
+    Earlier frames that the policy sees are in a state, ``metadata["state"]``. A vehicle that is not
+    given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it. If
+    it finds none, the vehicle must be given, and the scaling is that of Table A.2.
 
     :param file_format: ``onnx``, ``torchscript``, ``c``, ``crazyflie``, which is an app around the
         C header, ``px4`` or ``safetensors``; ``output``: ``thrusts`` or ``speeds``.
-    :param vehicle: in whose body frame and order of the rotors the file speaks; its thrust limits,
-        and for speeds its kF.
-    :param name: the C function is called ``NAME_policy``; None: as the zip.
-    :param n_observations: of the check, at most, see :func:`~sb3_quad.export.check.compare`.
+    :param vehicle: the vehicle whose body frame, order of rotors, thrust limits and, for speeds, kF
+        the file uses.
+    :param name: the C function is called ``NAME_policy``; None: the name of the zip.
+    :param n_observations: maximum number of observations of the check, see
+        :func:`~sb3_quad.export.check.compare`.
     :param half: round the weights to half precision, for ``c``. The check compares the file with
-        the policy of these weights.
+        the policy with rounded weights.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are
-        not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle
-        or does not say which, and none is given; a vehicle whose rotors cannot be brought to where
-        the policy knows them; an app for another vehicle than a Crazyflie, of speeds, or of a
+        not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle or
+        does not say which, and none is given; a vehicle whose rotors cannot be turned to the layout
+        that the policy knows; an app for another vehicle than a Crazyflie, of speeds, or of a
         policy that is too slow; a package or a C compiler that is not installed.
-    :raises ExportError: the file computes something else than the policy, or does not compile.
+    :raises ExportError: the file computes something other than the policy, or does not compile.
     """
     prefix = c_name(Path(path).stem) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix):
@@ -132,7 +133,7 @@ def export_policy(
     network = build_network(trained, f"model {path}", "px4" if file_format == "px4" else "body")
     write, read = formats.get(file_format, header)
     cost = None
-    # What conversions from half precision take was not measured.
+    # The cost of conversions from half precision was not measured.
     if write is header[0] and not half:
         cost = cost_of(network)
     plan = {}
@@ -140,8 +141,8 @@ def export_policy(
         plan = plan_app(network)
     metadata = _describe(Path(path), network, cost=cost, plan=plan)
     with warnings.catch_warnings():
-        # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's
-        # files do not.
+        # torch calls TorchScript deprecated, but it still loads everywhere, even where
+        # torch.export's files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
         # The file is checked, then written again with the result of the check in it.
         call, by = read(write(network, metadata), network.state_size)
@@ -183,7 +184,7 @@ def _agent_itself(path: StrPath, output: str, vehicle: VehicleSource | None) -> 
 
 
 def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:
-    """Return what users of the file must know; ASCII but for names."""
+    """Return what users of the file must know; ASCII except for names."""
     trained = network.trained
     text = render(
         "sb3_quad.export",
@@ -199,7 +200,7 @@ def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:
         needs=network.observation.model_dump(mode="json", exclude={"preview"}),
         **facts,
     )
-    # The name of a file may hold anything, also the end of a line.
+    # The name of a file may contain anything, even the end of a line.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     policy = f"{path.name} ({saved_algorithm(path)}), sha256 {digest}"
     return {"policy": policy, **dict(line.split(": ", 1) for line in text.splitlines())}

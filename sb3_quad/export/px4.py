@@ -1,7 +1,8 @@
 """A policy as a TensorFlow Lite file for PX4's module mc_nn_control.
 
-What the module gives a network and makes of its results is in ``src/modules/mc_nn_control`` of
-PX4-Autopilot: ``PopulateInputTensor``, ``RegisterOps``, ``RescaleActions``.
+The inputs that the module gives a network, and its use of the outputs, are in
+``src/modules/mc_nn_control`` of PX4-Autopilot: ``PopulateInputTensor``, ``RegisterOps``,
+``RescaleActions``.
 """
 
 from functools import partial
@@ -21,8 +22,8 @@ from sb3_quad.vehicles.vehicle import Vehicle
 PARAMETERS = "px4.params"
 FILES = ("control_net.cpp", "control_net.hpp", PARAMETERS)
 ARENA = 10 * 1024  # bytes that the module gives the interpreter
-# The features behind the 15 inputs. The module shows the first two rows of the rotation matrix from
-# body to world, which are columns of ours, and target - position.
+# The features that the 15 inputs correspond to. The module provides the first two rows of the
+# rotation matrix from body to world, which are columns of ours, and target - position.
 SHOWN = np.r_[
     GROUPS["position"],
     F.rotation : F.velocity : 3,
@@ -57,7 +58,7 @@ def write_px4(network: Network, metadata: StrDict) -> bytes:
         return getattr(tflite, f"{kind}End")(builder)
 
     def vector(content: Any, prepend: Any = builder.PrependInt32, size: int = 4) -> Any:
-        # The interpreter reads numbers where they are, so all are aligned.
+        # The interpreter reads numbers in place, so all are aligned.
         builder.StartVector(size, len(content), 16)
         for element in reversed(content):
             prepend(element)
@@ -68,7 +69,7 @@ def write_px4(network: Network, metadata: StrDict) -> bytes:
     tensors: list[Any] = []
 
     def tensor(array: Any, constant: bool = True) -> int:
-        # What the network computes has an empty buffer. Float32 is the schema's default.
+        # Tensors that the network computes have an empty buffer. Float32 is the schema's default.
         content = vector(array.tobytes() * constant, builder.PrependByte, 1)
         buffers.append(table("Buffer", Data=content))
         tensors.append(table("Tensor", Shape=vector(array.shape), Buffer=len(tensors)))
@@ -147,8 +148,8 @@ def motor_order(vehicle: Vehicle) -> list[int]:
 
 
 def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, str]:
-    """Load the file by TensorFlow Lite Micro, in an arena of the module's size, with what the
-    module does before and after it; see :func:`.load.load_torchscript`.
+    """Load the file with TensorFlow Lite Micro, in an arena of the module's size, with the module's
+    own processing before and after it; see :func:`.load.load_torchscript`.
 
     :raises ConfigError: tflite-micro is not installed; the network needs a larger arena.
     """

@@ -38,14 +38,14 @@ def plot_curves(
 ) -> Figure:
     """Draw two panels for each of ``show``, over timesteps and over wall-clock time.
 
-    A marker stands at each evaluation, unless there are too many to tell apart.
+    Each evaluation has a marker, unless there are too many to tell apart.
 
-    :param groups: from the name of an agent to the curves of its seeds; their mean is drawn, with
-        their range around it.
-    :param lines: from a name to heights by panel, shares for success and survival: horizontal
-        lines, such as the expert's.
-    :param show: of success, survival, reward and losses, which take a row for each that a curve
-        has; success, if the runs have it, and reward by default.
+    :param groups: the curves of an agent's seeds, by its name; their mean is drawn, with their
+        range around it.
+    :param lines: horizontal lines, such as the expert's: heights by panel, by name; shares for
+        success and survival.
+    :param show: the panels: success, survival, reward and losses, which take a row for each loss
+        that a curve has; by default success, if the runs have it, and reward.
     :raises ConfigError: a panel that no curve has values for.
     """
     measures = _measures([*chain.from_iterable(groups.values())], show)
@@ -70,7 +70,7 @@ def plot_curves(
                     panel.axhline(
                         heights[measure] * factor, color="0.3", ls=dashes, linewidth=1.2, label=name
                     )
-    # A title of the figure would lie on the legend.
+    # A title of the figure would overlap the legend.
     panels[0, 0].set_title(title, loc="left")
     legend(figure)
     return figure
@@ -94,9 +94,9 @@ def _measures(curves: Sequence[Curve], show: Sequence[str]) -> list[str]:
 
 
 def _mean_and_range(runs: Sequence[Curve], axis: str, measure: str) -> pd.DataFrame:
-    """The mean, the least and the greatest value of the runs, at the times of their evaluations.
+    """The mean, the lowest and the highest value of the runs, at the times of their evaluations.
 
-    Between its evaluations a run is interpolated. There is no line where a run has no values.
+    A run is interpolated between its evaluations. There is no line where a run has no values.
     """
     lines = [pd.Series(curve.values(measure), getattr(curve, axis)).dropna() for curve in runs]
     table = (

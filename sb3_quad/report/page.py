@@ -21,7 +21,7 @@ TEMPLATES = "sb3_quad.report.templates"
 class Section(NamedTuple):
     """A part of a page.
 
-    :param anchor: its place in the page's address; unique in a page.
+    :param anchor: its fragment in the page's address; unique in a page.
     :param facts: small print below the description.
     """
 
@@ -37,7 +37,7 @@ def write_page(folder: StrPath, title: str, facts: str, sections: Sequence[Secti
     """Write ``report.md`` with the tables, ``figures/`` with each plot as PNG, and the page,
     ``report.html``.
 
-    The page needs no other file and no network. Files that are there are replaced.
+    The page needs no other file and no network. Existing files are replaced.
 
     :param facts: a paragraph below the title.
     :return: the page.

@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.types import StrDict
 
-# The colours of the style, by their names in the page's own, which may be dark.
+# The colours of the style, with their names in the page's own scheme, which may be dark
 COLOURS = {"#1c2430": "ink", "#5c6672": "quiet", "#dfe3e8": "grid", "#ffffff": "paper"}
-# Inches: two stand side by side in the page, and one can be read on a telephone.
+# Inches: two fit side by side in the page, and one can be read on a telephone.
 WIDTH = 5.0
 HEIGHT = 3.3
 DPI = 150
-# A legend takes an inch for so many letters, and each name has a mark of so many before it.
+# Letters per inch of a legend, and the width in letters of the mark before each name
 LETTERS = 13
 MARK = 8
 POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
@@ -26,7 +26,7 @@ STYLE = matplotlib.rc_params_from_file(
     Path(__file__).parent / "templates/plots.mplstyle", use_default_template=False
 )
 styled = matplotlib.rc_context(STYLE)
-# None removes these from the file, so that the same results give the same bytes.
+# None removes these from the file, so that the same results yield the same bytes.
 METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
@@ -59,7 +59,7 @@ class Plot(NamedTuple):
 def picture(figure: Figure, kind: str, **options: Any) -> bytes:
     """Return a figure of matplotlib as a file of some kind, such as ``png``.
 
-    :param options: of the figure's ``savefig``.
+    :param options: options of the figure's ``savefig``.
     """
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, **options)
@@ -82,7 +82,7 @@ def legend(figure: Figure) -> None:
 
 
 def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
-    """Return a figure of the width of one of two side by side, and its axes."""
+    """Return a figure as wide as one of two side by side, and its axes."""
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     axes = figure.subplots()
     axes.set(xlabel=x_label, ylabel=y_label)

@@ -41,7 +41,7 @@ OVERVIEW = (
     " leaves the range. Where a scenario is varied, you see the least and the greatest share."
 )
 
-# Scenarios that are shown together, with their heading.
+# Scenarios that are shown together, with their heading
 Groups = Sequence[tuple[str, Sequence[Scenario]]]
 
 
@@ -49,10 +49,10 @@ def write_report(folder: StrPath, overwrite: bool = False) -> Path:
     """Write the report of a folder of results: ``report.html``, its tables as ``report.md``, its
     plots as files.
 
-    :param overwrite: replace a report that is there.
+    :param overwrite: replace an existing report.
     :return: the page.
-    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that
-        cannot be written.
+    :raises ConfigError: no results, damaged ones, an existing report, a folder that cannot be
+        written.
     """
     results = load_results(folder)
     if not results.entries:
@@ -98,7 +98,7 @@ def _flights_section(
 ) -> Section:
     """The section of a scenario, or of the cells that ``vary`` makes of one."""
     first = scenarios[0]
-    # What differs between the cells is left out.
+    # Conditions that differ between the cells are left out.
     conditions = []
     for scenario in scenarios:
         flown = f"{scenario.episodes} flights of each controller"
@@ -144,7 +144,7 @@ def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[
         if entry is not None:
             metrics[label] = entry.metrics
             flights[label] = read_tracks(folder / entry.flights)
-    # A scenario that all controllers failed in has no flights to draw.
+    # A scenario in which all controllers failed has no flights to draw.
     if not flights:
         return []
     plots = [paths_plot(scenario, flights, results.colours)]
@@ -155,7 +155,7 @@ def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[
 
 
 def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Table:
-    """Success or survival in each group of scenarios; of several, from the worst to the best."""
+    """Success or survival in each group of scenarios; for several, from the worst to the best."""
     others = []
     for _, scenarios in groups:
         for name, published in scenarios[0].published.items():
@@ -175,7 +175,7 @@ def _share_table(row: Row, results: Results, groups: Groups, corner: str) -> Tab
 
 
 def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
-    """The share of a controller in some scenarios; of several, the least and the greatest."""
+    """The share of a controller in some scenarios; for several, the least and the greatest."""
     measured = [measured_cells(results, label, scenario) for scenario in scenarios]
     cells = [cells[row] for cells in measured if cells is not None]
     if not cells:

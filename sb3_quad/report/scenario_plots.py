@@ -16,9 +16,9 @@ from sb3_quad.report.plots import HEIGHT, POINTS, WIDTH, Plot, band, legend, new
 
 FORCE = "#db1a24"
 TARGET = "#1a9a45"
-LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
-LINE_POINTS = 200  # of a flight, at most
-SHOWN_FLIGHTS = 4  # of a controller, where episodes differ
+LEAST_ERROR = 1e-3  # m; smaller ones are drawn at this value of the logarithmic axis
+LINE_POINTS = 200  # maximum number of points of a flight
+SHOWN_FLIGHTS = 4  # of a controller, if episodes differ
 
 
 @styled
@@ -27,11 +27,11 @@ def arrivals_plot(
 ) -> Plot:
     """Draw the mean times to each tolerance, cf. Figs. 4.6 and 4.7.
 
-    :param metrics: by the controllers' labels, as are ``colours``.
+    :param metrics: metrics by the controllers' labels, like ``colours``.
     """
     figure, axes = new_axes("tolerance (m)", "time (s)")
     for label, measured in metrics.items():
-        # There is no point where no flight arrives.
+        # There is no point if no flight arrives.
         means = [dict(arrival.time or {}) for arrival in measured.arrivals]
         times = pd.DataFrame(means, scenario.tolerances, ["value", "low", "high"], np.float64)
         band(axes, colours[label], label, times, **POINTS)
@@ -49,14 +49,14 @@ def arrivals_plot(
 def paths_plot(
     scenario: Scenario, flights: Mapping[str, Sequence[Track]], colours: Mapping[str, str]
 ) -> Plot:
-    """Draw recorded flights from above and from the side, with targets, or the paths of references
-    that move, and disturbances.
+    """Draw recorded flights from above and from the side, with targets, or the paths of moving
+    references, and disturbances.
 
-    :param flights: by the controllers' labels, as are ``colours``.
+    :param flights: flights by the controllers' labels, like ``colours``.
     """
     count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
     follows = scenario.reference is not None
-    # One above the other, so that they can be read on a telephone.
+    # Place the views one above the other, so that they can be read on a telephone.
     figure = Figure(figsize=(WIDTH, 2.2 * HEIGHT), layout="constrained")
     for axes, (i, j) in zip(figure.subplots(2, 1), ((0, 1), (0, 2)), strict=True):
         axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal")
@@ -86,7 +86,7 @@ def _draw_path(
         axes.plot(*track.targets[:, plane].T, "D", color=TARGET, markersize=4, label="target")
     if track.lost:
         axes.plot(*path[-1], "X", color=colour, markersize=9)
-    # An arrow where a force begins.
+    # Draw an arrow where a force begins.
     acts = track.wrench[:, :3].any(axis=1)
     begins = acts & ~np.roll(acts, 1)
     force = track.wrench[begins, :3]
@@ -106,7 +106,7 @@ def errors_plot(
     figure, axes = new_axes("time (s)", "distance from target (m)")
     for label, tracks in flights.items():
         lines = [pd.Series(track.error, track.times) for track in tracks]
-        # A flight that has ended early is lost, infinitely far away.
+        # A flight that ended early is lost, which counts as infinitely far away.
         errors = pd.concat(lines, axis="columns").fillna(np.inf)
         errors = errors[:: -(-len(errors) // LINE_POINTS)]
         ends = errors.quantile([0.5, 0.0, 1.0], axis="columns", interpolation="higher").T
@@ -118,7 +118,7 @@ def errors_plot(
             axes.axvspan(wrench.start, end, color=FORCE, alpha=0.16)
     axes.set_ylim(bottom=0.0)
     legend(figure)
-    # As many flights of each controller are recorded.
+    # The same number of flights is recorded for each controller.
     return Plot(
         f"{scenario.name}_error",
         f"Median of {len(tracks)} flights, in a band from the least to the greatest"
@@ -175,8 +175,8 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
 
 
 def _cells(results: Results, scenarios: Sequence[Scenario]) -> pd.DataFrame:
-    """A line for each controller in each cell that it did not fail in: its success, and its final
-    error where at least half of the flights survive.
+    """A row for each controller in each cell in which it did not fail: its success, and its final
+    error if at least half of the flights survive.
     """
     rows = []
     for label in results.colours:

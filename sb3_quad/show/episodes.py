@@ -22,15 +22,15 @@ from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 # The path of a target has the colour of its hoops.
 TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()
-WRENCH_SECONDS = 0.4  # a wrench is shown for that long, so that a short blow can be seen
+WRENCH_SECONDS = 0.4  # a wrench is shown for this long, so that a short hit can be seen
 
 
 class Recording(Hook):
     """A flight of T control steps, recorded as it is flown.
 
-    :ivar results: its metrics, the only ones; to be set once it has been flown.
+    :ivar results: the metrics of this one flight; to be set once it has been flown.
 
-    :param colour: of its trail and its heading, #rrggbb.
+    :param colour: colour of its trail and its heading, #rrggbb.
     """
 
     results: Flights
@@ -65,7 +65,7 @@ class Recording(Hook):
 
     @cached_property
     def wrench(self) -> FloatArray:
-        """What acted in the step before each state, (T + 1, 12): force in the world and in the body
+        """The wrench in the step before each state, (T + 1, 12): force in the world and in the body
         frame, N; torques likewise, N m.
         """
         return np.stack(self._wrenches)
@@ -100,8 +100,8 @@ class Recording(Hook):
         return bool(self.state.target_velocity.any())
 
     def trails(self, step: int) -> list[Trail]:
-        """The path flown until ``step``, and the whole path of a target that moves."""
-        # Every second step makes it smooth enough.
+        """The path flown until ``step``, and the whole path of a moving target."""
+        # Every second step is smooth enough.
         trails = [Trail(self.state.position[: step + 1 : 2], self.colour)]
         if self.follows:
             trails.insert(0, Trail(self.state.target[::2], TARGET))
@@ -116,7 +116,7 @@ class Recording(Hook):
     @property
     def disturbances(self) -> list[int]:
         """The steps after which a wrench has begun to act."""
-        # A wrench begins to act where it acts in a step and not in the one before.
+        # A wrench begins to act in a step if it did not act in the one before.
         acts = self.wrench.any(axis=1).astype(int)
         return (np.flatnonzero(np.diff(acts) > 0) + 1).tolist()
 
@@ -140,13 +140,13 @@ class Recording(Hook):
         return np.asarray(recent[np.linalg.norm(recent, axis=1).argmax()])
 
     def pose(self, step: int, seconds: float = WRENCH_SECONDS) -> Pose:
-        """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
+        """The vehicle to draw, with the wrench of the last ``seconds``."""
         return Pose(
             self.state.array[:, step], self.wrench_around(step, seconds), self.rotor_angles[step]
         )
 
 
-# What all controllers fly of one seed
+# The flights of all controllers with one seed
 Episode: TypeAlias = Sequence[Recording]
 
 
@@ -159,8 +159,8 @@ def landmarks(recordings: Episode) -> FloatArray:
 
 
 def outlook(recordings: Episode) -> FloatArray:
-    """Return the direction in which cameras look at flights, (3,), from higher up at paths that
-    targets move along.
+    """Return the direction in which cameras look at flights, (3,), from higher up if targets move
+    along paths.
     """
     return broadside(landmarks(recordings), ON_PATH if recordings[0].follows else DOWN)
 
@@ -168,17 +168,17 @@ def outlook(recordings: Episode) -> FloatArray:
 class Setting(NamedTuple):
     """The episodes that all controllers fly."""
 
-    vehicle: Any  # that experts are made for; in a scenario another one may fly
+    vehicle: Any  # the vehicle that experts are made for; in a scenario another one may fly
     settings: FlightSettings  # of all episodes
     plan: Callable[[int], Plan]  # the events of an episode, by its seed
-    # Changes to the settings that go with a controller, by its label.
+    # Changes to the settings for a controller, by its label
     own: StrMapping = {}
 
 
 def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = None) -> Setting:
     """Episodes of some settings.
 
-    :param target: of all of them, r_T, (3,), m; None: each episode's own.
+    :param target: r_T of all of them, (3,), m; None: each episode has its own.
     :raises ConfigError: an unknown vehicle, a target below ground.
     """
     start = {}
@@ -196,7 +196,7 @@ def scenario_setting(text: str, own: Any = None, vehicle: str | None = None) -> 
     """Episodes of a scenario, named by ``suite:name``.
 
     :param own: the vehicle of an agent, for a scenario that names none.
-    :param vehicle: one that flies instead of both.
+    :param vehicle: a vehicle that flies instead of both.
     :raises ConfigError: an unknown suite or name.
     """
     suite, colon, name = text.rpartition(":")
@@ -216,18 +216,19 @@ def fly_all(
     deterministic: bool = True,
     n_envs: int = 1,
 ) -> Iterator[Episode]:
-    """Fly episodes one after the other, each by all controllers.
+    """Fly episodes one after the other, each with all controllers.
 
-    :param controllers: by label; each as of :func:`~sb3_quad.evaluation.flights.fly`.
-    :param seed: of the first episode; the next has the next one.
-    :param n_timesteps: control steps, until which new episodes begin, as long as the longest of
-        each lasts; None: one episode.
+    :param controllers: controllers by label, each as for :func:`~sb3_quad.evaluation.flights.fly`.
+    :param seed: seed of the first episode; the next episode has the next seed.
+    :param n_timesteps: control steps after which no new episode begins; each episode counts with
+        its longest flight. None: one episode.
     :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
-    :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
+    :param n_envs: number of episodes, with consecutive seeds, that each controller flies side by
+        side.
     :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
-    # Without n_timesteps one whole episode is flown.
+    # Without n_timesteps, fly one whole episode.
     longest = setting.settings.longest_episode
     left = n_timesteps or longest
     while left > 0:

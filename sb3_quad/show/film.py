@@ -26,12 +26,12 @@ from sb3_quad.show.labels import mark_lost, side_by_side, with_header
 from sb3_quad.simulation.state import POSITION, TARGET
 
 FPS = 25
-HOLD = 0.4  # the last picture stays for that long, s
-AHEAD = 3.0  # of the way to its target that a camera shows, m, of the default vehicle
+HOLD = 0.4  # the last picture stays for this long, s
+AHEAD = 3.0  # how much of the way to its target a camera shows, m, for the default vehicle
 PANELS_ABREAST = 3
-LAG = 0.044  # s of flight after which a camera has followed to 1/e of a jump, as of a new target
+LAG = 0.044  # time after which a camera has followed a jump, as to a new target, up to 1/e, s
 LOOP = {"duration": 1000 / FPS, "loop": 0}
-# How imageio writes each.
+# How imageio writes each format
 FORMATS: dict[str, StrDict] = {
     ".mp4": {
         "fps": FPS,
@@ -67,7 +67,7 @@ def write_film(path: Path, frames: Iterable[Image]) -> None:
     """
     imageio = check_film(path)
     suffix = path.suffix.lower()
-    # In another folder: after an interruption, the encoder may still write for a moment.
+    # Write in another folder: after an interruption, the encoder may still write for a moment.
     with tempfile.TemporaryDirectory(prefix="sb3_quad_", ignore_cleanup_errors=True) as folder:
         draft = Path(folder, f"film{suffix}")
         try:
@@ -92,9 +92,9 @@ def film_frames(
 ) -> Iterator[Image]:
     """The frames of a film, FPS of them a second, uint8 (height, width, 3), all of one size.
 
-    :param recordings: one for each panel; they start together and are seen from one direction.
-    :param width: of a panel, pixels; ``height`` likewise, its header not counted.
-    :param speed: of time in the film; 0.5 is slow motion.
+    :param recordings: one for each panel; they start together and are seen from the same direction.
+    :param width: width of a panel, pixels; ``height`` likewise, not counting its header.
+    :param speed: speed of time in the film; 0.5 is slow motion.
     """
     times = frame_times(recordings, speed)
     # One direction for all panels, so that their flights can be compared.
@@ -116,7 +116,7 @@ def following_cameras(
     """Yield a camera for each time (s) that has all vehicles in its picture, and their targets when
     these are near.
 
-    :param scale: the vehicles' size, in that of the default one.
+    :param scale: the vehicles' size, relative to the default one.
     :param forward: the direction in which the cameras look, a unit vector, (3,), not vertical.
     """
     reach = AHEAD * scale
@@ -133,7 +133,8 @@ def following_cameras(
     for shown in np.stack(points, axis=1):
         camera = framing_camera(shown, MARGIN * scale, forward, lens)
         if eye is not None:
-            # The camera follows with a lag, so that a jump of the target is no jump of the picture.
+            # The camera follows with a lag, so that a jump of the target does not make the picture
+            # jump.
             camera = camera._replace(eye=eye + share * (camera.eye - eye))
         eye = camera.eye
         yield camera
@@ -161,7 +162,7 @@ def _caption(recording: Recording, step: int) -> str:
     distance = recording.state.distance[step]
     height = recording.state.position[step, 2]
     caption = f"{seconds}   {distance:.2f} m from target   {height:.1f} m high"
-    # Only disturbed flights have a force to tell.
+    # Only disturbed flights have a force to show.
     force = np.linalg.norm(recording.wrench_around(step)[:6])
     if force:
         caption += f"   force {force:.1f} N"
@@ -169,13 +170,14 @@ def _caption(recording: Recording, step: int) -> str:
 
 
 def show_in_window(episodes: Sequence[Episode], width: int, height: int, speed: float) -> None:
-    """Show episodes one after the other, until the window is shut; flights of one start together.
+    """Show episodes one after the other, until the window is shut; flights of an episode start
+    together.
 
     :raises ConfigError: the window cannot be opened.
     """
     client = open_window(width, height)
     try:
-        # All bodies are added before the window draws: it shows each one as it comes.
+        # Add all bodies before the window draws, since it would show each one as it is added.
         n = len(episodes[0])
         scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
         start_drawing(client)

@@ -30,7 +30,7 @@ def with_header(
 ) -> Pillow.Image:
     """Put a white band above a picture of a flight: a bar in its colour, its name, and lines below.
 
-    :param size: of the font, pixels.
+    :param size: font size, pixels.
     """
     # The band is as high as its lines, with a margin above and below them.
     band = round((0.7 + STEP * (1 + len(lines))) * size)
@@ -55,11 +55,11 @@ def mark_lost(picture: Pillow.Image, text: str, size: int) -> Pillow.Image:
 
 def side_by_side(pictures: Sequence[Pillow.Image], columns: int) -> Image:
     """Pictures of one size in rows of ``columns``, on white; even in width and height, as video
-    codecs ask for.
+    codecs require.
     """
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
-    # Each picture stands in the top left corner of its field; the gap is on its other sides.
+    # Each picture is in the top left corner of its field; the gap is on its other sides.
     width = pictures[0].width + GAP
     height = pictures[0].height + GAP
     sheet = Pillow.new("RGB", (columns * width // 2 * 2, rows * height // 2 * 2), "white")

@@ -16,12 +16,12 @@ from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.show.episodes import Episode, Recording, landmarks, outlook
 from sb3_quad.show.labels import INK, PLATE, font, side_by_side, with_header
 
-SETTLED = 0.25  # m: for a sequence, a flight is over once it stays within that of its target
-VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
-LARGEST = 6.0  # how much larger than life it is drawn at most
+SETTLED = 0.25  # m: in a sequence, a flight is over once it stays this close to its target
+VEHICLE_SHARE = 0.15  # least breadth of a drawn vehicle, as a share of the picture's height
+LARGEST = 6.0  # the most that it is enlarged
 APART = 0.95  # between poses in the picture, in the vehicle's drawn breadth
-AROUND = np.array([[0, 1, -1, 0], [-1, 0, 0, 1]]).T  # where its time may stand; above it is best
-COVERED = 0.4  # of a pose's drawn breadth: half the breadth that no text is to cover
+AROUND = np.array([[0, 1, -1, 0], [-1, 0, 0, 1]]).T  # where its time may be; above it is best
+COVERED = 0.4  # half the breadth that text should not cover, in a pose's drawn breadth
 
 
 class View(NamedTuple):
@@ -44,7 +44,7 @@ def sequence(recordings: Episode, width: int, height: int) -> Image:
     """Draw one panel for each recording, all seen by the same camera, with as many poses as do not
     hide one another.
 
-    :param width: of a panel, its header not counted, pixels; ``height`` likewise.
+    :param width: width of a panel, not counting its header, pixels; ``height`` likewise.
     :return: uint8 (height, about panels * width, 3).
     """
     # One view for all panels, so that their poses can be compared.
@@ -54,7 +54,7 @@ def sequence(recordings: Episode, width: int, height: int) -> Image:
 
 
 def until_settled(recording: Recording) -> Recording:
-    """Return a flight without what follows once the vehicle stays at its target."""
+    """Return a flight without the part after the vehicle stays at its target."""
     if recording.lost or recording.follows:
         return recording
     last = int(np.flatnonzero(recording.state.distance > SETTLED).max(initial=-1)) + 1
@@ -77,13 +77,13 @@ def view_of(recordings: Episode, lens: Lens) -> View:
 
 
 def pose_steps(recording: Recording, view: View) -> list[int]:
-    """The steps of the poses: each that hides none before it, the disturbances, and the crash."""
+    """The steps of the poses: those that hide none before them, the disturbances, and the crash."""
     places, breadth = view.project(recording.state.position)
     # The start, the disturbances and the crash are shown in any case.
     shown = [0, *recording.disturbances]
     if recording.lost:
         shown.append(len(places) - 1)
-    # Of the others, those are shown that are clear of all poses before them.
+    # Show those of the others that are clear of all poses before them.
     for step, place in enumerate(places):
         apart = np.linalg.norm(places[shown] - place, axis=1).min()
         if apart > APART * breadth[step]:
@@ -93,7 +93,7 @@ def pose_steps(recording: Recording, view: View) -> list[int]:
 
 def _panel(recording: Recording, view: View) -> Pillow.Image:
     steps = pose_steps(recording, view)
-    # Of a target that moves, hoops mark the place at the end.
+    # For a moving target, hoops mark the place at the end.
     targets = recording.state.target[-1:] if recording.follows else recording.targets
     with closing(Scene(recording.vehicle, None, len(steps), len(targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], targets)
@@ -104,7 +104,7 @@ def _panel(recording: Recording, view: View) -> Pillow.Image:
     lines = [recording.end]
     if not recording.lost and not recording.follows and recording.state.distance[-1] <= SETTLED:
         lines = [f"within {SETTLED:g} m of its target from {recording.times[-1]:.2f} s on"]
-    # Then whatever a reader could misunderstand: an enlarged vehicle, hoops and arrows.
+    # Explain what a reader could misunderstand: an enlarged vehicle, hoops and arrows.
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
     signs = "green line: path of the target" if recording.follows else "green hoops: target"
@@ -117,9 +117,9 @@ def draw_times(
     draw: ImageDraw.ImageDraw, recording: Recording, steps: list[int], view: View, size: int
 ) -> None:
     """Write the time of each pose on a small plate beside it, inside the picture, where it covers
-    least; a plate that has no room clear of the others is left out.
+    least; a plate without room clear of the others is left out.
 
-    :param size: of the font, pixels.
+    :param size: font size, pixels.
     """
     places, breadths = view.project(recording.state.position)
     # What should not be covered: the points of the path, the poses, and then the plates. Each is a

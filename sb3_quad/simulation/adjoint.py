@@ -70,8 +70,8 @@ def _add(gradient, row, lane, a):
 def undo_move(before, after, gradient, dt):
     """Undo :func:`.physics.move`, in place.
 
-    :param before: the state before the physics step, (MOVING, LANES), of which the attitude counts.
-    :param after: the state after it, of which the body rates count.
+    :param before: the state before the physics step, (MOVING, LANES); only its attitude is read.
+    :param after: the state after it; only its body rates are read.
     """
     half_step = 0.5 * dt
     k = X.quaternion
@@ -119,26 +119,27 @@ def undo_accelerate(b, before, after, gradient, grad_wanted):
 
     :param b: a block whose vehicle, wrench, wind and wanted speeds are loaded.
     :param before: the state before the physics step, (MOVING, LANES), and ``after`` that after it.
-    :param grad_wanted: (4, LANES), the gradient with respect to the wanted rotor speeds is added.
+    :param grad_wanted: (4, LANES), to which the gradient with respect to the wanted rotor speeds is
+        added.
     """
     for lane in range(LANES):
         r = rotation(before[X.quaternion :], lane)
 
-        # With respect to the torque in the body frame, and through the gyroscopic terms to the body
-        # rates
+        # Gradient with respect to the torque in the body frame, and through the gyroscopic terms to
+        # the body rates
         torque = product(vector(b.rates_gain, lane), vector(gradient[X.body_rates :], lane))
         wx, wy, wz = vector(before[X.body_rates :], lane)
         gx, gy, gz = product(vector(b.gyro, lane), torque)
         gyroscopic = gy * wz + gz * wy, gx * wz + gz * wx, gx * wy + gy * wx
         _add(gradient, X.body_rates, lane, scaled(-1.0, gyroscopic))
 
-        # With respect to the force, in the world frame and in the body frame
+        # Gradient with respect to the force, in the world frame and in the body frame
         push = vector(gradient[X.velocity :], lane)
         push = scaled(b.velocity_gain[lane], push)
         in_body = to_body(r, push)
 
-        # With respect to the rotors: each thrust acts along the body's z axis and about all
-        # three axes.
+        # Gradient with respect to the rotors: each thrust acts along the body's z axis and about
+        # all three axes.
         for k in range(4):
             old, new = before[X.rotor_speeds + k, lane], after[X.rotor_speeds + k, lane]
             lift, exact = b.thrust_coefficient[lane], b.exact_motors[lane]
@@ -153,14 +154,14 @@ def undo_accelerate(b, before, after, gradient, grad_wanted):
                 1.0 - factor
             ) * grad_new + grad_thrust * exact * new
 
-        # The force in the body frame, as it was: drag of the airspeed, and the thrusts.
+        # Recompute the force in the body frame: drag from the airspeed, and the thrusts.
         airspeed = difference(vector(before[X.velocity :], lane), vector(b.wind, lane))
         drag = vector(b.drag, lane)
         fx, fy, fz = difference(vector(b.force_body, lane), product(drag, to_body(r, airspeed)))
         force = fx, fy, fz + total_thrust(b, lane)
 
-        # With respect to the velocity, through the drag, and to the attitude: forces, drag and
-        # torques turn.
+        # Gradient with respect to the velocity, through the drag, and to the attitude: forces, drag
+        # and torques turn.
         braked = product(scaled(-1.0, drag), in_body)
         _add(gradient, X.velocity, lane, to_world(r, braked))
         x, y, z = transposed((push, airspeed, vector(b.torque_world, lane)))
@@ -204,7 +205,7 @@ def undo_limits(b, grad_speed):
         is_shared = b.shared_saturation[lane] > 0.0
         taken = 0.0
         for k in range(4):
-            # What is taken off all may stop a rotor.
+            # The reduction that all rotors share may stop a rotor.
             stops = b.wanted_speeds[k, lane] == 0.0
             if stops or (speeds[k] > greatest and not is_shared):
                 grad_speed[k, lane] = 0.0
@@ -234,7 +235,7 @@ def undo_noise(b, grad_feature):
 
 @fast
 def undo_relation(b, grad_feature):
-    """Undo what :func:`.observation.features` does for a reference that moves, in place."""
+    """Undo what :func:`.observation.features` does for a moving reference, in place."""
     f = grad_feature
     for lane in range(LANES):
         cosine, sine = heading_of(b, lane)

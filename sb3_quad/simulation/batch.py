@@ -78,17 +78,17 @@ _KEPT = (
 
 
 class QuadcopterBatch:
-    """n quadcopters, each in an episode of its own; arrays in, arrays out.
+    """n quadcopters, each in its own episode; arrays in, arrays out.
 
     :param n_envs: number of rows, from 1 to 2^20.
     :param settings: how they fly.
-    :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each row a stream; None: the
-        operating system's entropy.
+    :param seed: for :func:`~sb3_quad.base.seeds.row_seeds`, which gives each row a stream; None:
+        the operating system's entropy.
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use.
         Results do not depend on it.
     :param autoreset: whether a row that ends begins its next episode within the same step.
-    :raises ConfigError: an argument that does not fit; a vehicle that cannot fly as the settings
-        say.
+    :raises ConfigError: an argument that does not fit; a vehicle that cannot fly with these
+        settings.
     """
 
     _arguments: dict[str, Any]
@@ -116,7 +116,7 @@ class QuadcopterBatch:
         self.physics_step = vehicles[0].physics_step
         self.substeps = vehicles[0].substeps
         self.randomize_numbers = self.randomize.numbers(control_step)
-        # An array without columns stands for gusts, frames or an integral that are switched off.
+        # An array without columns means that gusts, frames or the integral are switched off.
         self.gust = np.zeros((GUST_SIZE, n * bool(self.randomize.gusts)))
         self.wind = np.zeros((3, n))
         self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
@@ -138,12 +138,12 @@ class QuadcopterBatch:
         self.integral_numbers = np.array((integral or PositionIntegral()).numbers(control_step))
         self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
 
-        # An array without columns stands for targets that rest.
+        # An array without columns means that targets rest.
         tracks = (
             NO_TRACKS if settings.reference is None else settings.reference.tracks(control_step)
         )
         self.previews = np.array(self.observation.preview or (), dtype=np.int64)
-        # A preview reads all that the rows of the target say of its motion.
+        # A preview reads all rows of the state that describe the target's motion.
         self.moves = settings.reference is not None or self.previews.size > 0
         self.tracks = tracks.table
         self.track_numbers = tracks.numbers()
@@ -154,7 +154,7 @@ class QuadcopterBatch:
         self.task_index = np.zeros(n, dtype=np.int64)
         steps = np.array(settings.max_episode_steps, dtype=np.int64, ndmin=1)
         self.max_steps = steps[repeated("max_episode_steps", steps.size, n)]
-        # The episodes under way may be shorter, see stagger.
+        # The current episodes may be shorter, see stagger.
         self.limits = self.max_steps.copy()
 
         self._state = np.zeros((STATE_SIZE, n))
@@ -173,7 +173,7 @@ class QuadcopterBatch:
     def _set_vehicles(self, settings: FlightSettings) -> list[Vehicle]:
         """Load the vehicles, check that all can be flown, and return the different ones.
 
-        ``base_vehicles`` and ``vehicles`` have a column for each row where rows differ, else one
+        ``base_vehicles`` and ``vehicles`` have a column for each row if rows differ, otherwise one
         for all.
         """
         self.distribution = settings.vehicles
@@ -210,7 +210,7 @@ class QuadcopterBatch:
             )
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
-        """Give rows new random streams, from one seed each. Their next reset begins the first
+        """Give rows new random streams, from one seed each. Their next reset begins their first
         episode.
         """
         self.streams[:, self.rows(rows)] = new_streams(seeds)
@@ -256,8 +256,8 @@ class QuadcopterBatch:
         return self._run(FLY, actions, physics_step=step, substeps=substeps, autoreset=False)
 
     def score(self, actions: AnyArray) -> StepResult:
-        """Score a control step that another simulator has flown and written into ``state``; else
-        like :meth:`step`.
+        """Score a control step that another simulator has flown and written into ``state``;
+        otherwise like :meth:`step`.
 
         :param actions: those that the policy sees in its next observation.
         """
@@ -333,7 +333,7 @@ class QuadcopterBatch:
             return np.atleast_1d(everything[selected])
         except (IndexError, TypeError):
             raise ConfigError(
-                f"indices {rows!r}: must be row numbers of 0 to {self.n - 1}"
+                f"indices {rows!r}: must be row numbers from 0 to {self.n - 1}"
             ) from None
 
     def true_state(self) -> QuadcopterState:
@@ -362,7 +362,7 @@ class QuadcopterBatch:
         return self.has_drag or self.randomize.drag is not None
 
     def warn_without_drag(self, what: str) -> None:
-        """Warn of wind that does nothing, and say what has set it."""
+        """Warn that the wind has no effect, and say what set it."""
         if not self.may_have_drag:
             warnings.warn(
                 f"{what}: wind acts through drag, and {self.vehicle_list[0].name} has none;"
@@ -392,7 +392,7 @@ class QuadcopterBatch:
     def state(self) -> FloatArray:
         """The state of all rows, (STATE_SIZE, n); see :data:`.state.STATE`.
 
-        A step changes it in place, but for what references have besides their position: that is
+        A step changes it in place, except for the motion and heading of references, which are those
         of when the state was asked for.
         """
         if self._is_behind:
@@ -407,11 +407,11 @@ class QuadcopterBatch:
     def restore(self, snapshot: Arrays) -> None:
         """Undo everything that has happened since :meth:`snapshot`.
 
-        :param snapshot: of environments with arrays of these types and shapes.
+        :param snapshot: from environments with arrays of these types and shapes.
         :raises ConfigError: its episodes are of tasks that these environments do not have.
         """
         if not np.isin(snapshot["task_index"], np.arange(self.task_weights.size)).all():
-            raise ConfigError("task_index numbers tasks that the environments do not have")
+            raise ConfigError("task_index refers to tasks that the environments do not have")
         for name in _KEPT:
             getattr(self, name)[...] = snapshot[name]
         self._bind()
@@ -436,7 +436,7 @@ class QuadcopterBatch:
         self._notice_motion()
 
     def _notice_motion(self) -> None:
-        """Let steps read how targets move and turn, once one does."""
+        """Let steps read how targets move and turn, once one of them does."""
         if not self.moves and self.state[X.target_velocity :].any():
             self.moves = True
             self._bind()
@@ -464,14 +464,14 @@ class QuadcopterBatch:
         stds = per_row("observation_std", std, self.n, OBSERVATION_SIZE)
         # Beyond these, features would vanish or overflow.
         if not ((stds >= 1e-6) & (stds <= 1e6)).all():
-            raise ConfigError("observation_std: every value must be of 1e-6 to 1e6")
+            raise ConfigError("observation_std: every value must be from 1e-6 to 1e6")
         if not (np.abs(means) <= 1e6).all():
-            raise ConfigError("observation_mean: every value must be of -1e6 to 1e6")
+            raise ConfigError("observation_mean: every value must be from -1e6 to 1e6")
         self.scaling_of_rows = np.vstack([means, stds, np.zeros((2, self.n))])
 
     def _bind(self) -> None:
         self.scaling = self.scaling_of_rows
-        # One column serves all rows where they do not differ.
+        # One column serves all rows if they do not differ.
         if (self.scaling == self.scaling[:, :1]).all():
             self.scaling = self.scaling[:, :1].copy()
         self.mean = self.scaling[:OBSERVATION_SIZE]

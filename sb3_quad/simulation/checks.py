@@ -30,21 +30,21 @@ def per_row(name: str, value: Any, rows: int, *size: int) -> FloatArray:
         raise ConfigError(
             f"{name} of shape {array.shape}: must be {size}, or {shape} for {rows} rows"
         )
-    # Not -1: without rows there would be no telling how many columns there are.
+    # Not -1: with zero rows it would be undetermined how many columns there are.
     columns = math.prod(size)
     return np.ascontiguousarray(np.broadcast_to(array, shape).T).reshape(columns, rows)
 
 
 def whole_number(name: str, value: Any, least: int, most: int) -> int:
-    """Return ``value``, a whole number of ``least`` to ``most``."""
+    """Return ``value``, a whole number from ``least`` to ``most``."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or not least <= value <= most:
-        raise ConfigError(f"{name} {value!r}: must be a whole number of {least} to {most}")
+        raise ConfigError(f"{name} {value!r}: must be a whole number from {least} to {most}")
     return int(value)
 
 
 def repeated(name: str, values: int, n: int) -> IntArray:
-    """Return which of some values each of n rows has: row i the i-th, and fewer values than rows
+    """Return which of some values each of n rows has: row i has the i-th; fewer values than rows
     repeat.
     """
     if not 0 < values <= n:

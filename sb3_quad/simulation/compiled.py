@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 
 from sb3_quad.base.process import print_once
 
-# Rows of a block: a multiple of every vector width, and few enough for a block to stay in the first
+# Rows of a block: a multiple of every vector width, and few enough for a block to stay in the L1
 # cache
 LANES = 64
 _COMPILED_IN = ("simulation", "vehicles", "experts", "algorithms/networks")
@@ -38,7 +38,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     try:
         dispatcher.enable_caching()
     except RuntimeError:
-        # Neither the package's folder nor the user's folder for caches can be written.
+        # Neither the package's folder nor the user's cache folder is writable.
         print_once(
             "compiled code cannot be cached and is compiled at every start, in 15 s or more;"
             " set NUMBA_CACHE_DIR to a folder"
@@ -51,7 +51,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 
 class _CacheFile(IndexDataCacheFile):
-    """Takes files that a crash or a full disk left broken for missing ones."""
+    """Treats files that a crash or a full disk left broken as missing."""
 
     def _load_index(self) -> Any:
         with suppress(Exception):
@@ -83,7 +83,7 @@ inlined = compiled(inline="always")
 
 class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
-        print_once("compiling the simulation, once, in 15 s or more; it is kept for later runs")
+        print_once("compiling the simulation once, in 15 s or more; it is kept for later runs")
 
     def on_end(self, event: event.Event) -> None:
         pass
@@ -107,7 +107,7 @@ def atomic_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.int64(array, types.int64, types.int64), codegen
 
 
-# The operating system's function that ends a thread's turn.
+# The operating system's function by which a thread yields its core.
 _YIELD = "SwitchToThread" if sys.platform == "win32" else "sched_yield"
 give_way = types.ExternalFunction(_YIELD, types.int32())
 """Yield the core. It is resolved by its symbol name, so cached code works in any process."""

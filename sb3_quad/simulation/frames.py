@@ -1,9 +1,9 @@
 """The parts of an observation besides the present features: the last action, earlier frames, and
 the integral of the position error.
 
-A frame is the scaled features of a control step, with ``last_action`` followed by the action that
-led there. An observation is the frames of several ages, one after the other. The compiled functions
-keep the frames of a row and build observations from them.
+A frame consists of the scaled features of a control step, followed, with ``last_action``, by the
+action that led there. An observation is the frames of several ages, one after the other. The
+compiled functions keep the frames of a row and build observations from them.
 """
 
 from typing import Annotated, Literal
@@ -65,7 +65,7 @@ class ObservationSettings(Frozen):
     @field_validator("history")
     @classmethod
     def _check_history(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        # Sorted with the present frame, they are as they were only if they rise from it.
+        # Sorting them together with the present frame changes nothing only if they rise from it.
         if value is not None and list(value) != sorted({0, *value}):
             raise ValueError(f"{list(value)}: must rise from 0, the present frame")
         return value
@@ -141,7 +141,7 @@ def observe_frames(b, i, step, lane, integral, ages, frames, out):
 
     :param b: a block whose scaled features are computed; row i is in ``lane``.
     :param step: control steps since the episode began.
-    :param integral: float64 (3, n), or (0, n) without.
+    :param integral: float64 (3, n), or (0, n) if there is none.
     :param ages: int64, ages of the observed frames, control steps.
     :param frames: float32 (n, depth, frame_size), the frames of the latest control steps, step s in
         slot s % depth.

@@ -1,11 +1,11 @@
-"""One control step of a batch, block by block: a block goes through all of it while it is in the
-first cache.
+"""One control step of a batch, block by block: a block goes through the whole step while it is in
+the L1 cache.
 
-A block is ``LANES`` neighbouring rows with everything a control step needs of them in one piece of
-memory. Its arrays have constant shapes and places: LLVM then knows each distance between two rows,
-needs no test for overlap, and vectorises the loops over lanes. Lanes behind the last row repeat it,
-so that every loop runs over all lanes: a row's numbers then never depend on how many others fly, or
-on where in the batch it stands.
+A block holds ``LANES`` neighbouring rows, with everything a control step needs of them, in one
+piece of memory. Its arrays have constant shapes and places: LLVM then knows the distance between
+any two rows, needs no test for overlap, and vectorises the loops over lanes. Lanes past the last
+row repeat it, so that every loop runs over all lanes: a row's numbers then depend neither on how
+many others fly nor on its place in the batch.
 """
 
 import inspect
@@ -81,7 +81,7 @@ OUTCOME = np.dtype(
 )
 """How the last episode of a row ended."""
 
-# The shape of each quantity of a lane, by its kind of number; an int is a number of rows.
+# The shape of each quantity of a lane, by its dtype; an int is a number of rows.
 _CONTENTS: dict[str, dict[str, Any]] = {
     "i8": {"row": ()},  # of the batch
     "f8": {
@@ -100,10 +100,10 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         "rates_gain": 3,  # dt / I
         "fall": (),  # g dt
         "gyro": 3,  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
-        # of the squared rotor speeds that commands can be
+        # the range of squared rotor speeds that can be commanded
         "square_middle": (),
         "square_half_range": (),
-        "greatest_speed": (),  # of a rotor, with the battery as it is, rad/s
+        "greatest_speed": (),  # of a rotor, with the present battery, rad/s
         "speed2": (),  # the larger of |v|² and |ω|²
         # limits and costs of the row's task
         **dict.fromkeys(SCORED, ()),
@@ -120,7 +120,7 @@ _CONTENTS: dict[str, dict[str, Any]] = {
     },
     "u4": {"word": WORDS, "stream": 4},
 }
-# Rows of several quantities that follow each other: the first quantity, and the shape of them all
+# Several consecutive quantities under one name: the first of them, and the shape of all
 _TOGETHER: dict[str, tuple[str, Any]] = {
     "state": ("position", STATE_SIZE),
     # the state with a target that rests
@@ -175,42 +175,42 @@ def step(
     and each block a tenth longer. The parts of a step are functions that numba inlines
     (``inline="always"``): where LLVM inlined them, a step took 5 to 8 % longer.
 
-    :param leads: whether this is the thread that returns to the batch.
     Where a shape says 1 or n, one column may serve all rows.
 
+    :param leads: whether this is the thread that returns to the batch.
     :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and
         ``dones`` bool (n,) are written.
     :param state: (STATE_SIZE, n), see :data:`.state.STATE`.
     :param queue: (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s.
     :param wrench: (WRENCH_SIZE, n), see :data:`.state.WRENCH`.
-    :param vehicles: (parameters, 1 or n), that fly; ``base_vehicles`` before anything is random.
+    :param vehicles: (parameters, 1 or n), as they fly; ``base_vehicles``: before randomization.
     :param distribution_numbers: :meth:`.VehicleDistribution.numbers`.
     :param randomize_numbers: :meth:`.Randomization.numbers`.
-    :param gust: (GUST_SIZE, 0 or n), of force; ``wind_gust`` (GUST_SIZE, 0 or n) of the wind.
+    :param gust: (GUST_SIZE, 0 or n), gusts of force; ``wind_gust``, likewise, gusts of wind.
     :param wind: (3, n), velocity of the air without gusts, world frame, m/s.
-    :param frames: float32 (n, depth, frame size); depth 0 where an observation is the present
-        features.
+    :param frames: float32 (n, depth, frame size); depth 0 if an observation is the present features
+        only.
     :param ages: int64 (ages,), of the frames in an observation, control steps.
-    :param integral: (0 or 3, n), of the position; ``integral_numbers`` (4,), see
+    :param integral: (0 or 3, n), integral of the position error; ``integral_numbers`` (4,), see
         :class:`.PositionIntegral`.
     :param streams: uint32 (4, n), see :mod:`.random`.
     :param scaling: (2 OBSERVATION_SIZE + 2, 1 or n): μ and σ of Eq. 3.16, relative and additive
         noise level.
-    :param task_index: int64 (n,), of the episodes under way.
+    :param task_index: int64 (n,), tasks of the current episodes.
     :param task_parameters: (tasks, columns), see :data:`.tasks.TASK`; ``task_weights`` (tasks,),
         cumulative.
     :param returns: (n,), of the episodes so far.
-    :param limits: int64 (n,), control steps of the episodes under way; ``max_steps`` (n,), of those
-        that follow.
+    :param limits: int64 (n,), control steps of the current episodes; ``max_steps`` (n,), of later
+        ones.
     :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
-    :param moves: whether references move or have a heading; else the rows of the state behind the
-        target's position are not read.
+    :param moves: whether references move or have a heading; otherwise the rows of the state after
+        the target's position are not read.
     :param for_px4: whether observations are those of ``features: px4``.
-    :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, as for ``tracks`` and
+    :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, also for ``tracks`` and
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
     :param autoreset: whether a row that ends begins its next episode within the same step.
-    :return: False if an action is not finite, and then nothing has happened.
+    :return: False if an action is not finite; then nothing has changed.
     """
     n = state.shape[1]
     chunks = (n + CHUNK - 1) // CHUNK
@@ -239,7 +239,8 @@ def step(
                 n_due += 1
             continue
         for first in range(chunk, min(chunk + CHUNK, n), LANES):
-            # Numba frees an array after its last use, whatever points into it: hence here.
+            # Take the view again here: numba frees `blocks` after its last use, even while `b`
+            # points into it.
             b = blocks[0]
             count = min(LANES, n - first)
             for lane in range(LANES):
@@ -273,7 +274,7 @@ def step(
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)
             if wind_gust.shape[1] > 0:
-                # The gusts of the wind have words of their own.
+                # Gusts of wind have their own random words.
                 gust_words(b.word[GUST_WORDS:], b.stream)
                 advance_gusts(b, wind_gust, first, count)
             if frames.shape[1] > 0:
@@ -318,7 +319,7 @@ def step(
                 )  # fmt: skip
                 if frames.shape[1] > 0:
                     clear_frames(i, frames, integral)
-        # Lanes behind the last row keep a row of the last block, which nobody reads.
+        # Lanes past the last row keep a row of the previous block, which is never read.
         for lane in range(count):
             for k in range(STATE_SIZE):
                 b.state[k, lane] = state[k, b.row[lane]]
@@ -375,8 +376,8 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step):
 
 @compiled
 def new_block():
-    """Return room for a block, (1,), which begins with a cache line: vectors that straddle two take
-    a third longer.
+    """Return memory for a block, (1,), that begins at a cache line: vectors that straddle two lines
+    take a third longer.
     """
     room = np.empty(_SIZE + 64, np.uint8)
     start = -room.ctypes.data % 64
@@ -385,7 +386,7 @@ def new_block():
 
 @compiled
 def _is_finite(actions):
-    # By their bits: code compiled with fastmath may assume that no NaN exists.
+    # Look at the bits: code compiled with fastmath may assume that no NaN exists.
     wrong = 0
     for bits in actions.view(np.int32).reshape(-1):
         wrong += (bits & 0x7F800000) == 0x7F800000
@@ -417,8 +418,8 @@ def save_rows(source, first, count, target):
 def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
     """Load what does not change during an episode: scaling, vehicles, limits and costs.
 
-    :param shared: whether to load what is the same for all rows, once for all blocks of a call, or
-        what differs by row.
+    :param shared: True: load what is the same for all rows, once for all blocks of a call. False:
+        load what differs by row.
     """
     if (scaling.shape[1] == 1) == shared:
         load_scaling(b, scaling)
@@ -434,7 +435,7 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
 
 @inlined
 def load_vehicles(b, vehicles, first, dt):
-    """Load the vehicles of a block, with the divisions of a control step done."""
+    """Load the vehicles of a block, with the divisions of a control step precomputed."""
     load_rows(vehicles, first, b.vehicle)
     for lane in range(LANES):
         lift = b.thrust_coefficient[lane]
@@ -465,10 +466,10 @@ def load_scaling(b, scaling):
 
 @inlined
 def _load_commands(b, first, count, actions, queue):
-    """Put the commands of a block into the queue, and take those that are due to
+    """Put the commands of a block into the queue, and move those that are due to
     ``b.wanted_speeds``.
 
-    A command enters at the row's own delay; the queue is as long as the longest.
+    A command enters at the row's own delay; the queue is as long as the longest delay.
     """
     command = b.command
     wanted = b.wanted_speeds
@@ -484,12 +485,13 @@ def _load_commands(b, first, count, actions, queue):
     load_rows(queue[0], first, wanted)
     for k in range(4):
         for late in range(delay - 1):
-            # Views, and both values read whichever is taken: else the loop is not vectorised.
+            # Take views, and read both values whichever is used: otherwise the loop is not
+            # vectorised.
             here = queue[late, k, first : first + count]
-            behind = queue[late + 1, k, first : first + count]
+            after = queue[late + 1, k, first : first + count]
             for lane in range(count):
                 new = command[k, lane]
-                old = behind[lane]
+                old = after[lane]
                 here[lane] = new if own[lane] == late + 1.0 else old
         for lane in range(LANES):
             new = command[k, lane]
@@ -519,7 +521,7 @@ def _end_episodes(
     b, first, count, autoreset, observations, rewards, dones, returns, limits,
     outcome, last_observations,
 ):  # fmt: skip
-    """Write rewards and dones of a block, and how the episodes ended; return how many have.
+    """Write rewards and dones of a block, and how its episodes ended; return how many ended.
 
     Without autoreset the outcome is that of every row's last step.
     """
@@ -534,7 +536,7 @@ def _end_episodes(
         out_of_range = distance[lane] > b.max_distance[lane]
         dones[i] = crashed | out_of_range | (b.stream[STEP, lane] >= limits[i])
         ended += dones[i]
-    # Few episodes end, and without this part the loop above has no branches.
+    # Few episodes end, and without this separate part the loop above would have branches.
     if ended == 0 and autoreset:
         return ended
     for lane in range(count):

@@ -1,4 +1,4 @@
-"""Motions: positions as functions of time, of curves, points in a file and waypoints."""
+"""Motions: positions as functions of time, from curves, points in a file, or waypoints."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ Motion = Callable[[FloatArray], FloatArray]
 """The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
 HARMONICS = np.arange(1, 7)
 _COLUMNS = ["t", "x", "y", "z", "heading"]
-# Of a segment of a polynomial with the least snap
+# Number of coefficients of a segment of a polynomial with the least snap
 _COEFFICIENTS = 8
 # Curves of sines, as functions of the angle ωt and the sizes A, B and C
 SINES: Mapping[str, Callable[..., Any]] = {
@@ -41,12 +41,12 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
 
     Its first line names the columns: t, x, y, z and maybe heading; s, m, rad.
 
-    :raises ConfigError: a file that cannot be read, or whose times do not rise; names the row,
-        counted from 1 behind the names.
+    :raises ConfigError: a file that cannot be read, or whose times do not rise; the message names
+        the row, counted from 1 after the header.
     """
     with raised_as(ConfigError, str(path)):
         frame = pd.read_csv(path, dtype=np.float64, skipinitialspace=True)
-    # Pandas takes what is too much in the rows for an index, and all columns would be shifted.
+    # Pandas would take surplus numbers in the rows for an index, and shift all columns.
     if not isinstance(frame.index, pd.RangeIndex):
         raise ConfigError(f"{path}: its rows have more numbers than its first line has names")
     frame.columns = frame.columns.str.strip()
@@ -56,20 +56,20 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
             f"{path}: its first line names {','.join(names)}; the columns must be t,x,y,z[,heading]"
         )
     if len(frame) < 2:
-        raise ConfigError(f"{path}: needs two or more rows behind the names of its columns")
+        raise ConfigError(f"{path}: needs two or more rows after its header")
     refuse_gaps(path, frame)
     numbers = frame.to_numpy()
     times = numbers[:, 0] - numbers[0, 0]
     refuse_falling_times(path, frame["t"])
-    # Headings may be given from -π to π: between two of them is the shorter way.
+    # Headings may be wrapped to [-π, π]: take the shorter way between two of them.
     numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)
     return times, numbers[:, 1:]
 
 
 def refuse_gaps(path: Path, frame: pd.DataFrame) -> None:
-    """Refuse a table of which a number is missing or not finite.
+    """Refuse a table in which a number is missing or not finite.
 
-    :raises ConfigError: names the row, counted from 1 behind the names, and the column.
+    :raises ConfigError: the message names the row, counted from 1 after the header, and the column.
     """
     unfit = np.argwhere(~np.isfinite(frame.to_numpy()))
     if len(unfit):
@@ -82,7 +82,7 @@ def refuse_gaps(path: Path, frame: pd.DataFrame) -> None:
 def refuse_falling_times(path: Path, times: "pd.Series[float]") -> None:
     """Refuse times that do not rise from row to row.
 
-    :raises ConfigError: names the row, counted from 1 behind the names.
+    :raises ConfigError: the message names the row, counted from 1 after the header.
     """
     falling = np.flatnonzero(times.diff() <= 0.0)
     if falling.size:
@@ -117,11 +117,11 @@ def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
     """
     m = len(seconds)
     size = _COEFFICIENTS * m
-    # Linear equations: for some segments, the factors of their coefficients
+    # Linear equations; each has, for some segments, the factors of their coefficients.
     equations = []
     for k in range(m):
         equations += [{k: _powers(0.0, 0)}, {k: _powers(seconds[k], 0)}]
-    # In between, the optimum is continuous up to the sixth derivative.
+    # At inner points, the optimum is continuous up to the sixth derivative.
     for k in range(1, m):
         for derivative in range(1, 7):
             ends = {k - 1: _powers(seconds[k - 1], derivative), k: -_powers(0.0, derivative)}
@@ -132,7 +132,8 @@ def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
     for row, equation in enumerate(equations):
         for segment, powers in equation.items():
             factors[row, segment] = powers
-    # Each segment begins at a point and ends at the next; the other equations are of zeros.
+    # Each segment begins at a point and ends at the next; the right-hand sides of the other
+    # equations are zero.
     right = np.zeros((size, 3))
     right[: 2 * m] = np.repeat(points, 2, axis=0)[1:-1]
     solution = np.linalg.solve(factors.reshape(size, size), right)
@@ -150,5 +151,5 @@ def least_snap(points: FloatArray, seconds: FloatArray) -> Motion:
 def _powers(time: float, derivative: int) -> FloatArray:
     """Return the derivative of 1, t, t², … at a time."""
     powers = range(_COEFFICIENTS)
-    # The factor is 0 where nothing is left of the power.
+    # The factor is 0 if nothing is left of the power.
     return np.array([math.perm(k, derivative) * time ** max(k - derivative, 0) for k in powers])

@@ -30,10 +30,10 @@ from sb3_quad.vehicles.layout import Turn
 class Feature(NamedTuple):
     """A group of features of one kind.
 
-    :param name: of the group.
-    :param prefix: what the name of each feature begins with; it ends in one of ``parts``.
+    :param name: name of the group.
+    :param prefix: the name of each feature begins with it, and ends in one of ``parts``.
     :param std: σ of Eq. 3.16 (Table A.2), in ``unit``.
-    :param axes: what the features belong to, which says how :func:`turn_features` turns them: the
+    :param axes: what the features refer to, which decides how :func:`turn_features` turns them: the
         ``world``'s axes, the ``body``'s axes, or the ``rotors``.
     """
 
@@ -159,7 +159,9 @@ def _turn(b):
 
 @inlined
 def with_noise(b, k, lane):
-    """Return feature k of a lane with its noise, in its unit. Relative noise alone has its sign."""
+    """Return feature k of a lane with its noise, in its unit. Relative noise on its own is
+    multiplied by the feature including its sign.
+    """
     feature = b.feature[k, lane]
     noise = b.noise[k, lane]
     relative = b.noise_level[lane] * feature
@@ -190,7 +192,7 @@ def _disturb_and_scale(b):
 def observe(b, moves, for_px4):
     """Write the scaled features of a loaded block with their noise to ``b.feature``.
 
-    The noise belongs to the row's episode and step: it is the same until the stream counts on.
+    The noise belongs to the row's episode and step: it stays the same until the stream advances.
     """
     features(b, moves, for_px4)
     random_words(b)

@@ -1,7 +1,7 @@
 """The physics of one control step of a block: the rotors (Eq. 4.1), the external wrench, and
 PyBullet's integrator.
 
-The rotors are the same where PyBullet moves the body.
+The rotors are computed here even if PyBullet moves the body.
 
 A physics step is what PyBullet computes for the floating base of a multibody. First come the
 explicit updates v += dt F/m and ω += dt I⁻¹(τ - ω×Iω). Then the world components of v and ω are
@@ -80,11 +80,11 @@ def rotor_speed(b, lane, action):
 
 @inlined
 def limit_speeds(b, speeds, lane):
-    """Keep the commanded rotor speeds of a lane, (4, LANES), to what its battery allows, in place.
+    """Limit the commanded rotor speeds of a lane, (4, LANES), to what its battery allows, in place.
 
-    With a saturation of each, a rotor takes the greatest speed alone. With a shared one, what the
-    fastest command exceeds it by is taken off all four, down to zero: their differences, and so the
-    moments, stay.
+    If each rotor saturates by itself, its speed is clipped to the greatest one. If the saturation
+    is shared, the excess of the fastest command is subtracted from all four, down to zero: their
+    differences, and so the moments, stay.
     """
     greatest = b.greatest_speed[lane]
     s0, s1, s2, s3 = four(speeds, lane)
@@ -111,7 +111,7 @@ def turn_rotors(b, lane):
     Their thrusts in that step, N (Eq. 2.4), are written to ``b.thrust``. With the new speed Ω a
     thrust is kF Ω²; with exact motors it is that of the step's middle, kF Ω Ω_old.
     """
-    # Both factors are read whichever is taken: else LLVM does not vectorise the loop over lanes.
+    # Read both factors whichever is used: otherwise LLVM does not vectorise the loop over lanes.
     speeding_up = b.motor[0, lane]
     slowing_down = b.motor[1, lane]
     for k in range(4):
@@ -172,7 +172,7 @@ def accelerate(b):
         store(b.velocity, lane, v)
         store(b.body_rates, lane, w)
         b.speed2[lane] = max(dot(w, w), dot(v, v))
-    # In a loop of its own: a sum over lanes keeps the one above from being vectorised.
+    # In a separate loop: a sum over lanes would keep the one above from being vectorised.
     over = 0
     for lane in range(LANES):
         over += b.speed2[lane] > MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY

@@ -3,14 +3,14 @@ change the numbers of a row.
 
 Every number is Philox4x32 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011)
 of a key and a counter: the key names the row, the counter is ``(block, step, episode, purpose)``.
-Nothing is kept in between.
+No state is kept between numbers.
 
 ``streams``, uint32 of shape ``(4, n)``: key_lo, key_hi, episode, step. Resetting a row adds one to
 ``episode`` and sets ``step`` to 0; each control step adds one to ``step``.
 
 Normals are Box-Muller in float32, lane by lane. The logarithm, sine and cosine are short
 polynomials instead of library calls, so that the loops vectorise; their error (1e-7) is far below
-what any test of the numbers could see. The largest number there can be is 6.7.
+what any test of the numbers could see. The largest possible normal is 6.7.
 """
 
 import math
@@ -35,7 +35,7 @@ _SHIFT = uint64(32)
 # The bits of sqrt(1/2) in float32
 _SQRT_HALF_BITS = 0x3F3504F3
 _LN2 = float32(math.log(2.0))
-# Of the polynomials, the highest power first
+# Coefficients of the polynomials, the highest power first
 _LOG = tuple(
     np.array(
         [
@@ -76,8 +76,8 @@ def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
 
 @compiled
 def _round(c0, c1, c2, c3, k0, k1):
-    # In uint64 whose upper half is left to hold anything: AVX2 multiplies the lower halves of
-    # 64-bit lanes.
+    # In uint64 whose upper half may hold anything: AVX2 multiplies the lower halves of 64-bit
+    # lanes.
     p0 = uint64(0xD2511F53) * (c0 & _MASK)
     p1 = uint64(0xCD9E8D57) * (c2 & _MASK)
     return (p1 >> _SHIFT) ^ c1 ^ k0, p1, (p0 >> _SHIFT) ^ c3 ^ k1, p0
@@ -122,7 +122,7 @@ def random_words(b):
     word = b.word
     for block in range(word.shape[0] // 4):
         for lane in range(LANES):
-            # Written out: a loop over the four is not vectorised.
+            # Written out, since a loop over the four would not be vectorised.
             (
                 word[4 * block, lane],
                 word[4 * block + 1, lane],

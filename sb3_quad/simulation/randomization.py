@@ -50,7 +50,7 @@ class Range(Frozen, Generic[Bounded]):
     high: Bounded
     """the greatest number, at least low"""
     distribution: Literal["uniform", "log_uniform", "uniform_cube_root"] = "uniform"
-    """of the number, of its logarithm (low > 0), or of its cube root"""
+    """distribution of the number, of its logarithm (low > 0), or of its cube root"""
 
     @model_validator(mode="before")
     @classmethod
@@ -94,7 +94,7 @@ class Factor(Range[Annotated[float, Field(ge=0.1, le=10)]]):
     """A factor between 0.1 and 10, log-uniform unless ``distribution`` says otherwise."""
 
     distribution: Literal["uniform", "log_uniform"] = "log_uniform"
-    """of the factor or its logarithm"""
+    """distribution of the factor or of its logarithm"""
 
 
 UNCHANGED = Factor(low=1.0, high=1.0)
@@ -109,7 +109,8 @@ class RandomVector(Frozen):
     magnitude: Magnitude
     """its length, N, N m or m/s; or in the unit that unit names"""
     unit: Unit = "SI"
-    """weight: a force in multiples of the weight m g, a torque of m g times the arm length"""
+    """weight: a force in multiples of the weight m g, a torque in those of m g times the arm length
+    """
     frame: Literal["world", "body"] | None = None
     """frame in which it is constant; default: world for a force, body for a torque"""
     direction: Vector | None = None
@@ -150,10 +151,10 @@ class Gusts(Frozen):
     Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930). The update
     is that of D. T. Gillespie, "Exact numerical simulation of the Ornstein-Uhlenbeck process"
     (Phys. Rev. E 54, 1996), with one difference: the increment of a control step has the variance
-    of a normal number but is not one. A sum of many is normal, and a time constant is many steps.
-    The first gust of an episode is normal. Deviation and time constant are exact for any control
-    step. MIL-F-8785C's Dryden model is this process along the flight path, with the time constant
-    L / V.
+    of a normal number but is not one. A sum of many increments is normal, and a time constant is
+    many steps. The first gust of an episode is normal. Deviation and time constant are exact for
+    any control step. MIL-F-8785C's Dryden model is this process along the flight path, with the
+    time constant L / V.
     """
 
     std: Magnitude
@@ -171,7 +172,7 @@ class Gusts(Frozen):
     def numbers(self, control_step: float) -> list[float]:
         """Return numbers in the order of ``GUST``.
 
-        :param control_step: s, after which a share of a gust is kept.
+        :param control_step: s, for the share of a gust that is left after it.
         """
         keeps = math.exp(-control_step / self.time_constant)
         return [*self.std.numbers(), keeps, self.unit == "weight"]
@@ -187,8 +188,8 @@ class Randomization(Frozen):
     stream. Fields that you do not give are not random.
 
     Factors multiply the vehicle's own parameters and are log-uniform unless they say otherwise. The
-    limits of the thrusts in N do not follow the mass, so action 0 gives the thrust with which the
-    vehicle hovers before it is randomized.
+    thrust limits in N do not follow the mass, so action 0 commands the thrust with which the
+    vehicle hovers before randomization.
     """
 
     share: Share = 1.0
@@ -206,8 +207,9 @@ class Randomization(Frozen):
     thrust: Factor | None = None
     """factor of the thrust of a command, such as that of an old battery"""
     battery: Battery | None = None
-    """factor of the greatest rotor thrust alone, such as [0.85, 1]: a battery that the firmware
-    compensates, until its voltage does not suffice; see saturation of Vehicle"""
+    """factor of the greatest rotor thrust only, such as [0.85, 1]: a falling battery voltage that
+    the firmware compensates as long as it can; see saturation of Vehicle
+    """
     arm: Factor | None = None
     """factor of the rotors' distances from the centre of mass"""
     center_of_mass: Offset | None = None
@@ -225,7 +227,7 @@ class Randomization(Frozen):
     gusts: Gusts | None = None
     """a random force, such as {std: [0, 1], time_constant: 1}"""
     wind: RandomVector | None = None
-    """m/s, horizontal unless it has a direction; the air's velocity, acts on vehicles with drag"""
+    """velocity of the air, m/s, horizontal unless it has a direction; acts on vehicles with drag"""
     wind_gusts: Gusts | None = None
     """a random velocity added to the wind, such as {std: [0, 1]}, m/s"""
 
@@ -241,17 +243,17 @@ class Randomization(Frozen):
 
     @property
     def sets_vehicle(self) -> bool:
-        """Whether an episode begins with a vehicle of its own."""
+        """Whether each episode may begin with another vehicle."""
         return any(isinstance(given, Range) for _, given in self)
 
     @property
     def sets_wrench(self) -> bool:
-        """Whether an episode begins with a wrench of its own, which may be zero."""
+        """Whether each episode begins with a new wrench, which may be zero."""
         return self.force is not None or self.torque is not None
 
     def hardest(self, vehicle: Vehicle) -> Vehicle:
-        """Return the vehicle with the narrowest thrust limits and the fastest motors that it can
-        get. If it can fly, all can.
+        """Return the vehicle with the narrowest thrust limits and the fastest motors that may be
+        sampled. If it can fly, all can.
 
         :raises ConfigError: it cannot fly.
         """
@@ -294,7 +296,7 @@ R = first_rows(RANDOMIZATION)
 
 
 def numbers_of(record: Frozen, sizes: Mapping[str, int], control_step: float = 0.0) -> FloatArray:
-    """Return the numbers of a record one after the other, (sum of sizes,); 0 where none are given.
+    """Return the numbers of a record one after the other, (sum of sizes,); 0 if none are given.
 
     :param sizes: how many numbers each field is, in their order.
     :param control_step: s, of gusts.

@@ -1,8 +1,8 @@
-"""References that move: curves, files and functions as tables of a state for each control step.
+"""Moving references: curves, files and functions, as tables with a state for each control step.
 
 A reference is a state: position, velocity, acceleration, heading and its rate. A row of a table is
-that state in the order of the last rows of :data:`.state.STATE`. Tables are made once, when an
-environment is; in flight, :mod:`.tracks` reads them.
+that state in the order of the last rows of :data:`.state.STATE`. Tables are made once, with the
+environment; in flight, :mod:`.tracks` reads them.
 """
 
 import math
@@ -34,10 +34,10 @@ _POSITION, _VELOCITY, _ACCELERATION, _HEADING, _HEADING_RATE, _AHEAD = row_slice
     REFERENCE_PARTS
 ).values()
 MAX_SECONDS = 600.0  # of a round or of all; a table must not fill the memory
-# Random motion: so many pieces of so many seconds, each a sum of sines that fit into it.
+# Random motion: this many pieces of this many seconds, each a sum of sines that fit into it.
 PIECES = 256
 PIECE_SECONDS = 10.0
-# Curves that are given by a field, and its name
+# Curves that need a field, and the name of that field
 NEEDED = {"polynomial": "waypoints", "file": "file", "function": "function"}
 CURVES = (*SINES, *NEEDED, "random_smooth")
 # Fields that only some curves use, and these curves
@@ -75,7 +75,7 @@ NO_TRACKS = Tracks(np.zeros((0, REFERENCE_SIZE)), 1, False)
 
 
 class Reference(Frozen):
-    """A reference that moves from the target of an episode on; units m, s, rad.
+    """A reference that starts at the target of an episode and moves; units m, s, rad.
 
     The axes of a curve are those of the world. With ω such that the greatest speed is ``speed``,
     its position at the time t relative to its start is:
@@ -92,9 +92,9 @@ class Reference(Frozen):
     """
 
     curve: Literal[CURVES] = "figure_eight"  # type: ignore[valid-type]
-    """which curve; waypoints, a file or a function without one name theirs"""
+    """which curve; not needed with waypoints, a file or a function"""
     speed: PositiveFloat = Field(default=2.0, le=100)
-    """greatest speed, m/s; of random_smooth the limit, below which each piece has its own"""
+    """greatest speed, m/s; for random_smooth a limit, below which each piece has its own speed"""
     size: Point | None = None
     """A, B and C, m; None: 2, 1 and 0.5 (figure_eight: 0)"""
     acceleration: PositiveFloat = Field(default=8.0, le=1e3)
@@ -102,11 +102,13 @@ class Reference(Frozen):
     resting: float = Field(default=0.0, ge=0, le=1)
     """random_smooth: share of pieces that rest"""
     heading: Literal["path", "random"] | Number | None = None
-    """at the start, rad; path: along the velocity; random: of each piece of random_smooth its own,
-    with a rate up to heading_rate; None: none is commanded"""
+    """heading at the start, rad; path: along the velocity; random: another one for each piece of
+    random_smooth, with a rate up to heading_rate; None: no heading is commanded
+    """
     heading_rate: float = Field(default=0.0, ge=-20, le=20)
-    """rad/s, for a heading that is a number; so that curves loop, rounded to whole turns in 600 s,
-    or in 10 s of random_smooth"""
+    """rad/s, for a heading that is a number; rounded to whole turns in 600 s (random_smooth: 10 s),
+    so that curves loop
+    """
     waypoints: tuple[Point, ...] | None = None
     """polynomial: two or more points, relative to the start, which is added if they do not begin
     there"""
@@ -115,14 +117,14 @@ class Reference(Frozen):
     function: Any = Field(default=None, exclude=True)
     """function: times (t,) to positions (t, 3), or (t, 4) with headings; it is not saved"""
     duration: PositiveFloat = Field(default=20.0, le=MAX_SECONDS)
-    """helix and function: s, after which they rest"""
+    """helix and function: time after which they rest, s"""
 
     @model_validator(mode="before")
     @classmethod
     def _from_name(cls, data: Any) -> Any:
-        """A string names a curve, or is the path of a CSV file; a function is one.
+        """A string is the name of a curve or the path of a CSV file; a function is itself a curve.
 
-        Fields without a curve say which it is by what only one curve needs.
+        If no curve is named, a field that only one curve needs decides which it is.
         """
         if isinstance(data, (str, Path)):
             field = "file" if str(data).endswith(".csv") else "curve"
@@ -140,7 +142,7 @@ class Reference(Frozen):
         needed = NEEDED.get(self.curve)
         if needed and not getattr(self, needed):
             raise ValueError(f"curve {self.curve}: needs {needed}")
-        # Zips hold every field, so that only a value that is not the default was given on purpose.
+        # Zips contain every field, so only a value other than the default was given on purpose.
         for name, curves in USED_BY.items():
             default = type(self).model_fields[name].default
             if self.curve not in curves and getattr(self, name) != default:
@@ -157,7 +159,7 @@ class Reference(Frozen):
     def tracks(self, dt: float) -> Tracks:
         """Return the tables for control steps of ``dt``, s.
 
-        :raises ConfigError: a file or function that does not give such numbers.
+        :raises ConfigError: a file or function without valid positions.
         """
         if self.curve == "random_smooth":
             return self._random_tracks(dt)
@@ -168,13 +170,13 @@ class Reference(Frozen):
                 f"reference {self.file or self.curve}: takes {seconds:g} s; at most"
                 f" {MAX_SECONDS:g} s are possible: make it shorter or faster"
             )
-        # The end may lie within the last control step. Rounding errors add no step.
+        # The end may lie within the last control step. Rounding errors must not add a step.
         steps = math.ceil(seconds / dt - 1e-6)
         loops = self.curve in SINES and self.curve != "helix"
         if loops and self.heading_rate:
-            # The heading must loop, too: whole turns in many periods are nearly at its rate.
+            # The heading must loop, too; with whole turns in many periods its rate is nearly kept.
             steps *= math.ceil(MAX_SECONDS / dt / steps)
-        # One row more where it does not loop: the end, at which it rests.
+        # One more row if it does not loop: the end, at which it rests.
         with raised_as(ConfigError, f"reference {self.curve}"):
             table = self._table(motion, steps + (not loops), dt, loops, seconds)
         return Tracks(table, len(table), loops)
@@ -194,11 +196,11 @@ class Reference(Frozen):
         grid = np.linspace(0.0, 2.0 * math.pi, 7201)
         way = np.gradient(np.stack(sines(grid, *size)), grid, axis=1)
         length = 2.0 * math.pi * np.linalg.norm(way, axis=0).max()
-        # With fewer than 10 control steps in a round, differences are no velocities any more.
+        # With fewer than 10 control steps in a round, differences no longer approximate velocities.
         fastest = length / (10 * dt)
         if 0.0 < fastest < self.speed:
             raise ConfigError(
-                f"reference {self.curve}: of this size it has at most {fastest:.3g} m/s, less than"
+                f"reference {self.curve}: with this size it reaches {fastest:.3g} m/s, less than"
                 f" speed {self.speed:g}; lower speed, or enlarge size"
             )
         # A whole number of control steps, so that it loops without a jump.
@@ -211,13 +213,13 @@ class Reference(Frozen):
     def _table(
         self, motion: Motion, steps: int, dt: float, loops: bool, end: float = math.inf
     ) -> FloatArray:
-        """Return a table of a function, its derivatives by central differences; where it does not
+        """Return a table of a function, its derivatives by central differences; if it does not
         loop, it rests in the last row.
 
-        :param end: s, after which it rests where it does not loop.
-        :raises ValueError: it gives something else than positions.
+        :param end: time after which a motion that does not loop rests, s.
+        :raises ValueError: the function returns something other than positions.
         """
-        # Where it loops, two steps more on each side: both differences have their neighbours.
+        # If it loops, add two steps on each side, so that both differences have their neighbours.
         more = 2 if loops else 0
         times = dt * np.arange(-more, steps + more, dtype=np.float64)
         if not loops:
@@ -259,8 +261,8 @@ class Reference(Frozen):
         """Return the motion of the least snap through the waypoints (Mellinger and Kumar, "Minimum
         snap trajectory generation and control for quadrotors", ICRA 2011), and its duration, s.
 
-        The times between waypoints are as the distances, then the whole is stretched so that the
-        greatest speed is ``speed``.
+        The times between waypoints are proportional to the distances; then the whole motion is
+        stretched so that its greatest speed is ``speed``.
         """
         points = np.array(self.waypoints)
         if points[0].any():
@@ -268,8 +270,8 @@ class Reference(Frozen):
         seconds = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if len(points) < 2 or not seconds.all():
             raise ConfigError(
-                "reference polynomial: two waypoints in a row are the same point, or there is one"
-                " alone, the start; give others"
+                "reference polynomial: two consecutive waypoints are the same point, or the only"
+                " one is the start; give others"
             )
         grid = np.linspace(0.0, seconds.sum(), 5000)
         way = np.gradient(least_snap(points, seconds)(grid), grid, axis=0)
@@ -299,7 +301,7 @@ class Reference(Frozen):
             table[:, : _ACCELERATION.stop] *= scale
             table[:, _AHEAD] *= scale
             if scale == 0.0 and self.heading == "path":
-                # It has no path: the heading rests, too, as that of hover.
+                # It has no path, so its heading rests, too, as in hover.
                 _set_heading(table, np.zeros(length), dt)
             # Whole turns in a piece, so that it loops.
             turns = round(random.uniform(-1.0, 1.0) * self.heading_rate / base)

@@ -7,7 +7,7 @@ import math
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
 from sb3_quad.simulation.vectors import difference, dot, four, polynomial, vector
 
-# Of Cephes' arctangent, the highest power first
+# Coefficients of Cephes' arctangent, the highest power first
 _NUMERATOR = (
     *(-8.750608600031904122785e-1, -1.615753718753365076637e1, -7.500855792314704667340e1),
     *(-1.228866684490136173410e2, -6.485021904942025371773e1),

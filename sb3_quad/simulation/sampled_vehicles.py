@@ -38,7 +38,7 @@ def sample_vehicles(
             # The roll arms are y of the rotors, the pitch arms -x.
             "rotor_positions": tuple(zip(-pitch, roll, strict=True)),
             "moment_thrust_ratio": abs(p.yaw_arm_0),
-            # If it is unknown, 0 stands for the same thrusts at the same speeds.
+            # If it is unknown, it stays 0.
             "thrust_coefficient": p.thrust_coefficient * bool(base.thrust_coefficient),
             "motor_gain_up": p.motor_gain_up,
             "motor_gain_down": p.motor_gain_down,

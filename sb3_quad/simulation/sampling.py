@@ -30,7 +30,7 @@ GUST_SIZE = sum(GUSTS.values())
 GUST_VALUE = row_slices(GUSTS)["value"]
 GUST_ROWS = first_rows(GUSTS)
 TURN = 2.0 * math.pi
-# Parameters of a vehicle, the range of the factor of each, and the number of its uniform
+# Parameters of a vehicle, the range of each one's factor, and the index of its uniform number
 _FACTORS = (
     (P.mass, R.mass, 1),
     (P.hover_thrust, R.mass, 1),
@@ -71,8 +71,8 @@ def start_episode(
     s = state[:, i]
     vehicle = _column(vehicles, i)
 
-    # A uniform direction has a uniform height (Archimedes), which is cut where the target would lie
-    # too close to the ground.
+    # A uniform direction has a uniform height (Archimedes), which is limited so that the target is
+    # not too close to the ground.
     nearest = task[T.nearest_target]
     distance = nearest + (task[T.target_distance] - nearest) * u[12]
     ground = vehicle[P.collision_radius] + task[T.target_clearance]
@@ -154,7 +154,7 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
         vehicles[:, i] = _column(base, i)
         sample_from_distribution(i, streams, distribution, vehicles)
 
-    # Forces in weights are those of the vehicle before it is randomized.
+    # Forces in multiples of a weight refer to the vehicle before randomization.
     vehicle = _column(vehicles, i)
     weight = vehicle[P.mass] * vehicle[P.gravity]
     u = uniforms(streams, i, 4, DISTURBANCE)
@@ -184,13 +184,13 @@ def _sample_vector(table, k, share, unit, u, out):
     frame.
 
     :param share: 1, or 0 for none in this episode.
-    :param unit: of a magnitude that is given by weight, in SI units.
+    :param unit: unit of a magnitude that is given by weight, in SI units.
     :param u: three numbers on (0, 1): magnitude, height and azimuth of a random direction.
     """
     size = share * between(table, k, u[0], 0.0)
     if table[k + V.by_weight] != 0.0:
         size *= unit
-    # A direction of zeros stands for a random one.
+    # A direction of zeros means a random one.
     direction = table[k + V.direction : k + V.axes]
     if not direction.any():
         direction = np.array(_spherical(1.0, 2.0 * u[1] - 1.0, TURN * u[2]))
@@ -209,7 +209,7 @@ def _randomize_vehicle(i, streams, table, vehicles):
     v[P.drag_x : P.drag_z + 1] += v[P.mass] * between(table, R.drag, u[13], 0.0)
     for parameter, factor, number in _FACTORS:
         v[parameter] *= between(table, factor, u[number], 1.0)
-    # No body has one moment larger than the other two together.
+    # No body has a moment of inertia larger than the sum of the other two.
     inertia = v[P.ixx : P.izz + 1]
     for axis in range(3):
         inertia[axis] = min(inertia[axis], inertia[axis - 1] + inertia[axis - 2])
@@ -232,9 +232,9 @@ def _randomize_vehicle(i, streams, table, vehicles):
 
 @compiled
 def _begin_gusts(table, k, share, unit, u, gust):
-    """Set how the gusts of an episode are, (GUST_SIZE,), and sample the first, in place.
+    """Set the parameters of an episode's gusts, (GUST_SIZE,), and sample the first one, in place.
 
-    :param k: where their numbers begin; ``share`` and ``unit`` as of :func:`_sample_vector`.
+    :param k: where their numbers begin; ``share`` and ``unit`` as in :func:`_sample_vector`.
     :param u: eight uniforms.
     """
     std = share * between(table, k + GUST_NUMBERS.std, u[0], 0.0)
@@ -260,7 +260,7 @@ def add_gusts(to, gust, first, count):
 
 @compiled
 def advance_gusts(b, gust, first, count):
-    """Advance the gusts of a block by a control step, in place, by two random words of each lane.
+    """Advance the gusts of a block by a control step, in place, with two random words of each lane.
 
     The increment of a component is the sum of three numbers of seven bits each, scaled. A gust's
     time constant is many control steps, so the sum of many increments is normal.

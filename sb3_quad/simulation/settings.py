@@ -20,7 +20,7 @@ from sb3_quad.simulation.tasks import find_mixture, resolve_tasks
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, a_number, first_vehicle, load_vehicle
 
-# The most control steps that an episode can have
+# The largest number of control steps that an episode can have
 ENDLESS = 2**62 - 1
 Steps = Annotated[int, BeforeValidator(a_number), Field(gt=0, le=ENDLESS)]
 AsList = BeforeValidator(
@@ -84,7 +84,7 @@ class FlightSettings(ObservationSettings):
 
     @model_validator(mode="after")
     def _check_task(self) -> "FlightSettings":
-        """A named mixture brings its episode length, unless one is given."""
+        """A named mixture sets the episode length, unless one is given."""
         resolve_tasks(self.task, self.task_kwargs)
         mixture = find_mixture(self.task)
         if mixture is not None and "max_episode_steps" not in self.model_fields_set:
@@ -93,9 +93,10 @@ class FlightSettings(ObservationSettings):
         return self
 
     def load_vehicles(self) -> list[Vehicle]:
-        """Return the vehicles, one if it is that of all rows, in the layout that they are flown in.
+        """Return the vehicles in the layout that they are flown in; only one if all rows have the
+        same.
 
-        :raises ConfigError: a vehicle that cannot be loaded, or with other time steps than others.
+        :raises ConfigError: a vehicle that cannot be loaded, or vehicles with different time steps.
         """
         given = self.vehicle if isinstance(self.vehicle, (list, tuple)) else [self.vehicle]
         vehicles = [load_vehicle(source, self.rotor_layout) for source in given]
@@ -109,7 +110,7 @@ class FlightSettings(ObservationSettings):
 
     @property
     def longest_episode(self) -> int:
-        """Control steps of an episode; of the longest where rows differ."""
+        """Control steps of an episode; of the longest one if rows differ."""
         return int(np.max(self.max_episode_steps))
 
     @property
@@ -141,7 +142,7 @@ class FlightSettings(ObservationSettings):
     @property
     def carried(self) -> dict[str, Any]:
         """The settings that go with an agent wherever it flies: :attr:`observed`, and the layout of
-        the rotors that it knows, also where that is its own vehicle's.
+        the rotors that it knows, even if that is its own vehicle's.
         """
         return {**self.observed, "rotor_layout": self.layout}
 
@@ -159,17 +160,17 @@ class FlightSettings(ObservationSettings):
         if "vehicle" in changes:
             own["vehicles"] = None
         if "max_episode_steps" not in self.model_fields_set:
-            # A mixture among the changes brings its own.
+            # A mixture among the changes sets its own.
             del own["max_episode_steps"]
         return validate(FlightSettings, {**own, **changes}, "env_kwargs")
 
     def write_into(self, model: Any) -> None:
         """Write these settings into an SB3 model: ``model.flight_settings``, plain JSON with the
-        parameters of the vehicle. Of several vehicles and scalings they are the first, of several
-        levels of noise the mean. A reference stays if it is a curve by name.
+        parameters of the vehicle. If rows differ, they are the first vehicle and scaling, and the
+        mean level of noise. A reference stays if it is a named curve.
 
-        From then on its zips hold them, and ``load`` of Stable-Baselines3 keeps them, even without
-        this package.
+        From then on its zips contain them, and ``load`` of Stable-Baselines3 keeps them, even
+        without this package.
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
@@ -198,7 +199,7 @@ def levels(noise: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def in_words(noise: Any) -> str:
-    """Return noise such as ``5 %``, or ``5 % and 2 % of σ``; the mean where rows differ."""
+    """Return noise such as ``5 %``, or ``5 % and 2 % of σ``; the mean if rows differ."""
     relative, additive = levels(noise)
     text = f"{100 * relative.mean():g} %"
     if additive:

@@ -49,10 +49,10 @@ REFERENCE_PARTS = {
     "target": 3,
     "target_velocity": 3,
     "target_acceleration": 3,
-    # Its cosine and sine; both zero where no heading is commanded
+    # Its cosine and sine; both zero if no heading is commanded
     "target_heading": 2,
     "target_heading_rate": 1,
-    # The acceleration in AHEAD seconds, for experts; where nobody knows it, as now
+    # The acceleration in AHEAD seconds, for experts; the present one if it is unknown
     "target_ahead": 3,
 }
 """Where the vehicle should be, and how that moves: the last rows of :data:`STATE`."""
@@ -126,7 +126,7 @@ class QuadcopterState:
 
     @property
     def rotor_speeds(self) -> FloatArray:
-        """Rotor speeds ω, shape (n, 4), rad/s; each gives a thrust F = kF ω² (Eq. 2.4)."""
+        """Rotor speeds ω, shape (n, 4), rad/s; each yields a thrust F = kF ω² (Eq. 2.4)."""
         return self.array[ROTOR_SPEEDS].T
 
     @property
@@ -141,7 +141,7 @@ class QuadcopterState:
 
     @property
     def target_heading(self) -> FloatArray:
-        """Cosine and sine of the commanded heading, (n, 2); zeros where there is none."""
+        """Cosine and sine of the commanded heading, (n, 2); zeros if there is none."""
         return self.array[X.target_heading : X.target_heading_rate].T
 
     @property
@@ -152,7 +152,7 @@ class QuadcopterState:
     @property
     def specific_force(self) -> FloatArray:
         """What an accelerometer at the centre of mass shows, shape (n, 3), body frame, m/s^2: all
-        forces but the weight, by the mass. ``vehicles`` and ``wrench`` must be known.
+        forces except the weight, divided by the mass. ``vehicles`` and ``wrench`` must be known.
         """
         assert self.vehicles is not None and self.wrench is not None
         force = np.einsum("nji,jn->ni", self.rotation, self.wrench[FORCE_WORLD])
@@ -169,7 +169,7 @@ class QuadcopterState:
 
     def copy(self) -> "QuadcopterState":
         """Return a state with its own memory, unaffected by later flight."""
-        # Joining copies, also where there is one part.
+        # Concatenation copies, even a single part.
         return QuadcopterState.concatenate([self])
 
     def rows(self, rows: slice) -> "QuadcopterState":

@@ -1,4 +1,6 @@
-"""Flights of a batch, recorded so that their cost can be differentiated by every action."""
+"""Flights of a batch, recorded so that their cost can be differentiated with respect to every
+action.
+"""
 
 from collections.abc import Callable
 
@@ -40,9 +42,9 @@ from sb3_quad.simulation.state import STATE_SIZE, P
 from sb3_quad.simulation.threads import DONE, LEFT, finish, share_out
 
 FlightCost = Callable[[FloatArray, Float32Array, BoolArray], tuple[float, FloatArray, FloatArray]]
-"""A cost and its gradients, of the states after each step (steps, STATE_SIZE, n), the actions
-(steps, n, 4), and whether each counts (steps, n): the mean, the gradient
-with respect to the states, that with respect to the actions.
+"""A function of the states after each step (steps, STATE_SIZE, n), the actions (steps, n, 4), and
+whether each counts (steps, n). It returns the mean cost, its gradient with respect to the states,
+and that with respect to the actions.
 """
 
 
@@ -54,7 +56,7 @@ class FlightTape:
 
     A row that crashes or leaves the range costs nothing from there on and has no gradient.
 
-    :param batch: flies. No time limit ends an episode within a recording.
+    :param batch: the batch that flies. No time limit ends an episode within a recording.
     :param n_steps: control steps of a recording.
     :param substeps: physics steps in a control step; None: those of the batch. Two take half the
         time of four, and differ little.
@@ -98,7 +100,7 @@ class FlightTape:
         if fastest * self.physics_step > 1.0:
             raise ConfigError(
                 f"substeps {self.substeps}: too few for motors of gain {fastest:.3g} per second;"
-                " give None, which is what the simulation has"
+                " give None, for those of the simulation"
             )
         self._at = 0
         self._streams = batch.streams.copy()
@@ -133,7 +135,7 @@ class FlightTape:
     def counts(self) -> BoolArray:
         """Whether the state after each control step counts, (n_steps, n).
 
-        The one that a crash ends in does not: it lies beyond what the model describes.
+        The state that a crash ends in does not: it lies outside the model.
         """
         return (np.arange(1, self.n_steps + 1)[:, None] < self.lengths) | ~self.lost
 
@@ -208,7 +210,7 @@ def undo(
     :param grad_integral: (0 or 3, n), with respect to the position integral.
     :param gradient: (MOVING, n), with respect to the state after the step; becomes that with
         respect to the state before.
-    :param grad_actions: (steps, n, 4), is added to where an earlier action acts late or is
+    :param grad_actions: (steps, n, 4), is added to where an earlier action acts after a delay or is
         observed.
     """
     n = states.shape[2]

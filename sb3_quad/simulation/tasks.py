@@ -1,7 +1,7 @@
 """The tasks (thesis 4.2): where an episode starts, how its control steps are rewarded, and when it
 is over.
 
-A task is data. :mod:`.sampling` begins episodes by it, :mod:`.reward` scores their control steps.
+A task is data. :mod:`.sampling` begins episodes from it, :mod:`.reward` scores their control steps.
 :data:`TASKS` and :data:`MIXTURES` hold those that have a name.
 """
 
@@ -42,7 +42,7 @@ class Task(Frozen):
     """least height of a target above the ground, beyond the collision radius, where its distance
     from the start allows it, m"""
     random_attitude: bool = False
-    """start attitude uniform on SO(3), else level"""
+    """start attitude uniform on SO(3), otherwise level"""
     velocity_std: Speed = 0.0
     """standard deviation of v at the start, per axis, m/s"""
     body_rates_std: Speed = 0.0
@@ -52,9 +52,9 @@ class Task(Frozen):
     max_distance: PositiveLength = 30.0
     """distance from the target beyond which the episode terminates, m"""
     success_distance: PositiveLength = 0.1
-    """greatest final distance from the target of a success, m"""
+    """greatest final distance from the target that counts as a success, m"""
     success_tilt: PositiveFloat = np.pi
-    """greatest final tilt of a success, rad"""
+    """greatest final tilt that counts as a success, rad"""
     position_cost: Cost = 0.003
     """per m and control step (Eq. 4.5)"""
     precision_cost: Cost = 0.0
@@ -93,13 +93,13 @@ class Task(Frozen):
 
 
 TASK = dict.fromkeys(list(Task.model_fields)[1:], 1) | {"start_position": 3}
-"""Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
+"""Columns of a table of tasks: how many numbers each field of :class:`Task` has."""
 T = first_rows(TASK)
 SCORED = list(TASK)[list(TASK).index("max_distance") :]
 """The fields that every control step needs: all from ``max_distance`` on, a number each."""
 
 RECOVERED = {"success_distance": 0.25, "success_tilt": np.radians(10.0)}
-"""The success of tasks whose target is their start."""
+"""The criteria of success of tasks whose target is their start."""
 # Random attitude, velocity and body rates, at a random distance from the target.
 _THROWN_AWAY: Any = {
     "target_distance": 25.0,
@@ -127,9 +127,9 @@ TASKS: Mapping[str, Task] = {
 class Mixture(NamedTuple):
     """A mixture of tasks that has a name.
 
-    :param weights: of each task, by its name. Their order decides which random number gives which
-        task.
-    :param task_kwargs: fields of :class:`Task` to override in each; the user's own come after them.
+    :param weights: weight of each task, by its name. Their order decides which random numbers
+        select which task.
+    :param task_kwargs: fields of :class:`Task` to override in each; the user's own take precedence.
     :param max_episode_steps: control steps of an episode, unless the user says how many.
     """
 
@@ -201,7 +201,7 @@ def resolve_tasks(
     shares = per_row("task: the weights", weights, len(weights))[0]
     if (shares < 0).any() or not shares.any():
         raise ConfigError(
-            f"task: the weights {shares.tolist()} must be not negative and not all zero"
+            f"task: the weights {shares.tolist()} must not be negative, and not all zero"
         )
     cumulative = np.cumsum(shares / shares.sum())
     cumulative[-1] = 1.0

@@ -16,13 +16,13 @@ import numpy as np
 from sb3_quad.simulation.compiled import atomic_add, compiled, give_way
 
 Function = Callable[..., Any]
-# Places in a control array, each on a cache line of its own, and its size
+# Places in a control array, each on its own cache line, and the array's size
 LEFT, DONE, LATE, CONTROL = range(0, 64, 16)
-# Looks at a chunk that another thread still has, before that thread gets the core: about 30 µs
+# Checks of a chunk that another thread still has, before this thread yields its core: about 30 µs
 SPIN = 20_000
-# Looks after that, with which the call counts as late: longer than a chunk takes
+# Further checks, after which the call counts as late: longer than a chunk takes
 PATIENCE = 5_000
-# Calls without other threads after a late one: something else keeps their core busy.
+# Calls without other threads after a late one, since something else keeps their core busy
 REST = 100
 
 
@@ -50,7 +50,7 @@ class _Pool:
         while True:
             function, arguments = self.calls.get()
             function(*arguments)
-            # Nothing stays alive while this thread sleeps.
+            # Keep nothing alive while this thread sleeps.
             del function, arguments
 
 
@@ -70,7 +70,7 @@ def share_out(function: Function, helpers: int, *arguments: Any) -> Any:
     pool = _pool
     control = np.zeros(CONTROL, np.int64)
     if helpers < 1:
-        # It takes no part in whether other calls rest.
+        # A call without helpers does not shorten the rest of other calls.
         return function(control, True, *arguments)
     if pool.resting > 0:
         pool.resting -= 1

@@ -5,8 +5,8 @@
 reference moves, and the first row of its piece in the table, below zero for a target that rests.
 ``numbers`` int64 (3,) are :meth:`.references.Tracks.numbers`.
 
-A step writes the positions of references to the state. :func:`complete` writes what else they have
-when somebody reads it, since that would take a third of what references cost.
+A step writes the positions of references to the state. :func:`complete` writes their other
+quantities only when somebody reads them, which saves a third of the cost of references.
 """
 
 import numpy as np
@@ -49,7 +49,7 @@ def _first_row(i, streams, numbers):
 
 @compiled
 def start_course(i, state, streams, course, numbers):
-    """Let row i's reference begin at its target, by a piece from its own stream."""
+    """Let row i's reference begin at its target, with a piece that its own stream chooses."""
     for axis in range(3):
         course[C.anchor + axis, i] = state[X.target + axis, i]
     course[C.begin, i] = _first_row(i, streams, numbers)
@@ -72,7 +72,7 @@ def follow(b, ahead, state, streams, course, table, numbers):
             for k in range(X.target, STATE_SIZE):
                 b.state[k, lane] = state[k, i]
             continue
-        # Without a sign, numba does not look whether an index counts from the end.
+        # With an unsigned index, numba does not check whether it counts from the end.
         row = np.uint64(_row_at(begin, streams[STEP, i] + ahead, numbers))
         # A loop of a fixed length: a variable one would take five times as long.
         for k in range(AHEAD):
@@ -93,8 +93,8 @@ def complete(state, streams, course, table, numbers):
 
 @compiled
 def observe_preview(b, count, previews, course, table, numbers, out):
-    """Write what the rows of a block see of their references' future: the acceleration in each of
-    the given control steps from now, in the frame of the present heading, at the end of ``out``.
+    """Write what the rows of a block observe of their references' future: the acceleration in each
+    of the given control steps from now, in the frame of the present heading, at the end of ``out``.
 
     A reference without a table keeps its present acceleration.
 

@@ -118,7 +118,7 @@ DISTRIBUTION_NUMBERS = dict.fromkeys(VehicleDistribution.model_fields, RANGE) | 
 }
 """Numbers of :meth:`VehicleDistribution.numbers`; ratios that are not given are 0."""
 D = first_rows(DISTRIBUTION_NUMBERS)
-# Its ranges are FIXED.
+# A distribution whose ranges are all FIXED
 NO_DISTRIBUTION = np.zeros(sum(DISTRIBUTION_NUMBERS.values()))
 
 
@@ -156,7 +156,7 @@ def sample_from_distribution(i, streams, table, vehicles):
     v[P.motor_gain_up] = 1.0 / slow
     v[P.motor_gain_down] = 1.0 / between(table, D.motor_time_constant_down, u[8], slow)
 
-    # Size and arms, of a standard normal from two uniforms (Box-Muller).
+    # Size and arms, by a standard normal from two uniforms (Box-Muller).
     normal = math.sqrt(-2.0 * math.log(u[6])) * math.cos(2.0 * math.pi * u[7])
     x = table[D.size_deviation] * (normal - 1.0)
     size = mass_ratio ** (1.0 / 3.0) * (1.0 + x if x >= 0.0 else 1.0 / (1.0 - x))

@@ -2,12 +2,11 @@
 
 A sweep's folder holds
 
-- ``sweep.yaml``, what was asked for; ``plan.json``, a :class:`Sweep`: its runs with all their
+- ``sweep.yaml``, the sweep as given; ``plan.json``, a :class:`Sweep`: its runs with all their
   settings;
 - ``runs/<configuration>/seed_<k>/``, folders as ``train`` leaves them;
 - ``records/<configuration>/seed_<k>.json``, a :class:`RunResult` of each run that ended;
-- ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: what was
-  measured.
+- ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: the measurements.
 """
 
 from pathlib import Path
@@ -41,15 +40,16 @@ class RunResult(Frozen):
     """the zip that flew, relative to the run's folder"""
     timesteps: int = 0
     seconds: float = 0.0
-    """wall-clock time of the training; of a run that was resumed, since then"""
+    """wall-clock time of the training; if the run was resumed, since then"""
     flights: dict[str, dict[str, list[float | None]]] = {}
     """by scenario and measure, a number for each episode, the same episodes in every run: success
     and survival 0 or 1; reward the sum; final_error in m (NaN: crashed or out of range); time in s
-    to the tightest tolerance, or, where it starts at its target, until stable (NaN: never)"""
+    to the tightest tolerance, or until stable if it starts at its target (NaN: never)
+    """
 
 
 class Sweep(Frozen):
-    """A sweep with all that its files say; resuming does not read the settings files again."""
+    """A sweep with the contents of its files; resuming does not read the settings files again."""
 
     spec: SweepSpec
     runs: list[Run] = Field(min_length=1)

@@ -1,10 +1,10 @@
 """The results of a sweep: ``results.csv``, ``results.json``, and the tables of terminal and page.
 
-Intervals are bootstraps over seeds and episodes. A resample takes as many seeds as there are, with
-replacement, and as many episodes; the episodes are the same in every run, so that seeds and
-episodes are crossed (Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1, 2007). Few
-seeds give intervals that are too narrow (Agarwal et al., Deep Reinforcement Learning at the Edge of
-the Statistical Precipice, NeurIPS 2021): with one seed they cover the choice of episodes alone.
+Intervals are bootstraps over seeds and episodes. A resample draws as many seeds as there are, with
+replacement, and as many episodes; the episodes are the same in every run, so seeds and episodes are
+crossed (Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1, 2007). Few seeds lead to
+intervals that are too narrow (Agarwal et al., Deep Reinforcement Learning at the Edge of the
+Statistical Precipice, NeurIPS 2021): with one seed they cover only the choice of episodes.
 """
 
 import warnings
@@ -42,7 +42,7 @@ ROWS = {
 COMPARED = ("success", "reward")
 CAPTION = "means over n seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
 PAIRED = "paired bootstrap over the seeds and episodes that both have"
-# The levels that tell apart the rows of a table of episodes.
+# The levels that distinguish the rows of a table of episodes
 LEVELS = ("configuration", "seed", "scenario", "episode")
 COLUMNS = (
     *("run", "configuration", "seed", "state", "scenario", "episodes"),
@@ -59,14 +59,14 @@ class SweepResults(Frozen):
     runs: int
     finished: int
     failed: dict[str, str]
-    """by the name of a run, why it failed"""
+    """why a run failed, by its name"""
     configurations: dict[str, list[int]]
-    """by the name of a configuration, the seeds of its finished runs, if it has any"""
+    """the seeds of a configuration's finished runs, if it has any, by its name"""
     estimates: list[StrDict] = []
     """means over the finished runs of a configuration, by scenario and measure: fields of Estimate
     """
     comparisons: list[StrDict] = []
-    """differences of two configurations, the first less the second: fields of Estimate, and as
+    """differences of two configurations, the first minus the second: fields of Estimate, and as
     verdict whether the first is better or worse
     """
 
@@ -76,7 +76,7 @@ def write_results(
 ) -> tuple[SweepResults, list[Table]]:
     """Write ``results.csv``, a line for each run and scenario, ``results.json``, and the report.
 
-    :param results: of all runs that ended, by name.
+    :param results: results of all runs that ended, by name.
     :return: means, intervals and comparisons of all runs that are finished, and their tables.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
@@ -84,13 +84,13 @@ def write_results(
     parts = {}
     failed = {}
     configurations: dict[str, list[int]] = {}
-    # In the order of the plan, not in that in which runs ended.
+    # In the order of the plan, not in that of the ends of runs.
     for run in sweep.runs:
         if run.name not in results:
             continue
         result = results[run.name]
         line = {"run": run.name, **dict(run), **dict(result)}
-        # The table holds every run that ended, also those that failed.
+        # The table has every run that ended, even if it failed.
         if result.state == "failed":
             failed[run.name] = result.message
             lines.append(line)
@@ -101,7 +101,7 @@ def write_results(
             part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
             parts[run.configuration, run.seed, scenario] = part
             line |= {"scenario": scenario, "episodes": len(part), **part.mean()}
-            # All are means but for the final error, which is a median.
+            # All are means, except for the final error, which is a median.
             lines.append({**line, "final_error": part["final_error"].quantile()})
     write_text(
         folder / "results.csv",
@@ -155,7 +155,7 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
             if measure not in COMPARED:
                 continue
             for first, second in combinations(runs, 2):
-                # Differences are paired: only the seeds that both have, and the same episodes.
+                # Differences are paired: only seeds that both have, and the same episodes.
                 paired = (runs[first] - runs[second]).dropna(how="all")
                 difference = over_seeds(paired.to_numpy())
                 if difference is not None:
@@ -178,16 +178,16 @@ def _compare(summary: SweepResults, flights: pd.DataFrame) -> list[Table]:
 def over_seeds(
     values: FloatArray, statistic: Callable[..., FloatArray] = np.nanmean
 ) -> Estimate | None:
-    """Estimate the mean over seeds of a statistic of a run's episodes; of the difference of two
-    configurations, a paired bootstrap.
+    """Estimate the mean over seeds of a statistic of a run's episodes; for the difference of two
+    configurations, this is a paired bootstrap.
 
-    :param values: of a measure, (seeds, episodes), NaN without a number.
+    :param values: values of a measure, (seeds, episodes), NaN without a number.
     :return: None if a run has no number at all, or if there is no run.
     """
     # Without a number from some run, there is no mean over seeds.
     if values.size == 0 or np.isnan(values).all(axis=1).any():
         return None
-    # The same resamples each time: equal values give equal intervals.
+    # The same resamples each time, so that equal values yield equal intervals.
     random = np.random.default_rng(0)
     seeds, episodes = (random.integers(0, n, (RESAMPLES, n)) for n in values.shape)
     with warnings.catch_warnings():
@@ -196,15 +196,15 @@ def over_seeds(
         # (resamples, seeds)
         runs = np.stack([statistic(row[episodes], axis=1) for row in values], axis=1)
         means = np.nanmean(np.take_along_axis(runs, seeds, axis=1), axis=1)
-    # The interval holds the value, even if every resample misses it.
+    # The interval includes the value, even if every resample misses it.
     value = float(statistic(values, axis=1).mean())
     low, high = np.nanpercentile(means, [2.5, 97.5])
     return Estimate(value=value, low=min(value, low), high=max(value, high), n=values.size)
 
 
 def verdict(difference: Estimate) -> str:
-    """Return whether the first of two is better or worse: whether the interval of the difference
-    leaves out zero.
+    """Return whether the first of two is better or worse, which it is if the interval of the
+    difference excludes zero.
     """
     if difference.low > 0:
         return "better"
@@ -214,7 +214,7 @@ def verdict(difference: Estimate) -> str:
 
 
 def _curves(folder: Path, sweep: Sweep, results: Mapping[str, RunResult]) -> dict[str, list[Curve]]:
-    """Read the learning curves of the finished runs, by configuration; of pipelines, those of the
+    """Read the learning curves of the finished runs, by configuration; for pipelines, those of the
     last stage.
     """
     curves: dict[str, list[Curve]] = {}
@@ -241,7 +241,7 @@ def _write_report(
     ]
     if curves:
         caption = "Mean over seeds, with their range; of pipelines, that of the last stage."
-        # An environment of others may report neither success nor reward.
+        # A third-party environment may report neither success nor reward.
         with suppress(ConfigError):
             plots = [Plot("curves", caption, plot_curves(curves, {}))]
             sections.append(Section("curves", "Learning curves", plots=plots))

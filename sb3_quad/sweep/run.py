@@ -38,7 +38,7 @@ from sb3_quad.training.pipeline import (
     run_pipeline,
 )
 
-EPISODES = 240  # of each task, where no suite is named
+EPISODES = 240  # of each task, if no suite is named
 TASKS = ("state_recovery", "target_tracking")
 LOG = "log.txt"  # the reports of the training, in the run's folder
 
@@ -53,11 +53,10 @@ def execute(
 ) -> dict[str, RunResult]:
     """Execute all runs of a sweep's folder that are not finished.
 
-    A run that fails is left, and the others continue. After a signal, the runs under way save and
-    end.
+    If a run fails, the others continue. After a signal, the current runs save and end.
 
     :param report: receives each event in one line.
-    :return: the results of all runs that ended, those of earlier calls included, by name.
+    :return: the results of all runs that ended, including those of earlier calls, by name.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     # Finished runs stay as they are; failed ones are tried again.
@@ -68,7 +67,7 @@ def execute(
     # All runs are submitted at once; the executor starts as many as it has workers.
     for run in sweep.runs:
         if run.name not in results:
-            # Files in the folder of a run name others, which must be found from anywhere.
+            # Files in the folder of a run contain paths, which must be valid from anywhere.
             place = folder.absolute() / "runs" / run.name
             calls[executor.submit(work, run, place, sweep.spec, sweep.suite)] = run
     show(len(results), len(sweep.runs), "runs")
@@ -76,7 +75,7 @@ def execute(
         try:
             result = future.result()
         except WorkerDied as died:
-            # After a signal a worker may have been ended by it.
+            # A signal may have ended a worker.
             if signals.received is not None:
                 continue
             result = RunResult(name=run.name, state="failed", message=str(died))
@@ -91,13 +90,13 @@ def execute(
 
 
 def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResult | None:
-    """Train a run in its folder, or the rest of it, and fly its agent.
+    """Train a run in its folder, or resume it, and fly its agent.
 
     :param suite: the scenarios of the agent; None: fresh episodes of both tasks, as many as
         ``spec.evaluation`` says.
-    :return: the result, which of a run that fails says why; None: it was interrupted.
+    :return: the result, with the reason if the run failed; None: it was interrupted.
     """
-    # One core for each run: so the same weights come out on any machine.
+    # One core for each run, so that the weights are the same on any machine.
     use_cpus(1)
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -118,7 +117,7 @@ def work(run: Run, place: Path, spec: SweepSpec, suite: Suite | None) -> RunResu
         )
     except KeyboardInterrupt:
         return None
-    # Also the errors of a user's callback or environment: the other runs continue.
+    # Even after errors of a user's callback or environment, the other runs continue.
     except (Exception, SystemExit) as error:
         return RunResult(name=run.name, state="failed", message=kind_and_line(error))
 
@@ -129,7 +128,7 @@ def _train(run: Run, place: Path, report: Report) -> PipelineResult:
         return resume_pipeline(begun.parent, report)
     stages = []
     for number, stage in enumerate(run.stages):
-        # The settings get a file here, because one of the user's may have changed since.
+        # The settings are written here, because a user's file may have changed since.
         settings = place / f"stage_{number}.yml"
         write_text(settings, yaml.safe_dump({stage.env: stage.settings}, sort_keys=False))
         stages.append(stage.model_copy(update={"conf_file": str(settings), "settings": {}}))
@@ -147,7 +146,7 @@ def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluat
     episodes = evaluation.episodes or EPISODES
     seed = seed_for("table", evaluation.seed or 0)
     if job.config.task is None or not hasattr(model, KEY):
-        # An environment of others has rewards, and no scenarios; so it is behind wrappers.
+        # A third-party environment has rewards but no scenarios, and neither has a wrapped one.
         if suite is not None:
             raise ConfigError(
                 "evaluation: suites are for this package's environments without wrappers, "
@@ -175,7 +174,7 @@ def _numbers(flights: Flights) -> StrDict:
     """Return the measures of all episodes, NaN where there is no number."""
     # The time to the tightest tolerance.
     arrival = flights.time_to[min(flights.time_to)]
-    # An episode that starts at its target has no way to it, and so no cross-track error.
+    # An episode that starts at its target has no way to it, and thus no cross-track error.
     has_way = np.isfinite(flights.cross_track_error)
     measures = {
         "success": flights.success,

@@ -1,4 +1,4 @@
-"""The runs of a sweep: every configuration of its grid and list, by every seed, each checked."""
+"""The runs of a sweep: every configuration of its grid and list with every seed, each checked."""
 
 import copy
 import itertools
@@ -18,7 +18,7 @@ from sb3_quad.training.options import RunOptions, SettingsOptions, all_changes
 from sb3_quad.training.pipeline import Pipeline, Stage, plan_training, stage_jobs
 from sb3_quad.vehicles.vehicle import first_vehicle
 
-NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # whose value says enough
+NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # keys whose value says enough
 LONGEST = 80  # characters of a name
 
 
@@ -32,14 +32,14 @@ class Run(Frozen):
     job: StrDict
     """arguments of TrainingJob, less config, seed and log_folder"""
     stages: list[Stage]
-    """of its pipeline, with all their settings; a single run is one of one stage"""
+    """stages of its pipeline, with all their settings; a single run is a pipeline of one stage"""
 
 
 def make_runs(spec: SweepSpec) -> list[Run]:
     """Return the runs of a sweep, the seeds of a configuration one after another.
 
     :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
-        two runs of one name.
+        two runs with the same name.
     """
     # Every configuration is checked before the first run starts.
     runs = {}
@@ -91,7 +91,7 @@ def _cells(spec: SweepSpec) -> Iterator[tuple[str, StrDict]]:
                 put_key(data, key, copy.deepcopy(value), f"configuration: {key}")
             # A named configuration keeps its name in each cell of the grid.
             label = [str(own.get("name") or _in_words(own)), _in_words(cell)]
-            # Where nothing differs, the file or the algorithm says what is trained.
+            # If nothing differs, the file or the algorithm says what is trained.
             alone = data.get("conf_file") or data.get("algo") or "run"
             yield ",".join(filter(None, label)) or str(alone), data
 

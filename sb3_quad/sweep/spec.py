@@ -1,9 +1,9 @@
 """The settings of a sweep: those that all runs share, a grid or a list of those that differ, and
 the seeds.
 
-The words are rl-zoo's. Keys at the top hold for every configuration; ``grid`` maps keys, dotted
-where they lie deeper, to lists of values. Every combination of them is a configuration, such as
-``grid: {hyperparams.learning_rate: [1e-3, 5e-3]}``; ``configurations`` lists some one by one.
+The terms are rl-zoo's. Keys at the top apply to every configuration; ``grid`` maps keys, dotted for
+nested ones, to lists of values. Every combination of them is a configuration, such as ``grid:
+{hyperparams.learning_rate: [1e-3, 5e-3]}``; ``configurations`` lists some one by one.
 """
 
 from pathlib import Path
@@ -25,7 +25,9 @@ SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 
 
 class Configuration(SettingsOptions, RunOptions):
-    """The settings of one training, less its seed; a missing key has the default of ``train``."""
+    """The settings of one training, except for its seed; a missing key has the default of
+    ``train``.
+    """
 
     name: str | None = Field(default=None, pattern=NAME)
     """in tables and folders; made of the settings that differ without it"""
@@ -88,7 +90,7 @@ def load_sweep(source: StrPath) -> SweepSpec:
     """Load the sweep in a YAML file, by path or by the name of one in the package.
 
     :raises ConfigError: an unreadable file, or a key that is unknown or does not fit; a sweep of
-        the package where a file of the user's is called like one of its settings files.
+        the package if a user's file has the name of one of its settings files.
     """
     data, where = SWEEPS.read(source)
     spec = validate(SweepSpec, {"name": Path(source).stem, **data}, where)

@@ -1,6 +1,6 @@
 """The classes that settings name, and the keywords that their constructors take.
 
-They are the algorithms that can be trained, and callbacks and wrappers of the user's.
+These are the algorithms that can be trained, and a user's callbacks and wrappers.
 """
 
 import inspect
@@ -38,7 +38,7 @@ BASES = {
     "vec_env_wrapper": VecEnvWrapper,
 }
 """The keys of the settings that name classes, and the base class that each asks for."""
-# A training job gives these itself, so they are no settings of an algorithm.
+# A training job sets these itself, so they are not settings of an algorithm.
 _SET_BY_JOB = (
     "policy",
     "env",
@@ -58,7 +58,7 @@ EXPECTED = {
     "float": "a number",
     "int": "a whole number",
 }
-"""What a value must be by the kind of pydantic's error; the first that applies."""
+"""What a value must be, by the kind of pydantic's error; the first that applies."""
 _CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -82,7 +82,7 @@ def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
     Each annotation is a type. It is Any where an annotation is missing or has a name that cannot be
     resolved.
     """
-    # SB3's GymEnv holds "VecEnv" as a string, which only some of its modules can resolve.
+    # SB3's GymEnv contains "VecEnv" as a string, which only some of its modules can resolve.
     try:
         types = typing.get_type_hints(algorithm.__init__, localns={"VecEnv": VecEnv})  # type: ignore[misc]
     except NameError:
@@ -105,14 +105,15 @@ def convert(
     least: float = -math.inf,
     most: float = math.inf,
 ) -> Any:
-    """Return ``value`` as the constructor's ``parameter``, whose annotation is a type, takes it.
+    """Convert ``value`` to what the constructor's ``parameter``, whose annotation is a type,
+    accepts.
 
     Strings become literals or, as ``lin_x``, SB3's ``LinearSchedule(x, 0, 1)``, which every SB3 can
     unpickle.
 
     :param least: the smallest number that is allowed, also at the start of a schedule.
     :param most: the largest one.
-    :raises ConfigError: text where a number belongs, a fraction where a whole number does, another
+    :raises ConfigError: text instead of a number, a fraction instead of a whole number, another
         type; NaN or infinity; a number out of range.
     """
     is_linear = isinstance(value, str) and value.startswith(_LINEAR)
@@ -159,13 +160,13 @@ def check(kind: Any, value: Any, where: str) -> Any:
     if isinstance(value, str) and "is" in messages:
         return value
     known = [text for kind, text in EXPECTED.items() if kind in messages]
-    # Pydantic says the others well.
+    # Pydantic's own messages are good enough for the others.
     expected = [*known, *messages.values()][0].removeprefix("Input should be ")
     raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 
 def takes_whole(parameter: inspect.Parameter) -> bool:
-    """Whether a constructor's parameter takes whole numbers and no others."""
+    """Whether a constructor's parameter takes only whole numbers."""
     return _takes(parameter.annotation, 2) and not _takes(parameter.annotation, 0.5)
 
 
@@ -188,7 +189,7 @@ def qualified_classes(value: Any, where: str) -> list[tuple[str, StrDict]]:
 
     These are a name, ``{name: keywords}``, or a list of both.
 
-    :raises ConfigError: another form, or as :func:`import_class`.
+    :raises ConfigError: another form, or see :func:`import_class`.
     """
     classes = []
     for entry in as_list(value):
@@ -209,7 +210,7 @@ def import_class(path: str, where: str) -> Any:
 
     :param where: the key that names it, one of ``BASES``.
     :raises ConfigError: a module or a name that does not exist, or anything but a class of the kind
-        that the key is for.
+        that the key requires.
     """
     named = import_name(path, where)
     base = BASES[where]
@@ -224,7 +225,7 @@ def import_class(path: str, where: str) -> Any:
 def instance(path: str, where: str, *arguments: Any, **keywords: Any) -> Any:
     """Make an instance of the class at ``package.module.Class``.
 
-    :raises ConfigError: as :func:`import_class`; or the class does not take these keywords.
+    :raises ConfigError: see :func:`import_class`; or the class does not take these keywords.
     """
     # A user's class may raise anything.
     with raised_as(ConfigError, f"{where}: {path} cannot be made with {keywords}"):

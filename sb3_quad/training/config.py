@@ -2,8 +2,8 @@
 
 Settings come from rl-zoo's YAML: one file per algorithm, whose top keys are environment ids.
 :class:`TrainingConfig` lists the keys of a job. Any other key is a keyword of the algorithm's
-constructor. There, ``lin_1e-3`` falls linearly to 0 over the training; a learning rate falls to its
-n-th part, which it has in the last of n updates.
+constructor. There, ``lin_1e-3`` falls linearly to 0 over the training; a learning rate falls to 1/n
+of its value, which it reaches in the last of n updates.
 """
 
 from collections.abc import Collection, Mapping
@@ -54,7 +54,7 @@ SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind = Literal["batch", "dummy", "subproc"]
 NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
-# For dummy and subproc. PyBullet allows about as many in a process.
+# For dummy and subproc. PyBullet allows about this many in a process.
 MAX_SINGLE = 1000
 
 
@@ -70,13 +70,14 @@ Classes = Annotated[
     list[tuple[str, StrDict]],
     BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
-# Units of the layers of all networks, or of each by name; the last form is that of older versions.
+# Units of the layers of all networks, or of each by name; the last form is from older versions of
+# SB3.
 Layers = list[PositiveInt]
 NetArch = Layers | dict[str, Layers] | list[dict[str, Layers]] | None
 
 
 class TrainingConfig(Frozen):
-    """The checked settings of one job. ``settings`` holds them as given, in values of plain YAML.
+    """The checked settings of one job. ``settings`` has them as given, in plain YAML values.
 
     Classes are given as ``package.module.Class``, one or a list; with keywords as
     ``{package.module.Class: {…}}``.
@@ -93,7 +94,7 @@ class TrainingConfig(Frozen):
     env_kwargs: Keywords = {}
     """keywords of the environment's constructor"""
     eval_env_kwargs: Keywords = {}
-    """put over env_kwargs in the evaluation's environments"""
+    """override env_kwargs in the evaluation's environments"""
     eval_tasks: Annotated[list[str], BeforeValidator(as_list)] = []
     """more tasks to evaluate on; the job's own task decides which model is best"""
     best_by: Literal["success", "survival"] = "success"
@@ -106,7 +107,7 @@ class TrainingConfig(Frozen):
     callback: Classes = []
     """callbacks of the training"""
     env_wrapper: Classes = []
-    """wrappers around each environment, for dummy and subproc"""
+    """wrappers around each environment, only for dummy and subproc"""
     vec_env_wrapper: Classes = []
     """wrappers around the vectorised environment"""
     normalize: bool | Keywords = False
@@ -131,7 +132,7 @@ class TrainingConfig(Frozen):
 
     @property
     def flight_settings(self) -> FlightSettings:
-        """How an agent of this job flies, in an environment of this package."""
+        """The flight settings of an agent of this job, in an environment of this package."""
         return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
 
     def make_expert(self) -> Any:
@@ -146,17 +147,17 @@ class TrainingConfig(Frozen):
         )
 
     def keyword(self, name: str) -> Any:
-        """Return what the algorithm's constructor is given as ``name``, or its default."""
+        """Return the value that the algorithm's constructor gets for ``name``, or its default."""
         if name in self.hyperparams:
             return self.hyperparams[name]
         return constructor_parameters(self.algorithm)[name].default
 
     @property
     def vec_env_wrappers(self) -> list[tuple[str, StrDict]]:
-        """The wrappers around the vectorised environment, that of ``normalize`` included."""
+        """The wrappers around the vectorised environment, including that of ``normalize``."""
         if not self.normalize:
             return self.vec_env_wrapper
-        # As rl_zoo3 gives it.
+        # As in rl_zoo3.
         keywords = {"gamma": self.hyperparams.get("gamma", 0.99)}
         if self.normalize is not True:
             keywords |= self.normalize
@@ -174,7 +175,7 @@ class TrainingConfig(Frozen):
     def rollout_steps(self) -> int:
         """Control steps of each environment between two updates.
 
-        1 where ``train_freq`` counts episodes.
+        1 if ``train_freq`` counts episodes.
         """
         if not self.is_off_policy:
             return int(self.keyword("n_steps"))
@@ -190,9 +191,9 @@ class TrainingConfig(Frozen):
         return self.rollout_steps * self.n_envs
 
     def shorter_rollout(self) -> dict[str, int]:
-        """Return the settings that fit a rollout to a budget of less than one.
+        """Return the settings that shorten a rollout to a smaller budget.
 
-        SB3 would fly the rollout whole. Empty where the budget is large enough.
+        SB3 would fly the whole rollout. Empty if the budget is large enough.
         """
         n_steps = -(-self.n_timesteps // self.n_envs)
         if n_steps >= self.rollout_steps:
@@ -202,7 +203,7 @@ class TrainingConfig(Frozen):
         if "batch_size" not in constructor_parameters(self.algorithm):
             return {"n_steps": n_steps}
         rollout = n_steps * self.n_envs
-        # PPOBC chooses a batch size of its own unless it is given one.
+        # PPOBC chooses its batch size unless it is given one.
         batch_size = min(self.keyword("batch_size") or rollout, rollout)
         return {"n_steps": n_steps, "batch_size": batch_size}
 
@@ -214,14 +215,14 @@ class TrainingConfig(Frozen):
                 [*self.env_kwargs, *self.eval_env_kwargs],
                 FlightSettings.model_fields,
             )
-            # Evaluations fly with both; each of the two must fit.
+            # Evaluations use both, so each of the two must fit.
             self.flight_settings.with_changes(**self.eval_env_kwargs)
             refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
         elif self.eval_tasks:
             raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
         aliases = self.algorithm.policy_aliases
         refuse_unknown("policy", [self.policy], aliases)
-        # The constructor of the policy takes these, not that of the algorithm.
+        # The policy's constructor takes these, not the algorithm's.
         policy = aliases[self.policy]
         refuse_unknown(
             f"keyword of {policy.__name__}", self.policy_kwargs, constructor_parameters(policy)
@@ -244,7 +245,7 @@ class TrainingConfig(Frozen):
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
         if "NormalizeObservation" in str(self.env_wrapper):
             raise ConfigError(
-                "env_wrapper: NormalizeObservation has statistics of its own in each environment, "
+                "env_wrapper: NormalizeObservation has separate statistics in each environment, "
                 "also to evaluate in; remove it, and give normalize: true"
             )
         if self.expert and not takes_expert(self.algorithm):
@@ -254,7 +255,7 @@ class TrainingConfig(Frozen):
 
 # Keys of a settings file that hold keywords of environments.
 ENV_KEYS = {"env_kwargs", "eval_env_kwargs"}
-# Keywords of environments that may be the path of a file, or hold one.
+# Keywords of environments that may be the path of a file, or contain one.
 FILE_KEYS = {"vehicle", "rotor_layout", "vehicles", "reference"}
 # Keys of a settings file that are not the algorithm's.
 JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams", "settings"}
@@ -267,9 +268,9 @@ class TrainingJob(JobOptions):
     """the settings"""
 
     def for_evaluation(self, **changes: Any) -> TrainingConfig:
-        """Return the settings with the environments as evaluations have them.
+        """Return the settings with the environments of evaluations.
 
-        :param changes: to the keywords of the environments.
+        :param changes: changes to the keywords of the environments.
         """
         config = self.config
         return config.model_copy(
@@ -278,11 +279,11 @@ class TrainingJob(JobOptions):
 
     @property
     def flight_settings(self) -> FlightSettings:
-        """How the agent is evaluated, in an environment of this package."""
+        """The flight settings of evaluations, in an environment of this package."""
         return self.for_evaluation().flight_settings
 
     def arguments(self) -> StrDict:
-        """Return what args.yml holds: all but the settings, and how evaluations fly.
+        """Return the content of args.yml: everything except the settings, and how evaluations fly.
 
         The settings are in config.yml.
         """
@@ -295,9 +296,9 @@ class TrainingJob(JobOptions):
 
 
 def describe(job: TrainingJob) -> str:
-    """Return one line about what is going to be trained, in whole rollouts as SB3 trains."""
+    """Return one line about the training to come, in whole rollouts as SB3 trains."""
     config = job.config
-    # The last rollout is flown whole.
+    # SB3 completes the last rollout.
     timesteps = -(-config.n_timesteps // config.rollout) * config.rollout
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
     if timesteps != config.n_timesteps:
@@ -323,11 +324,11 @@ def load_config(
     conf_file: StrPath | None = None,
     overrides: StrDict | None = None,
 ) -> TrainingConfig:
-    """Read the settings of ``env_id`` from a YAML file and put ``overrides`` over them.
+    """Read the settings of ``env_id`` from a YAML file and apply ``overrides`` to them.
 
-    They are merged as by :func:`merged`. Where ``n_timesteps`` is less than a rollout, ``n_steps``
-    is shortened to it, and ``batch_size`` to no more than that; ``train_freq`` for an off-policy
-    algorithm.
+    They are merged as by :func:`merged`. If ``n_timesteps`` is less than a rollout, ``n_steps`` is
+    reduced to it and ``batch_size`` to at most that; for an off-policy algorithm, ``train_freq``
+    is.
 
     :param conf_file: path of a file, or the name of one that comes with the package such as
         ``thesis/dagger.yml``; None for ``<algo>.yml`` of the package.
@@ -337,7 +338,7 @@ def load_config(
     # A misspelt name would otherwise be reported as a missing file.
     get_algorithm(algo)
     check_environment(env_id)
-    # A file of the user's that is called like the default is not meant.
+    # A user's file with the name of the default is not meant.
     content, where = SETTINGS.read(conf_file or SETTINGS.packaged(f"{algo}.yml"))
     if env_id not in content:
         missing = unknown("environment in this file", env_id, map(str, content))
@@ -354,7 +355,7 @@ def load_config(
 
 
 def merged(settings: StrMapping, changes: StrMapping, where: str) -> StrDict:
-    """Return ``changes`` put over ``settings``; keywords of environments are merged key by key.
+    """Return ``settings`` with ``changes`` applied; keywords of environments are merged key by key.
 
     :param where: what the messages call the source of the settings.
     """
@@ -377,14 +378,15 @@ def build_config(
     """Check the settings of one job, given as a plain mapping.
 
     :param where: what the messages call the source of the settings.
-    :param changes: keys that come from the command line instead.
+    :param changes: keys that come from the command line.
     :raises ConfigError: see :func:`load_config`.
     """
     algorithm = get_algorithm(algo)
     parameters = constructor_parameters(algorithm)
     check_environment(env_id)
     settings = with_absolute_paths(env_id, settings)
-    # The default is written out, so that config.yml names the expert. Flights of a file need none.
+    # The default is written out, so that config.yml names the expert. Demonstrations from a file
+    # need none.
     needs_expert = takes_expert(algorithm) and not settings.get("demonstrations")
     if needs_expert and settings.get("expert") is None:
         settings["expert"] = DEFAULT_EXPERT
@@ -411,8 +413,8 @@ def build_config(
 def with_absolute_paths(env_id: str, settings: StrDict) -> StrDict:
     """Return the settings with absolute paths of the files that they name.
 
-    A run may be flown and resumed later, from another folder. What keywords of other packages'
-    environments mean is not known.
+    A run may be flown and resumed later, from another folder. The meaning of keywords of other
+    packages' environments is unknown.
     """
     settings = dict(settings)
     for key in ENV_KEYS & settings.keys() if env_id in ENVIRONMENTS else ():
@@ -436,7 +438,7 @@ def _absolute(value: Any) -> Any:
         value = dict(value)
         if "distribution" in value:
             value["distribution"] = _absolute(value["distribution"])
-        # It is never a name, even without a suffix.
+        # A file is never a name, even without a suffix.
         if isinstance(value.get("file"), str):
             value["file"] = str(Path(value["file"]).absolute())
         return value
@@ -458,13 +460,13 @@ def check_environment(env_id: str) -> None:
 
 
 def as_agent(path: StrPath, algo: str, env_id: str, changes: StrDict) -> StrDict:
-    """Return ``changes`` to the settings of an algorithm with the observation and networks of a zip
-    added.
+    """Return ``changes`` to the settings of an algorithm, together with the observation and
+    networks of a zip.
 
-    What is in ``changes`` takes precedence. Evaluations fly with the agent's position integral, if
-    it has one; training does without. A zip that does not say how its agent flies adds nothing.
+    ``changes`` take precedence. Evaluations fly with the agent's position integral, if it has one;
+    training flies without it. A zip that does not say how its agent flies adds nothing.
 
-    :raises ConfigError: a zip or settings that do not fit; rotors that are elsewhere.
+    :raises ConfigError: a zip or settings that do not fit; rotors in other places.
     """
     config = load_config(algo, env_id, None, changes)
     own, source = agent_settings(path)

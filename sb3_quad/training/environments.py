@@ -21,7 +21,7 @@ from sb3_quad.training.config import TrainingConfig
 Env = gymnasium.Env[Any, Any]
 WORKER_ENDED = (
     "a worker process of the environments ended (its error, if it had time for one, is above; "
-    "else out of memory?); vec_env dummy needs no worker processes"
+    "otherwise, out of memory?); vec_env dummy needs no worker processes"
 )
 
 
@@ -30,9 +30,9 @@ class _Dummy(RowSeeds, DummyVecEnv):
 
 
 class _Subproc(RowSeeds, SubprocVecEnv):
-    """Ends its worker processes also where one of them has ended before.
+    """Ends its worker processes even if one of them has already ended.
 
-    SB3's ``close`` would wait forever for the answer of that one.
+    SB3's ``close`` would wait forever for that one to answer.
     """
 
     def close(self) -> None:
@@ -53,9 +53,9 @@ SINGLE = {"dummy": _Dummy, "subproc": _Subproc}
 def make_environments(
     config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False
 ) -> VecEnv:
-    """Make ``n_envs`` environments; their rows fly by ``row_seeds`` of ``seed``.
+    """Make ``n_envs`` environments; their rows use ``row_seeds`` of ``seed``.
 
-    Each gives ``info["episode"]`` where an episode ends, as SB3's Monitor does.
+    When an episode ends, its info has ``"episode"``, as with SB3's Monitor.
 
     :param staggered: whether the first episodes end at different times, as those of
         :class:`QuadcopterVecEnv` do.
@@ -106,13 +106,13 @@ def make_environments(
 def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
     """Make the environment of a row.
 
-    Keywords that are lists hold the values of the rows, which start again at the end of the list.
+    Keywords that are lists have a value for each row, and start over at the end of the list.
 
-    :param phases: row i begins in the i-th of so many phases, which divide an episode evenly.
+    :param phases: number of phases that divide an episode evenly; row i begins in the i-th.
     """
     if config.vec_env == "subproc":
         ignore_interrupts()
-    # One environment takes one value, where the batched one takes a list.
+    # A single environment takes one value; the batched one takes a list.
     keywords = dict(config.env_kwargs)
     for name in keywords.keys() & {"vehicle", "noise", "max_episode_steps"}:
         values = as_list(keywords[name]) or [None]
@@ -129,7 +129,7 @@ def _make_row(config: TrainingConfig, row: int, phases: int) -> Env:
 
 
 class _FirstEpisode(TimeLimit):
-    """Truncates the first episode after so many steps, and no other."""
+    """Truncates only the first episode, after a number of steps."""
 
     def reset(self, **kwargs: Any) -> Any:
         elapsed: Any = self._elapsed_steps

@@ -14,20 +14,20 @@ from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import Frozen
 
-# What is trained where none of the three is given; the algorithm and the environment of a single
-# run.
+# What is trained if neither algorithm, environment nor settings file is given; and the defaults of
+# a single run
 DEFAULT_PIPELINE = "two_stage.yml"
 DEFAULT_ALGO = "dagger"
 DEFAULT_ENV = "QuadTargetTracking-v0"
 # A pipeline's stages have their own values of these.
 KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
-# 1e6 is a text to YAML.
+# YAML reads 1e6 as text.
 Number = Annotated[int, BeforeValidator(parse_number)]
 
 
 def _check_device(device: str) -> str:
-    """Refuse a device that PyTorch does not know, and CUDA on a machine without it, for which SB3
-    would take the CPU without a warning.
+    """Refuse a device that PyTorch does not know, and CUDA on a machine without it, where SB3 would
+    use the CPU without a warning.
     """
     import torch
 
@@ -40,7 +40,7 @@ def _check_device(device: str) -> str:
 
 
 class SettingsOptions(Frozen):
-    """Keys of a settings file that have a flag of their own; None keeps the file's value."""
+    """Keys of a settings file that have their own flag; None keeps the file's value."""
 
     n_timesteps: Number | None = None
     """timesteps, rounded up to whole rollouts; fewer than one rollout shorten the rollout"""
@@ -57,9 +57,9 @@ class SettingsOptions(Frozen):
 
 
 def all_changes(hyperparams: StrMapping, options: StrMapping) -> StrDict:
-    """Return the changes to a settings file: hyperparameters, and keys with a flag of their own.
+    """Return the changes to a settings file: hyperparameters, and keys that have their own flag.
 
-    :raises ConfigError: a key that both give, of which one would be ignored.
+    :raises ConfigError: a key that is in both, one of which would be ignored.
     """
     for key in sorted(hyperparams.keys() & options.keys()):
         raise ConfigError(f"{key}: given by itself and in hyperparams; remove it from one of them")
@@ -117,7 +117,7 @@ class JobOptions(RunOptions):
     @model_validator(mode="before")
     @classmethod
     def _tracked(cls, given: StrDict) -> StrDict:
-        """Weights & Biases shows what TensorBoard is given, so there must be a folder for that."""
+        """Weights & Biases shows TensorBoard's logs, so TensorBoard needs a folder."""
         if not given.get("track"):
             return given
         require("wandb", "track", "--track")

@@ -1,6 +1,6 @@
 """Pipelines: several training jobs in a row, each starting from the agent of the one before.
 
-The two stages of the thesis (4.2) are one. A pipeline's file lists its stages in order, as
+The two stages of the thesis (4.2) form one. A pipeline's file lists its stages in order, as
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
@@ -69,18 +69,18 @@ class Stage(Frozen):
     seed_offset: NonNegativeInt = 0
     """added to the seed, so that stages on the same task fly different episodes"""
     pass_on: Literal["best", "last"] = "best"
-    """the best evaluation, as best_by of its settings says"""
+    """best: the agent of the best evaluation, by best_by of its settings"""
     correct_offset: PositiveFloat | None = None
-    """offset correction after the stage: α of Eq. 4.10, such as 0.7; 1: the offset alone"""
+    """offset correction after the stage: α of Eq. 4.10, such as 0.7; 1: only the offset"""
     require: Requirement = Requirement()
-    """the pipeline stops where this is missed"""
+    """the pipeline stops if this is missed"""
     eval_freq: int | None = None
     """timesteps between evaluations of this stage"""
     eval_episodes: PositiveInt | None = None
-    """episodes in each"""
+    """episodes of each evaluation"""
 
     def load(self) -> TrainingConfig:
-        """Return its checked settings.
+        """Return the checked settings of the stage.
 
         :raises ConfigError: see :func:`~sb3_quad.training.config.load_config`.
         """
@@ -115,7 +115,7 @@ class StageResult(NamedTuple):
 
     :param run: its run folder.
     :param agent: the zip that is passed on.
-    :param seconds: of training; where the stage was resumed, since then.
+    :param seconds: time of training; if the stage was resumed, since then.
     """
 
     run: str
@@ -129,7 +129,7 @@ class PipelineResult(NamedTuple):
 
     :param stages: the finished stages by name. After an interruption, some are missing and
         ``exit_code`` is not 0.
-    :param job: that of the first stage.
+    :param job: the job of the first stage.
     """
 
     folder: Path
@@ -139,7 +139,7 @@ class PipelineResult(NamedTuple):
 
 
 def is_pipeline(conf_file: StrPath) -> bool:
-    """Whether a settings file holds stages rather than the settings of one run."""
+    """Whether a settings file lists stages rather than the settings of one run."""
     return "stages" in SETTINGS.read(conf_file)[0]
 
 
@@ -156,7 +156,7 @@ def load_pipeline(conf_file: StrPath) -> Pipeline:
     pipeline = validate(Pipeline, *SETTINGS.read(conf_file))
     if not SETTINGS.is_packaged(conf_file):
         return pipeline
-    # The stages of a packaged pipeline have packaged settings, whatever lies in the user's folder.
+    # The stages of a packaged pipeline use packaged settings, whatever is in the user's folder.
     stages = []
     for stage in pipeline.stages:
         if stage.conf_file is not None:
@@ -167,7 +167,7 @@ def load_pipeline(conf_file: StrPath) -> Pipeline:
 
 
 def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
-    """Return the pipeline with ``changes`` put over the settings of every stage.
+    """Return the pipeline with ``changes`` applied to the settings of every stage.
 
     They are merged as by :func:`~sb3_quad.training.config.merged`.
     """
@@ -182,8 +182,8 @@ def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
 def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
     """Return what the options of ``train`` ask for: a pipeline, or the only stage of a single run.
 
-    :param options: those that were given, ``conf_file`` and those of ``KEPT_BY_STAGES`` among them.
-    :param changes: to the settings, of every stage.
+    :param options: the given options, including ``conf_file`` and those of ``KEPT_BY_STAGES``.
+    :param changes: changes to the settings of every stage.
     :raises ConfigError: an option that a pipeline's stages have themselves, or an agent that does
         not fit.
     """
@@ -201,7 +201,7 @@ def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
         return with_settings(load_pipeline(file), changes)
     algo = options.get("algo") or DEFAULT_ALGO
     env = options.get("env") or DEFAULT_ENV
-    # A file of settings takes precedence over those of the agent.
+    # A settings file takes precedence over the agent's settings.
     if file is None and "trained_agent" in options:
         changes = as_agent(agent_path(options["trained_agent"]), algo, env, changes)
     return Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes)
@@ -212,13 +212,13 @@ def run_pipeline(
 ) -> PipelineResult:
     """Train the stages one after the other, each from the agent that the one before passed on.
 
-    Their run folders lie where those of single runs lie.
+    Their run folders are where those of single runs are.
     ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them; beside it are the settings of each
     stage, ``stage_<number>.yml``.
 
     :param job: options of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq``
         and ``eval_episodes`` take precedence.
-    :param name: of the pipeline, for its folder.
+    :param name: name of the pipeline, for its folder.
     :raises ConfigError: settings that do not fit, named with their stage, before the first one
         starts.
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was
@@ -226,7 +226,7 @@ def run_pipeline(
     """
     jobs = stage_jobs(pipeline, job)
     folder = claim_folder(Path(jobs[0].log_folder) / name, name)
-    # The settings are written, too, since the files that hold them may change before a resume.
+    # The settings are written, too, since their files may change before a resume.
     stages = []
     for number, (stage, planned) in enumerate(zip(pipeline.stages, jobs, strict=True)):
         settings = f"stage_{number}.yml"
@@ -274,7 +274,7 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
 
 
 def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:
-    """Resume an interrupted or killed pipeline within its present stage, then train the others.
+    """Resume an interrupted or killed pipeline within its current stage, then train the others.
 
     :param changes: options of the jobs to change, as for
         :func:`~sb3_quad.training.trainer.resume`.
@@ -282,7 +282,8 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     """
     content, where = SETTINGS.read(folder / STATUS_FILE)
     status = validate(Status, content, where)
-    # The paths are found from any folder. Those of an older version begin in the one that trained.
+    # Make the paths valid in any folder. Those of an older version are relative to the folder of
+    # the training.
     log_folder = folder.absolute().parent.parent
     stages = []
     for stage in status.stages:
@@ -298,7 +299,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     agent = ""
 
     def note(number: int, run: RunFolder) -> None:
-        """Note a stage's run folder before its training begins."""
+        """Record a stage's run folder before its training begins."""
         runs[number:] = [run.path.absolute().relative_to(log_folder).as_posix()]
         _write_status(folder, {**content, "runs": runs})
 
@@ -314,7 +315,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                         stage.algo, stage.env, run.read_yaml()[0], str(run.config)
                     )
                     job = job.model_copy(update={"config": config})
-                # A callback may end a stage early. It had ended if the next one has a run.
+                # A callback may end a stage early. If the next stage has a run, this one had ended.
                 later = number + 1 < len(runs)
                 if run and (later or run.timesteps >= job.config.n_timesteps):
                     seconds = trained_seconds(run)
@@ -331,7 +332,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                         trained = train(job, report, on_start=partial(note, number))
                     run = trained.run
                     seconds = trained.seconds
-                # The signal that ended a training is noted here, too.
+                # ``signals`` also has the signal that ended a training.
                 if signals.received:
                     break
                 agent = str(_agent(stage, job, run, report))
@@ -349,9 +350,9 @@ def _write_status(folder: Path, content: StrDict) -> None:
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
-    """Return the zip that a stage passes on, after the offset correction where it has one.
+    """Return the zip that a stage passes on, after its offset correction, if any.
 
-    :raises TrainingError: it misses what the stage requires.
+    :raises TrainingError: it misses the requirement of the stage.
     """
     if stage.correct_offset and run.corrected_model.is_file():
         return run.corrected_model

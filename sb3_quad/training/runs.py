@@ -22,10 +22,10 @@ MADE_WITH = ("commit", "versions")  # keys of args.yml
 
 
 class RunFolder:
-    """The files of one run. Its checkpoints are further ones, ``rl_model_<N>_steps.zip``.
+    """The files of one run, besides its checkpoints, ``rl_model_<N>_steps.zip``.
 
     :param path: the folder.
-    :param name: the environment id, as file names take it.
+    :param name: the environment id, as part of file names.
     """
 
     def __init__(self, path: Path, name: str) -> None:
@@ -35,7 +35,7 @@ class RunFolder:
         self.model = path / f"{name}.zip"
         # The best model of the evaluations: by success, then by mean reward.
         self.best_model = path / BEST
-        # The model after the offset correction, where a pipeline does that.
+        # The model after the offset correction, if a pipeline does one.
         self.corrected_model = path / CORRECTED
         # Evaluations as SB3's EvalCallback writes them.
         self.evaluations = path / "evaluations.npz"
@@ -47,14 +47,14 @@ class RunFolder:
         self.error = path / "error.txt"
         # The settings.
         self.config = path / name / "config.yml"
-        # The options; env_kwargs there are those of the evaluations.
+        # The options; its env_kwargs are those of the evaluations.
         self.arguments = path / name / "args.yml"
         # The command that was typed.
         self.command = path / name / "command.txt"
 
     @property
     def result(self) -> Path:
-        """The run's agent: the corrected one, else the best one, else the last one."""
+        """The run's agent: the corrected model, or else the best one, or else the last one."""
         return run_agent(self.path, self.name)
 
     @property
@@ -74,7 +74,7 @@ class RunFolder:
         return self.path / f"rl_model_{timesteps}_steps.zip"
 
     def latest_checkpoint(self) -> Path:
-        """Return the path of the checkpoint after most timesteps.
+        """Return the path of the latest checkpoint.
 
         :raises ConfigError: the run has no checkpoint.
         """
@@ -88,19 +88,19 @@ class RunFolder:
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
 
-        args.yml comes last, so that a run that has it lacks nothing.
+        args.yml comes last, so that a run with it is complete.
         """
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
         command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-        # A program of the user's may train, too.
+        # A user's program may train, too.
         if not command.startswith("sb3-quad"):
             command = f"python {command}".replace("python __main__.py", "sb3-quad")
         write_text(self.command, f"{command}\n")
         write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
 
     def read_yaml(self) -> tuple[StrDict, StrDict]:
-        """Read config.yml and args.yml, also those of rl_zoo3.
+        """Read config.yml and args.yml, including those of rl_zoo3.
 
         :raises ConfigError: either is missing, unreadable or not a mapping.
         """
@@ -110,7 +110,7 @@ class RunFolder:
 def made_with() -> StrDict:
     """Return the commit of the checkout and the versions of the packages that train a run.
 
-    The commit has a mark where files differ from it.
+    The commit is marked if files differ from it.
     """
     try:
         commit = subprocess.check_output(
@@ -154,11 +154,12 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     """
     make_folder(parent, "log folder", "-f")
     folders = _numbered(parent, name)
-    # A run that was killed before it had settings is nobody's. Another may be about to have some.
+    # A run that was killed before it had settings is abandoned, but another may be about to get
+    # some.
     for folder in folders.values():
         if not any(folder.glob("*/args.yml")):
             remove_half_written(folder, seconds=3.0)
-    # Numbers of removed runs before the last one are not used again.
+    # Numbers of removed runs before the last one are not reused.
     number = max(folders, default=0) + 1
     while True:
         path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")

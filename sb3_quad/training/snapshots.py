@@ -1,4 +1,4 @@
-"""Snapshots of a run: one file that holds all it needs to resume, and is replaced as a whole."""
+"""Snapshots of a run: one file with everything that it needs to resume, replaced as a whole."""
 
 import io
 import json
@@ -45,14 +45,14 @@ PAUSE = 1.0
 class SnapshotFile(BaseCallback):
     """Takes a snapshot whenever a rollout starts, and writes some of them to the file.
 
-    That is the first one, then one in so many seconds. Where writing takes long, as it does for a
-    large dataset on a slow disk, fewer are written.
+    It writes the first one, then one every few seconds. If writing takes long, such as with a large
+    dataset on a slow disk, it writes fewer.
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
     :param report: called with one line if a snapshot cannot be written; the training continues.
-    :param signals: one that was received ends the training where the snapshot can be completed.
-    :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from
-        before that update.
+    :param signals: a received signal ends the training as soon as the snapshot can be completed.
+    :raises TrainingError: parameters that are no longer finite; the snapshot is then from before
+        that update.
     """
 
     def __init__(self, run: RunFolder, every: float, report: Report, signals: StopSignals) -> None:
@@ -79,8 +79,8 @@ class SnapshotFile(BaseCallback):
     def _on_step(self) -> bool:
         if not self._signals.received:
             return True
-        # In its first step after the snapshot, a replay buffer holds nothing more that would be
-        # lost. Until then, the training continues.
+        # In the first step after a snapshot, a replay buffer has nothing yet that would be lost.
+        # Until then, the training continues.
         first_step = self._state["timesteps"] + self.training_env.num_envs
         return isinstance(self.model, OffPolicyAlgorithm) and self.num_timesteps != first_step
 
@@ -98,9 +98,9 @@ class SnapshotFile(BaseCallback):
         self._next_taken = start + PAUSE
         model = io.BytesIO()
         self.model.save(model)
-        # The stores' rows are read when the snapshot is written. A rollout later they hold more,
-        # and the oldest of a full store are replaced; the resumed training adds the same rows again
-        # before it reads any.
+        # The rows of the stores are read when the snapshot is written. A rollout later there are
+        # more, and the oldest of a full store are replaced; the resumed training adds the same rows
+        # again before it reads any.
         self._state = {
             **_surroundings(self.training_env, self.model),
             "timesteps": np.array(self.model.num_timesteps),
@@ -120,7 +120,7 @@ class SnapshotFile(BaseCallback):
             self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
 
     def write(self) -> None:
-        """Write the latest snapshot; until that is whole, the file holds the one before.
+        """Write the latest snapshot; until it is complete, the file keeps the one before.
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
@@ -130,7 +130,7 @@ class SnapshotFile(BaseCallback):
         write_arrays(self._run.resume_state, **arrays)
 
     def save_model(self) -> str:
-        """Write the model of the latest snapshot, and return where it is; empty without one."""
+        """Write the model of the latest snapshot, and return its place; empty without one."""
         if not self._state:
             return ""
         write_bytes(self._run.model, self._state["model"].tobytes())
@@ -142,9 +142,9 @@ def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: A
 
     The run's files are rolled back to the snapshot.
 
-    :param attributes: given to ``load``: what neither the zip nor the job holds, such as
+    :param attributes: passed to ``load``: what is in neither the zip nor the job, such as
         ``expert``.
-    :raises ConfigError: a file that is missing or damaged, or of other settings; then nothing has
+    :raises ConfigError: a file that is missing or damaged, or has other settings; then nothing has
         been rolled back.
     """
     path = run.resume_state
@@ -165,7 +165,7 @@ def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: A
 def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) -> Any:
     """Return the model of a snapshot, with its stores, environments and random numbers."""
     batch = _batch(env)
-    # The model comes first: what else is expected depends on it.
+    # The model comes first, since the other expected arrays depend on it.
     _check(state, {"model": NO_BYTES})
     model: Any = load_zip(
         job.config.algorithm,
@@ -192,9 +192,8 @@ def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) 
     if batch is not None:
         batch.restore(environment)
     else:
-        _require(not environment, f"{ENVIRONMENT}… is of environments of another kind")
-    # The random numbers come last, since loading may sample.
-    # A damaged text may raise anything.
+        _require(not environment, f"{ENVIRONMENT}… belongs to environments of another kind")
+    # The random numbers come last, since loading may sample. Damaged text may raise anything.
     with raised_as(ConfigError, "log, random or torch cannot be read"):
         LOG.validate_json(str(state["log"]))
         set_random_state(state)
@@ -202,8 +201,8 @@ def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) 
 
 
 def _surroundings(env: VecEnv, model: Any) -> Arrays:
-    """Return random numbers, environments and fill counters of the stores, and places for the log
-    and the files.
+    """Return random states, environments and fill counters of the stores, and placeholders for the
+    log and the files.
     """
     state = {
         **random_state(),
@@ -249,10 +248,10 @@ def _misfit(path: Path, problem: object) -> ConfigError:
 
 
 def _batch(env: VecEnv) -> Any:
-    """Return the batch of the batched environment, which can be restored; None for others, and
-    behind wrappers.
+    """Return the batch of the batched environment, which can be restored; None for others, and for
+    wrapped ones.
     """
-    # Wrappers have a state of their own, which begins with the episodes.
+    # Wrappers have their own state, which begins with the episodes.
     return None if env is not env.unwrapped else getattr(env, "batch", None)
 
 
@@ -264,13 +263,13 @@ def _stores(model: Any) -> StrDict:
 
 
 def _filled(name: str, store: Any) -> Arrays:
-    """Return views of the rows that a dataset or a replay buffer holds, by name."""
+    """Return views of the filled rows of a dataset or a replay buffer, by name."""
     if not isinstance(store, ReplayBuffer):
         arrays = store.filled
     elif isinstance(store.observations, dict):
         raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
     else:
-        # The memory-efficient variant keeps the last next observation one row further on.
+        # The memory-efficient variant keeps the last next observation in one more row.
         rows = store.size() + 1
         arrays = {
             key: array[:rows] for key, array in vars(store).items() if isinstance(array, np.ndarray)
@@ -288,7 +287,7 @@ def _fill(name: str, store: Any, state: Arrays) -> None:
         )
         setattr(store, counter, value)
     for key, rows in _filled(name, store).items():
-        # What was written later than the counters may hold more rows.
+        # Arrays that were written after the counters may have more rows.
         if key in state and state[key].ndim:
             state[key] = state[key][: len(rows)]
         _check(state, {key: rows})
@@ -305,10 +304,10 @@ def _roll_back(run: RunFolder, state: Arrays) -> None:
             earlier = {name: array[is_earlier] for name, array in rows.items()}
         except (KeyError, IndexError, TypeError):
             raise _misfit(path, "holds no evaluations") from None
-        # A file that lacks nothing needs no room on the disk.
+        # A file that stays as it is needs no space on the disk.
         if not is_earlier.all():
             kept[path] = earlier
-    # Only when all files are known to be good is any of them changed.
+    # Change files only when all are known to be good.
     for path, rows in kept.items():
         if rows["timesteps"].size:
             write_arrays(path, **rows)
@@ -325,7 +324,7 @@ def _roll_back(run: RunFolder, state: Arrays) -> None:
 def log_state(logger: Logger) -> Any:
     """Return what was recorded since the logger's last dump, as JSON.
 
-    That is the losses of the latest update, for example.
+    These are the losses of the latest update, for example.
     """
     records = {}
     for name, value in logger.name_to_value.items():

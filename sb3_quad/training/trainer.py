@@ -1,8 +1,8 @@
 """Runs a training job: from its settings to a run folder with a model.
 
-A run that a signal or an error ends leaves a model and a snapshot, which lies between two rollouts.
-Where the environments can be restored (the batched one can), the resumed run is bit for bit the one
-that was not interrupted; elsewhere the episodes start again.
+A run that a signal or an error ends leaves a model and a snapshot, taken between two rollouts. If
+the environments can be restored (the batched one can), the resumed run equals an uninterrupted one
+bit for bit; otherwise the episodes start again.
 """
 
 import copy
@@ -49,7 +49,7 @@ NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckAc
 NEVER = 2**62  # timesteps
 # TensorBoard shows these next to the settings, under HPARAMS.
 METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")
-OWN_TASK = ""  # the name of the evaluations on the task of the training
+OWN_TASK = ""  # the name of evaluations on the task of the training
 
 
 class TrainingResult(NamedTuple):
@@ -100,19 +100,19 @@ def train(
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
     """Continue an interrupted or killed run in its folder.
 
-    Settings, seed, optimiser, dataset and step count stay the same. A run that has not come to its
-    first rollout is started; a complete one gives its result.
+    Settings, seed, optimiser, dataset and step count stay the same. A run that has not reached its
+    first rollout is started; a complete one returns its result.
 
     :param changes: options of the job to change, such as ``progress``.
     :raises SB3QuadError: a folder without such a run, one that another process trains, or with
-        damaged files; else as :func:`train`.
+        damaged files; otherwise as :func:`train`.
     """
     run = open_run(run_folder)
     settings, options = run.read_yaml()
     if not {"algo", "env"} <= options.keys():
         raise ConfigError(f"{run.arguments}: algo or env is missing")
     config = build_config(str(options["algo"]), str(options["env"]), settings, str(run.config))
-    # These are in args.yml for its readers; they are not options.
+    # These are in args.yml for readers only; they are not options.
     for name in ("algo", "env", "env_kwargs", *MADE_WITH):
         options.pop(name, None)
     options |= {**changes, "config": config}
@@ -141,10 +141,10 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
 
 @contextmanager
 def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]]:
-    """Make the environments to train in and those to evaluate in, and close them in the end.
+    """Make the environments to train in and those to evaluate in, and close them at the end.
 
-    The latter are by task, with the job's own under OWN_TASK; without evaluations, there are only
-    the former.
+    The latter are a mapping by task, with the job's own under OWN_TASK; it is empty without
+    evaluations.
     """
     config = job.config
     eval_envs = {}
@@ -167,7 +167,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str, VecEnv]]
 
 
 def _expert(config: TrainingConfig) -> StrDict:
-    """Return the expert as a keyword of the algorithm; empty for one that learns from none."""
+    """Return the expert as a keyword of the algorithm; empty if it learns from none."""
     return {} if config.expert is None else {"expert": config.make_expert()}
 
 
@@ -178,9 +178,9 @@ def _user_callbacks(config: TrainingConfig) -> list[BaseCallback]:
 def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     """Make the algorithm of a job, with the policy that it starts from.
 
-    :raises ConfigError: settings that it refuses, or for which this machine has too little memory;
-        an agent that does not fit.
-    :raises ExpertError: an expert that fails when it is asked for the first time.
+    :raises ConfigError: settings that the algorithm refuses, or for which this machine has too
+        little memory; an agent that does not fit.
+    :raises ExpertError: an expert that fails at its first query.
     """
     config = job.config
     keywords = copy.deepcopy(config.hyperparams) | _expert(config)
@@ -191,7 +191,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
     model = _construct(config, env, keywords)
-    # An expert that fails does so before there is a run folder.
+    # Query the expert once, so that it fails before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
         Controller.for_env(keywords.get("expert"), env).labels(env.reset())
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
@@ -207,7 +207,8 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
 
 
 def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAlgorithm:
-    """Call the algorithm's constructor; errors that do not concern its arguments stay as they are.
+    """Call the algorithm's constructor; errors that do not concern its arguments are left as they
+    are.
 
     :raises ConfigError: arguments that it refuses, or too little memory.
     """
@@ -216,12 +217,12 @@ def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAl
     except SB3QuadError:
         raise
     except (ValueError, AssertionError) as error:
-        # SB3 refuses values of arguments by these.
+        # SB3 raises these for invalid arguments.
         raise ConfigError(
             f"{config.algo} cannot be made with these settings ({one_line(error)})"
         ) from error
     except (MemoryError, RuntimeError) as error:
-        # PyTorch has a plain RuntimeError for want of memory.
+        # PyTorch raises a plain RuntimeError when memory is short.
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise
         raise ConfigError(
@@ -232,10 +233,10 @@ def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAl
 
 @dataclass
 class _Training:
-    """The training of a model in a run folder: what watches it, and how it ends.
+    """The training of a model in a run folder, with its callbacks and its end.
 
-    :param eval_envs: by task, the job's own under OWN_TASK; empty: no evaluations.
-    :param user_callbacks: those of the settings.
+    :param eval_envs: environments by task, the job's own under OWN_TASK; empty: no evaluations.
+    :param user_callbacks: the callbacks in the settings.
     """
 
     job: TrainingJob
@@ -302,7 +303,7 @@ class _Training:
         if self.signals.received:
             self._save_interrupted()
         else:
-            # Those at the end, where rl_zoo3 has them.
+            # The final statistics, where rl_zoo3 keeps them.
             if statistics is not None:
                 write_bytes(self.run.config.with_name("vecnormalize.pkl"), pickle.dumps(statistics))
             save_model(self.model, self.run.model)
@@ -313,7 +314,7 @@ class _Training:
     def _learn(self) -> None:
         config = self.job.config
         log_interval = self.job.log_interval
-        # An off-policy algorithm counts episodes here; n_envs of them end at about the same time.
+        # An off-policy algorithm counts episodes here, n_envs of which end at about the same time.
         if config.is_off_policy:
             log_interval *= config.n_envs
         self.model.learn(
@@ -332,7 +333,7 @@ class _Training:
 
     def _save_interrupted(self) -> None:
         """Save the model and the snapshot after a signal."""
-        # The model comes first, since it needs the least room.
+        # The model comes first, since it needs the least space.
         where = self.snapshots.save_model()
         if where:
             try:
@@ -346,7 +347,7 @@ class _Training:
     def _refuse_removed_folder(self) -> None:
         """:raises TrainingError: the run folder was removed while it was trained.
 
-        It has been made again for the model alone.
+        It has been recreated for the model only.
         """
         if not self.run.arguments.is_file():
             raise TrainingError(
@@ -356,18 +357,18 @@ class _Training:
             )
 
     def _save_after(self, error: BaseException) -> None:
-        """Save the last good model, and the traceback of an error that was not expected.
+        """Save the last good model, and the traceback of an unexpected error.
 
-        An error that has an explanation is raised again; the message says where they are.
+        An error with an explanation is raised again; its message says where these are.
         """
         where = self.snapshots.save_model()
-        # An error of this package says what is wrong; the place in the code adds nothing.
+        # An error of this package says what is wrong; a traceback would add nothing.
         if isinstance(error, SB3QuadError):
             raise type(error)(f"{error}{where}") from error
         write_text(self.run.error, "".join(traceback.format_exception(error)))
         where += f"; the traceback is in {self.run.error}"
         if isinstance(error, (EOFError, ConnectionError)):
-            # Without workers it may be the reader of the output, as in `sb3-quad train | head`.
+            # Without workers, it may be the reader of the output, as in `sb3-quad train | head`.
             reason = "a connection, or the reader of the output, has ended"
             if self.job.config.vec_env == "subproc":
                 reason = WORKER_ENDED
@@ -377,7 +378,7 @@ class _Training:
             raise TrainingError(
                 f"the policy's parameters are no longer finite; lower learning_rate{where}"
             ) from error
-        # The command line prints the notes of an error that no check foresaw.
+        # The command line prints the notes of an error that no check anticipated.
         error.__notes__ = [*getattr(error, "__notes__", ()), where.removeprefix("; ")]
 
 
@@ -401,7 +402,7 @@ class HyperparameterLog(BaseCallback):
         }
 
     def _on_training_start(self) -> None:
-        # TensorBoard takes plain values alone.
+        # TensorBoard accepts only plain values.
         shown = {
             name: value if isinstance(value, (bool, int, float)) else str(value)
             for name, value in self._shown.items()
@@ -420,7 +421,7 @@ class HyperparameterLog(BaseCallback):
 def tracked(job: TrainingJob) -> Iterator[None]:
     """Track the block in a run of Weights & Biases, if the job asks for it.
 
-    The run is made as rl_zoo3 makes it, and shows what TensorBoard is given.
+    The run is created as in rl_zoo3, and shows TensorBoard's logs.
 
     :raises ConfigError: it cannot begin, for example without a login.
     """

@@ -1,9 +1,10 @@
-"""The search for hyperparameters: trials, each a training of its own, in a study of Optuna that may
-be shared and resumed.
+"""The search for hyperparameters: trials, each a separate training, in an Optuna study that may be
+shared and resumed.
 
 Optuna's heartbeats and its retries of stale trials need a database and ``study.optimize``, and its
-samplers are seeded once for a process. A study here may be a journal file, on any system, and
-repeats by its seed however often it was interrupted; so retries and seeds of trials are our own.
+samplers are seeded once per process. A study here may be a journal file, on any system, and is
+reproducible by its seed however often it was interrupted, so retries and seeds of trials are
+implemented here.
 """
 
 import json
@@ -36,19 +37,19 @@ from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
 
 Factories = dict[str, Callable[..., Any]]
-# From n_startup_trials and a seed.
+# Factories with the arguments n_startup_trials and seed
 SAMPLERS: Factories = {
     "tpe": partial(TPESampler, multivariate=True, constant_liar=True),
     "random": lambda n_startup_trials, seed: RandomSampler(seed),
     "cmaes": partial(CmaEsSampler, warn_independent_sampling=False),
 }
-# From n_startup_trials and n_evaluations.
+# Factories with the arguments n_startup_trials and n_evaluations
 PRUNERS: Factories = {
     "median": lambda n, evaluations: MedianPruner(n, n_warmup_steps=evaluations // 3),
     "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
     "none": lambda n, evaluations: NopPruner(),
 }
-# The states of trials that ended, in words.
+# The states of ended trials, in words
 STATES = {
     TrialState.COMPLETE: "finished",
     TrialState.PRUNED: "pruned",
@@ -57,7 +58,7 @@ STATES = {
 BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials share
 # User attributes of a trial. The owner is the machine and the process that trains it.
 OWNER = "owner"
-# The rate that decides, which is that of survival where best_by says so.
+# The rate that decides, which is that of survival if best_by says so
 RATE = "success_rate"
 REWARD = "mean_reward"
 RUN = "run"
@@ -70,22 +71,21 @@ AGAIN = {"again": True}  # user attributes of the trials that do so
 class Search:
     """Trains with one choice of settings after the other.
 
-    Trials are judged as the best model of a run is: by the share of successful episodes of the
+    Trials are judged like the best model of a run: by the share of successful episodes of the
     deterministic policy, and among equals by the mean reward; see :func:`score`. The episodes and
-    the seed of the training are the same for all trials. The first trial has the settings as they
-    are.
+    the seed of the training are the same for all trials. The first trial uses the given settings.
 
-    :param job: what every trial does, but for the settings that are varied; its run folders go to
-        its ``log_folder``.
-    :param name: of the study, within its storage.
-    :param storage: a database's URL (with ``://``), or else the path of a journal file. A study
-        that it holds is continued.
+    :param job: the job of every trial, except for the varied settings; run folders go to its
+        ``log_folder``.
+    :param name: name of the study within its storage.
+    :param storage: a database's URL (with ``://``), or else the path of a journal file. An existing
+        study in it is continued.
     :param sampler: one of :data:`SAMPLERS`; ``pruner`` one of :data:`PRUNERS`.
-    :param n_startup_trials: sampled at random before the sampler begins, and finished before the
-        median pruner does.
-    :param n_evaluations: of each trial, the last at its end.
-    :raises ConfigError: an option that there is not; a storage that cannot be used, or that holds a
-        study of this name of another kind.
+    :param n_startup_trials: trials sampled at random before the sampler begins, and finished before
+        the median pruner does.
+    :param n_evaluations: evaluations of each trial, the last one at its end.
+    :raises ConfigError: an unknown option; a storage that cannot be used, or with a study of this
+        name of another kind.
     """
 
     job: TrainingJob
@@ -100,19 +100,19 @@ class Search:
     def __post_init__(self) -> None:
         refuse_unknown("sampler", [self.sampler], SAMPLERS)
         refuse_unknown("pruner", [self.pruner], PRUNERS)
-        # Only trials of one kind compare. This is the kind, as a storage gives it back.
+        # Only trials of the same kind are comparable. This is the kind, as a storage returns it.
         wanted = json.loads(json.dumps(self._shared(), default=str))
         self.study = open_study(self.name, self.storage)
         if BEGUN_WITH not in self.study.user_attrs and not self.study.trials:
             self.study.set_user_attr(BEGUN_WITH, wanted)
-            # The first trial has the settings as they are, if the space holds them.
+            # The first trial uses the given settings, if the space includes them.
             first = self.space.start()
             if first is not None:
                 self.study.enqueue_trial(first)
         known = self.study.user_attrs.get(BEGUN_WITH)
         where = f"study {self.name} in {self.storage}"
         if known is None:
-            raise ConfigError(f"{where}: is not of tune; give another --study-name")
+            raise ConfigError(f"{where}: was not made by tune; give another --study-name")
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
         if differing:
             raise ConfigError(
@@ -126,13 +126,13 @@ class Search:
     def try_one(self, most: int | None) -> FrozenTrial | None:
         """Train once.
 
-        :param most: trials of the study, those of other processes and earlier sessions included,
-            failed ones not.
-        :return: the trial that ended; None: the study has as many as it may.
+        :param most: maximum number of trials in the study, including those of other processes and
+            earlier sessions, but not failed ones.
+        :return: the trial that ended; None: the study has reached the maximum.
         :raises ConfigError: a storage that fails meanwhile.
         """
         try:
-            # A trial that another process left behind counts no longer, but is tried again.
+            # A trial that another process left behind no longer counts, but is tried again.
             retry_dead_trials(self.study)
             counted = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
             if most is not None and len(self.trials(counted)) >= most:
@@ -144,7 +144,7 @@ class Search:
             raise ConfigError(f"storage {self.storage}: fails ({kind_and_line(error)})") from error
 
     def trials(self, states: Container[TrialState] = STATES) -> list[FrozenTrial]:
-        """The trials in these states; all that ended by default."""
+        """The trials in these states; by default, all that ended."""
         return self.study.get_trials(deepcopy=False, states=states)
 
     @property
@@ -167,12 +167,12 @@ class Search:
         )
 
     def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
-        """Train as a trial says; return its value and state. Whatever happens to a choice of
-        settings, the next one may fare better.
+        """Train with a trial's settings; return its value and state. Whatever happens with one
+        choice of settings, the next one may do better.
         """
         try:
             value = self._value(trial)
-        # Also what a user's callback or environment raises.
+        # This includes errors of a user's callback or environment.
         except (Exception, SystemExit) as error:
             trial.set_user_attr(ERROR, kind_and_line(error))
             return None, TrialState.FAIL
@@ -183,7 +183,9 @@ class Search:
         return value, TrialState.PRUNED if value is None else TrialState.COMPLETE
 
     def _value(self, trial: optuna.Trial) -> float | None:
-        """Train as a trial says; return the value of its last evaluation, None if it was pruned."""
+        """Train with a trial's settings; return the value of its last evaluation, None if it was
+        pruned.
+        """
         config = self.config(trial)
         # A training ends with a whole rollout.
         total = math.ceil(config.n_timesteps / config.rollout) * config.rollout
@@ -206,7 +208,7 @@ class Search:
             on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
             should_continue=should_continue,
         )
-        # The training ends early by a signal, or because the pruner stopped it.
+        # The training ends early after a signal, or because the pruner stopped it.
         if result.exit_code != 0:
             raise KeyboardInterrupt
         if result.model.num_timesteps < total:
@@ -216,9 +218,9 @@ class Search:
         return values[-1]
 
     def _shared(self) -> StrDict:
-        """Return all that the trials of a study must share to be compared."""
+        """Return everything that the trials of a study must share to be compared."""
         job = self.job
-        # The agent counts by its content, since its file may move.
+        # The agent is identified by its content, since its file may move.
         agent = None
         if job.trained_agent is not None:
             agent = controller_record(ControllerSpec("agent", job.trained_agent)).content
@@ -236,11 +238,11 @@ class Search:
 
 @dataclass
 class NumberedSampler(BaseSampler):
-    """One of :data:`SAMPLERS`, made again for each trial, from a seed, the known trials and its
-    number, retries not counted.
+    """One of :data:`SAMPLERS`, made anew for each trial from a seed, the known trials and its
+    number, not counting retries.
 
-    So processes that share a study propose different trials, and a study that is resumed continues
-    as if it had never been interrupted.
+    Thus processes that share a study propose different trials, and a resumed study continues as if
+    it had never been interrupted.
     """
 
     kind: str
@@ -248,7 +250,7 @@ class NumberedSampler(BaseSampler):
     n_startup_trials: int
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> Any:
-        # A retry has the parameters of an earlier trial, and no number of its own.
+        # A retry has the parameters of an earlier trial, and does not count.
         number = sum(
             "again" not in earlier.user_attrs
             for earlier in study.get_trials(deepcopy=False)[: trial.number]
@@ -265,7 +267,7 @@ class NumberedSampler(BaseSampler):
 
 
 def open_study(name: str, storage: StrPath) -> optuna.Study:
-    """Return the study of this name, which the storage may hold already.
+    """Return the study of this name, which may already be in the storage.
 
     :raises ConfigError: cmaes is missing; a storage that cannot be used, such as a file that is not
         a journal.
@@ -276,7 +278,7 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
         if "://" not in backend:
             path = Path(storage)
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Optuna would ignore a cut line, and append the next one to it.
+            # Optuna would ignore an incomplete line, and append the next one to it.
             if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):
                 raise ValueError(
                     "the last line is cut, as by a full disk, or it is no journal; remove that line"
@@ -289,7 +291,7 @@ def open_study(name: str, storage: StrPath) -> optuna.Study:
 
 
 def retry_dead_trials(study: optuna.Study) -> None:
-    """Enqueue the trials again whose process on this machine is gone."""
+    """Enqueue again the trials whose process on this machine is gone."""
     for trial in study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
         machine, process = trial.user_attrs.get(OWNER, ["", 0])
         if machine == platform.node() and has_ended(process):
@@ -298,13 +300,13 @@ def retry_dead_trials(study: optuna.Study) -> None:
 
 
 def score(success: float, reward: float, n_episodes: int) -> float:
-    """Return success and reward as one number: any more successful episodes outweigh any reward,
-    which decides between equals.
+    """Return success and reward as one number: more successful episodes outweigh any reward, which
+    decides between equals.
 
     ``success + s(reward) / n_episodes`` with s(x) = (1 + x / (1 + |x|)) / 2, which rises from 0 to
     1.
 
     :param success: share of ``n_episodes`` episodes.
-    :param reward: mean per episode.
+    :param reward: mean reward per episode.
     """
     return success + (1.0 + reward / (1.0 + abs(reward))) / (2 * n_episodes)

@@ -2,9 +2,9 @@
 lists them.
 
 Keys are those of the settings. ``policy_kwargs.net_arch`` is an entry of a mapping, and
-``n_minibatches`` stands for the ``batch_size`` that divides a rollout into so many. Where the
+``n_minibatches`` stands for the ``batch_size`` that divides a rollout into this many. If the
 settings have ``lin_x``, the x is varied. A setting for which only whole numbers are valid gets
-whole numbers, others get four significant digits.
+whole numbers; others get four significant digits.
 """
 
 import json
@@ -52,7 +52,7 @@ class WholeInterval(Interval):
 
 
 class Factor(Frozen):
-    """A number around that of the settings, at most so many times as large or small."""
+    """A number around that of the settings, at most this many times larger or smaller."""
 
     around: float = Field(gt=1)
 
@@ -62,7 +62,7 @@ class SearchSpace(NamedTuple):
 
     :param config: the settings that a search starts from.
     :param dimensions: the distributions that Optuna samples from. Values of lists that are not
-        plain ones are there as JSON.
+        plain appear as JSON.
     """
 
     config: TrainingConfig
@@ -82,7 +82,7 @@ class SearchSpace(NamedTuple):
         return values
 
     def settings(self, parameters: StrMapping) -> StrDict:
-        """Return all settings of a trial with these parameters, as YAML holds them."""
+        """Return all settings of a trial with these parameters, as in YAML."""
         changed = dict(self.config.settings)
         for name, value in self.values(parameters).items():
             outer, _, inner = name.partition(".")
@@ -92,17 +92,17 @@ class SearchSpace(NamedTuple):
                 self._pin(changed, inner)
             changed[outer] = value
         if MINIBATCHES in changed:
-            # All of the same size, but for the last, which may be smaller.
+            # All have the same size, except that the last may be smaller.
             count = changed.pop(MINIBATCHES)
             config = build_config(self.config.algo, self.config.env_id, changed)
             changed["batch_size"] = math.ceil(config.rollout / count)
         return changed
 
     def _pin(self, settings: StrDict, name: str) -> None:
-        """Keep a varied keyword of the environment as it is in evaluations, so that all trials are
-        evaluated on the same episodes.
+        """Keep the original value of a varied environment keyword in evaluations, so that all
+        trials are evaluated on the same episodes.
 
-        What an agent's observations and rotors depend on stays as in its training.
+        Keywords that an agent's observations and rotors depend on stay as in its training.
         """
         base = _entries(self.config.settings.get("env_kwargs"))
         if self.config.task:
@@ -112,8 +112,8 @@ class SearchSpace(NamedTuple):
             settings["eval_env_kwargs"] = {name: base[name], **evaluated}
 
     def start(self) -> StrDict | None:
-        """Return the parameters that stand for the settings as they are; None if one of these lies
-        outside the space.
+        """Return the parameters that stand for the given settings; None if one of these is outside
+        the space.
         """
         start = {}
         for name, dimension in self.dimensions.items():
@@ -123,7 +123,7 @@ class SearchSpace(NamedTuple):
             else:
                 start[name] = _number_of(value)
         try:
-            # Optuna checks that the list holds the value, or that the range includes it.
+            # Optuna checks that the list or the range includes the value.
             create_trial(value=0.0, params=start, distributions=self.dimensions)
         except ValueError:
             return None
@@ -134,7 +134,7 @@ def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchS
     """Load the space of a search around some settings.
 
     :param source: a YAML file; None: the package's own for the algorithm.
-    :raises ConfigError: an unreadable file, an unknown setting, bounds that are not any.
+    :raises ConfigError: an unreadable file, an unknown setting, invalid bounds.
     """
     content, where = SPACES.read(source or config.algo)
     if not content:
@@ -147,7 +147,7 @@ def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchS
         valid.append(MINIBATCHES)
     dimensions = {}
     for name, values in content.items():
-        # Of mappings, any entry may vary.
+        # Any entry of a mapping may vary.
         outer, _, inner = str(name).partition(".")
         if name not in valid and not (inner and outer in MAPPINGS):
             raise ConfigError(f"{where}: {unknown(f'setting of {config.algo}', name, valid)}")
@@ -158,8 +158,8 @@ def load_space(config: TrainingConfig, source: StrPath | None = None) -> SearchS
 
 
 def _current(config: TrainingConfig, name: str) -> Any:
-    """Return the value that some settings have under a name of a search space, or else the
-    algorithm's default.
+    """Return the value of some settings under a name of a search space, or else the algorithm's
+    default.
     """
     outer, _, inner = name.partition(".")
     # An entry of a mapping, such as policy_kwargs.net_arch.
@@ -205,20 +205,20 @@ def _dimension(config: TrainingConfig, name: str, values: Any, where: str) -> Ba
 
 
 def _entries(value: Any) -> StrDict:
-    """Return a mapping of the settings with its values as written, also one like ``dict(…)``."""
+    """Return a mapping of the settings with its values as written, even one like ``dict(…)``."""
     if isinstance(value, str):
         value = parse_value(value)
     return value or {}
 
 
 def _label(value: Any) -> Any:
-    """Return a value of a list as Optuna holds it: a plain one as it is, others as JSON."""
+    """Return a value of a list as Optuna stores it: a plain one unchanged, others as JSON."""
     if isinstance(value, (list, dict)):
         return json.dumps(value)
     return value
 
 
 def _number_of(value: Any) -> float | None:
-    """Return a number, also that of ``lin_x``; None for anything else."""
+    """Return a number, including that of ``lin_x``; None for anything else."""
     number = parse_number(str(value).removeprefix(LINEAR))
     return None if isinstance(number, str) else number

@@ -1,4 +1,4 @@
-"""The gains of the geometric expert as a vehicle's YAML holds them."""
+"""The gains of the geometric expert, as in a vehicle's YAML."""
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -28,7 +28,7 @@ class GeometricGains(Frozen):
     descent: PositiveFloat
     """greatest desired acceleration downwards, below g, m/s²"""
     tilt: PositiveFloat
-    """tangent of the tilt at which the greatest desired force holds the height"""
+    """tangent of the tilt at which the greatest desired force keeps the height"""
     attitude: PositiveFloat
     """desired body rate per small angle of thrust direction error, 1/s"""
     angular_deceleration: PositiveFloat
@@ -37,7 +37,7 @@ class GeometricGains(Frozen):
     """angular acceleration per error of roll and pitch rate, 1/s"""
     yaw_rate: PositiveFloat
     """angular deceleration per yaw rate, 1/s"""
-    # Less than from below, so that an agent that imitates it imprecisely does not overshoot.
+    # Less than from below, so that an agent that imitates it inexactly does not overshoot.
     descent_deceleration: PositiveFloat
     """vertical deceleration planned from above, m/s²"""
     measured: StrDict | None = None

@@ -14,9 +14,9 @@ from sb3_quad.base.validate import Frozen
 if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import Vehicle
 
-# Rotors in the same place may differ by this angle, seen from the middle of the rotors.
+# Rotors count as in the same place up to this angle, seen from the middle of the rotors.
 TOLERANCE = math.radians(20.0)
-# Angles that differ by less are equal, since published positions are rounded.
+# Angles that differ by less count as equal, since published positions are rounded.
 _SLACK = math.radians(1.0)
 _EIGHTH = math.pi / 4
 # Signs of x and y
@@ -30,7 +30,7 @@ ORDERS = {
     "ardupilot": (FRONT_RIGHT, REAR_LEFT, FRONT_LEFT, REAR_RIGHT),
     "crazyflie": (FRONT_RIGHT, REAR_RIGHT, REAR_LEFT, FRONT_LEFT),
 }
-"""Where a flight stack has its motors 1 to 4 of an X; sources in docs/vehicles.md."""
+"""Places of motors 1 to 4 of an X by flight stack; sources in docs/vehicles.md."""
 
 
 class NamedLayout(Frozen):
@@ -43,7 +43,9 @@ class NamedLayout(Frozen):
     arm_length: PositiveFloat
     """from the middle of the rotors to each, m"""
     arm_angle: Annotated[float, Field(gt=0.0, lt=90.0)] = 45.0
-    """from forward to the front arms, degrees; above 45 the rotors are wider apart than long"""
+    """from forward to the front arms, degrees; above 45 the rotors are farther apart in width than
+    in length
+    """
     center_of_mass: tuple[float, float] = (0.0, 0.0)
     """x and y of the centre of mass from the middle of the rotors, m: [-0.01, 0] is behind it"""
 
@@ -84,8 +86,8 @@ class Turn(NamedTuple):
 def find_turn(own: "Vehicle", other: "Vehicle") -> Turn:
     """Return the turn that brings the rotors of a vehicle to where those of another are.
 
-    Each comes to one with the same sign of its yaw moment. Of turns that fit equally well it is the
-    smallest.
+    Each rotor comes to one with the same sign of its yaw moment. Among turns that fit equally well,
+    this is the smallest.
 
     :raises ConfigError: no turn does that.
     """

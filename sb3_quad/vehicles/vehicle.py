@@ -21,15 +21,15 @@ MAX_SUBSTEPS = 1000
 GRAVITY = 9.81  # m/s²; 1 g
 # Published moments of inertia are inaccurate: the largest may be this many times the other two.
 INACCURACY = 1.05
-# Where kF is unknown, this is the speed of a rotor that gives m g / 4, rad/s.
+# If kF is unknown, this is the speed of a rotor with a thrust of m g / 4, rad/s.
 HOVER_SPEED = 1000.0
-# What gain times physics step may be: Eq. 4.1 overshoots beyond 1; of the exponential, what
-# turn_rotors takes for it is 1 % short at 2, and worse beyond.
+# Upper bounds of gain times physics step: Eq. 4.1 overshoots beyond 1; the approximation of the
+# exponential in turn_rotors is 1 % short at 2, and worse beyond.
 LARGEST_STEP = {"euler": 1.0, "exact": 2.0}
 # Up to this step, s, the compiled rotation is exact.
 MAX_PHYSICS_STEP = 0.0025
-# What the compiled kernel needs of a vehicle: the rows of an array (parameters, n), in the order of
-# Vehicle.parameters().
+# The parameters of a vehicle that the compiled kernel needs: the rows of an array (parameters, n),
+# in the order of Vehicle.parameters()
 PARAMETER_NAMES = (
     "mass",
     "ixx",
@@ -72,7 +72,7 @@ NAME = r"^[^/\\<>\p{C}]{1,100}$"
 
 
 def a_number(value: Any) -> Any:
-    """Refuse true and false, which pydantic takes for 1 and 0."""
+    """Refuse true and false, which pydantic would read as 1 and 0."""
     if isinstance(value, bool):
         raise ValueError("true and false are not numbers")
     return value
@@ -88,18 +88,18 @@ Place = tuple[Number, Number]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 _NO_LIMITS = (0.0, 0.0)
-# Results of a search, which hold for one vehicle only.
+# Results of a search, which are valid for one vehicle only
 _FOUND = ("geometric_gains", "time_optimal")
 
 
 class Vehicle(Frozen):
     """The parameters of one quadcopter, and the values that follow from them.
 
-    They are those of the specification table and of thesis 4.1.1. The rotors' limits may be given
-    as they are published: instead of ``thrust_limits``, in hover thrusts, ``rotor_thrust_limits``
-    in N or ``rotor_speed_limits`` in rad/s. These become ``thrust_limits``, which a copy with
-    another mass keeps, and are None. ``motor_gain`` stands for ``motor_gain_up`` and
-    ``motor_gain_down`` where both are the same.
+    They include those of thesis 4.1.1. The rotors' limits may be given as they are published:
+    instead of ``thrust_limits``, in hover thrusts, ``rotor_thrust_limits`` in N or
+    ``rotor_speed_limits`` in rad/s. These become ``thrust_limits``, which a copy with another mass
+    keeps, and are None. ``motor_gain`` stands for ``motor_gain_up`` and ``motor_gain_down`` if both
+    are the same.
 
     It is frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well.
     :func:`load_vehicle` raises :class:`ConfigError`; the class itself raises pydantic's
@@ -121,13 +121,13 @@ class Vehicle(Frozen):
     moment_thrust_ratio: PositiveFloat
     """kM / kF, m"""
     thrust_coefficient: NonNegativeFloat = 0.0
-    """kF, N s^2, in F = kF ω^2 (Eq. 2.4); 0 if unknown: hover then takes 1,000 rad/s"""
+    """kF, N s^2, in F = kF ω^2 (Eq. 2.4); 0 if unknown: the rotors then hover at 1,000 rad/s"""
     motor_gain_up: PositiveFloat
     """k_m of a rotor that speeds up, 1/s (Eq. 4.1)"""
     motor_gain_down: PositiveFloat
     """k_m of a rotor that slows down, 1/s"""
     motor_integration: Literal["euler", "exact"] = "euler"
-    """euler: Eq. 4.1 as printed; exact: the speed's exponential, and the thrust of its middle"""
+    """euler: Eq. 4.1 as printed; exact: the exponential, and the thrust at the middle of a step"""
     drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
     """d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"""
     gravity: PositiveFloat = GRAVITY
@@ -139,10 +139,11 @@ class Vehicle(Frozen):
     rotor_speed_limits: Limits | None = Field(default=None, exclude=True)
     """the same as rotor speeds, rad/s"""
     saturation: Literal["each", "shared"] = "each"
-    """where a low battery (randomize) does not give a command, each: this rotor turns as fast as it
-    can; shared: its missing speed is taken off all four, as Crazyflie's firmware does"""
+    """if a low battery (randomize) cannot provide a commanded speed, each: this rotor turns as fast
+    as it can; shared: the missing speed is subtracted from all four, as in Crazyflie's firmware
+    """
     supervisor: Literal["crazyflie"] | None = None
-    """whose firmware judges whether a flight would be cut, see evaluation/supervisor.py"""
+    """whose firmware decides whether a flight would be cut, see evaluation/supervisor.py"""
     physics_step: PositiveFloat = Field(default=MAX_PHYSICS_STEP, le=MAX_PHYSICS_STEP)
     """s; at most 0.0025"""
     control_step: PositiveFloat = 0.01
@@ -152,14 +153,14 @@ class Vehicle(Frozen):
     collision_radius: PositiveFloat
     """radius of the collision sphere at the centre of mass, m"""
     geometric_gains: GeometricGains | None = None
-    """gains of the geometric expert, found for this vehicle; without them it derives its own"""
+    """gains of the geometric expert, found for this vehicle; without them it derives gains"""
     time_optimal: dict[PositiveFloat, PositiveFloat] | None = None
     """from distances, m, to least times to rest there, s (examples/time_optimal.py)"""
 
     @model_validator(mode="before")
     @classmethod
     def _in_short(cls, data: Any) -> Any:
-        """Take ``motor_gain`` for that up and down, and ``rotor_order`` with what goes with it for
+        """Replace ``motor_gain`` by the gains up and down, and ``rotor_order`` with its keys by
         positions and directions.
         """
         if not isinstance(data, Mapping):
@@ -177,7 +178,7 @@ class Vehicle(Frozen):
 
     @model_validator(mode="after")
     def _limits_as_published(self) -> "Vehicle":
-        """Take ``rotor_thrust_limits`` or ``rotor_speed_limits`` for ``thrust_limits``."""
+        """Convert ``rotor_thrust_limits`` or ``rotor_speed_limits`` to ``thrust_limits``."""
         given = [name for name in LIMITS if getattr(self, name) not in (None, _NO_LIMITS)]
         if len(given) != 1:
             raise ValueError(f"{' and '.join(given or LIMITS)}: give exactly one of them")
@@ -196,7 +197,7 @@ class Vehicle(Frozen):
                 )
             thrusts = self.thrust_coefficient * thrusts**2
         limits = (thrusts / self.hover_thrust).tolist()
-        # The model is frozen, but not yet handed out.
+        # The model is frozen, but nobody else has it yet.
         vars(self).update({"thrust_limits": tuple(limits), name: None})
         return self
 
@@ -253,12 +254,12 @@ class Vehicle(Frozen):
         """Return another vehicle that differs in ``update``; unlike pydantic's own, validated.
 
         ``geometric_gains`` and ``time_optimal`` were found for this vehicle: one that differs in
-        more than its name and its gains has none, unless ``update`` brings some.
+        more than its name and its gains has none, unless ``update`` contains some.
         """
         changes = dict(update or {})
         if changes.keys() - {"name", "geometric_gains"}:
             changes = {**dict.fromkeys(_FOUND), **changes}
-        # What the changes give in another form.
+        # Fields that the changes give in another form.
         replaced: set[str] = set()
         if "motor_gain" in changes:
             replaced.update(MOTOR_GAINS)
@@ -269,11 +270,11 @@ class Vehicle(Frozen):
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
         """Return this vehicle with axes turned about z, and rotors in the order of ``other``.
 
-        A policy knows one order of the rotors. So it can fly vehicles that number theirs in another
-        way, or whose rotors form a plus instead of an X.
+        A policy knows one order of the rotors. This lets it fly vehicles that number their rotors
+        in another way, or whose rotors form a plus instead of an X.
 
-        :raises ConfigError: no turn brings its rotors there; or it would turn axes of different
-            moments of inertia, off which there are products of inertia.
+        :raises ConfigError: no turn brings its rotors there; or it would turn axes with different
+            moments of inertia, which leads to products of inertia.
         """
         turn = find_turn(self, other)
         if turn == Turn():
@@ -295,8 +296,8 @@ class Vehicle(Frozen):
         return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
-        """Whether both have the same parameters; names, an expert's gains and who judges their
-        flights do not matter.
+        """Whether both have the same parameters; names, an expert's gains and the supervisor do not
+        matter.
         """
         unlike = {"name", "supervisor", *_FOUND}
         return self.model_dump(exclude=unlike) == other.model_dump(exclude=unlike)
@@ -329,10 +330,10 @@ class Vehicle(Frozen):
 
     @property
     def hover_shares(self) -> FloatArray:
-        """Thrusts of the rotors in hover, in m g / 4, (4,): 1, or whatever gives no moment where
+        """Thrusts of the rotors in hover, in m g / 4, (4,): 1, or whatever balances the moments if
         the centre of mass is not in the middle of the rotors.
         """
-        # Rounded, so that rotors in symmetrical places have 1.
+        # Rounded, so that rotors in symmetrical places have exactly 1.
         return np.round(4.0 * self.mixer_inverse[:, 0], 12)
 
     @property
@@ -342,7 +343,7 @@ class Vehicle(Frozen):
 
     @property
     def lift(self) -> float:
-        """kF, N s²; where it is unknown, the one that makes ``hover_rotor_speed`` 1,000 rad/s."""
+        """kF, N s²; if it is unknown, the one with which ``hover_rotor_speed`` is 1,000 rad/s."""
         return self.thrust_coefficient or self.hover_thrust / HOVER_SPEED**2
 
     @property
@@ -365,7 +366,7 @@ class Vehicle(Frozen):
 
     @property
     def greatest_moments(self) -> FloatArray:
-        """Greatest moments about roll, pitch and yaw alone, (3,), N m, whatever the thrust is."""
+        """Greatest moments about roll, pitch and yaw separately, (3,), N m, whatever the thrust."""
         middle, half = self._middle_and_half
         arms = self.mixer[1:]
         # Each rotor goes from the middle of its limits to one end.
@@ -373,7 +374,7 @@ class Vehicle(Frozen):
 
     @property
     def gyration_ratios(self) -> FloatArray:
-        """Radii of gyration √(I/m) by the arm length, (3,).
+        """Radii of gyration √(I/m), divided by the arm length, (3,).
 
         Above 1 the mass would lie beyond the rotors.
         """
@@ -381,29 +382,31 @@ class Vehicle(Frozen):
 
     @property
     def largest_moment(self) -> float:
-        """The largest moment of inertia by the sum of the other two; of a rigid body at most 1."""
+        """The largest moment of inertia, divided by the sum of the other two; at most 1 for a rigid
+        body.
+        """
         largest = max(self.inertia)
         return largest / (sum(self.inertia) - largest)
 
     @property
     def inertia_fault(self) -> str:
-        """Why no rigid body has this inertia; empty where one can."""
+        """Why no rigid body has this inertia; empty if one can."""
         excess = self.largest_moment - 1.0
         if excess <= 1e-9:
             return ""
         return (
-            "no rigid body has one moment larger than the other two together, "
+            "no rigid body has a moment larger than the sum of the other two, "
             f"here by {100 * excess:.2g} %"
         )
 
     @property
     def hover_rotor_speed(self) -> float:
-        """Speed of a rotor that gives ``hover_thrust``, rad/s."""
+        """Speed of a rotor with the thrust ``hover_thrust``, rad/s."""
         return math.sqrt(self.hover_thrust / self.lift)
 
     @property
     def hover_action(self) -> FloatArray:
-        """The action in hover, (4,); 0 where hover is in the middle of the thrust limits."""
+        """The action in hover, (4,); 0 if hover is in the middle of the thrust limits."""
         return self.thrust_to_action(self.hover_thrusts)
 
     @property
@@ -412,7 +415,7 @@ class Vehicle(Frozen):
         return round(self.control_step / self.physics_step)
 
     def thrust_to_action(self, thrust: FloatArray) -> FloatArray:
-        """Return the actions of rotor thrusts in N, any shape.
+        """Return the actions that command rotor thrusts in N, any shape.
 
         It inverts Eq. 3.18, and does not clip to [-1, 1].
         """
@@ -425,7 +428,9 @@ class Vehicle(Frozen):
         return middle + half * np.clip(action, -1.0, 1.0)
 
     def parameters(self) -> FloatArray:
-        """Return what the compiled kernel needs, in the order of ``PARAMETER_NAMES``, (names,)."""
+        """Return the numbers that the compiled kernel needs, in the order of ``PARAMETER_NAMES``,
+        (names,).
+        """
         return np.array(
             [
                 self.mass,
@@ -453,12 +458,12 @@ VehicleSource = StrPath | Vehicle
 
 
 def load_vehicle(source: VehicleSource, layout: VehicleSource | None = None) -> Vehicle:
-    """Return a vehicle by name or path, or as it is.
+    """Return a vehicle by name or path; a Vehicle is returned as it is.
 
     A line on stderr warns of a user's file whose inertia no rigid body has.
 
-    :param layout: the vehicle in whose layout it is flown, as of ``rotor_layout``; None: its own.
-    :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
+    :param layout: the vehicle in whose layout it is flown, as for ``rotor_layout``; None: its own.
+    :raises CannotHover: the only fault of the file is that hover lies outside the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown,
         missing or out of range.
     """

@@ -359,8 +359,8 @@ def test_a_zip_flies_without_the_file_of_its_reference(source):
     [
         ([], "flight_settings: must be a mapping"),
         (None, "flight_settings: must be a mapping"),
-        ({"observation_std": [1e-320] * 18}, "observation_std: every value must be of 1e-6"),
-        ({"observation_mean": [1e30] * 18}, "observation_mean: every value must be of -1e6"),
+        ({"observation_std": [1e-320] * 18}, "observation_std: every value must be from 1e-6"),
+        ({"observation_mean": [1e30] * 18}, "observation_mean: every value must be from -1e6"),
     ],
 )
 def test_settings_that_no_flight_can_have_are_refused(changes, says, capsys):

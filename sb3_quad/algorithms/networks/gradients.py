@@ -1,4 +1,4 @@
-"""Policies that are two perceptrons, whose losses are differentiated by compiled code.
+"""Policies of two perceptrons, whose losses compiled code differentiates.
 
 In shapes, ``b`` is the mini-batch and ``a`` the action dimension.
 """
@@ -21,22 +21,22 @@ Terms = dict[str, float]
 
 
 class Perceptrons(NamedTuple):
-    """A policy that is two perceptrons and a diagonal Gaussian."""
+    """A policy that consists of two perceptrons and a diagonal Gaussian."""
 
     actor: Perceptron
     critic: Perceptron
     log_std: th.nn.Parameter
 
     def parameters(self) -> list[th.nn.Parameter]:
-        """Return those of the policy."""
+        """Return the policy's parameters."""
         return [*self.actor.parameters(), *self.critic.parameters(), self.log_std]
 
     def gradients(self, loss: Loss, actor: Batch, critic: Batch | None) -> Terms:
         """Set ``.grad`` of every parameter to the gradient of a loss.
 
-        It is what ``loss.backward()`` gives in ``PPOBC.train`` and ``DAgger.train``.
+        It equals what ``loss.backward()`` computes in ``PPOBC.train`` and ``DAgger.train``.
 
-        :param critic: mini-batch of the value loss. None: the critic takes no part.
+        :param critic: mini-batch of the value loss. None: no value loss.
         :return: the terms that were computed; NaN for a policy that is no longer finite.
         """
         n = len(actor.rows)
@@ -53,12 +53,12 @@ class Perceptrons(NamedTuple):
             terms["approx_kl"] = means[losses.KL]
             terms["clip_fraction"] = means[losses.CLIPPED]
         if critic is None:
-            # The weights' own term is added below.
+            # The gradient of the L2 term is added below.
             for parameter in self.critic.parameters():
                 parameter.grad = th.zeros_like(parameter)
         else:
             terms["value_loss"] = self.critic.gradient(critic, loss)[losses.VALUE]
-        # The gradients of the entropy and of the weights are written out here.
+        # The gradients of the entropy and of the L2 term are written out here.
         with th.no_grad():
             terms["entropy_loss"] = -float(losses.gaussian_entropy(self.log_std))
             self.log_std.grad -= loss.ent_coef  # type: ignore[operator, assignment]
@@ -80,7 +80,8 @@ Network = ActorCriticPolicy | Perceptrons
 def network_of(policy: ActorCriticPolicy) -> Network:
     """Return the fastest implementation of a policy.
 
-    That is compiled perceptrons where it is two of them on the CPU, else the policy itself.
+    That is compiled perceptrons if it consists of two of them on the CPU, otherwise the policy
+    itself.
     """
     extractor: Any = policy.mlp_extractor
     # A subclass may compute something else.
@@ -97,7 +98,7 @@ def network_of(policy: ActorCriticPolicy) -> Network:
     if not (Perceptron.fits(actor) and Perceptron.fits(critic) and policy.log_std.requires_grad):
         return policy
     network = Perceptrons(Perceptron(actor), Perceptron(critic), policy.log_std)
-    # A policy with further parameters, or with layers that both share, is computed by PyTorch.
+    # PyTorch computes a policy with further parameters, or with layers that actor and critic share.
     if len(network.parameters()) != len([*policy.parameters()]):
         return policy
     return network
@@ -122,7 +123,7 @@ def state_values(network: Network, observations: AnyArray) -> Float32Array:
 
 
 def act(network: Perceptrons, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """Return what ``policy(observations)`` does, from the same random numbers.
+    """Return what ``policy(observations)`` returns, using the same random numbers.
 
     :return: sampled actions (b, a), values (b, 1), log-probabilities (b,).
     """
@@ -138,10 +139,10 @@ class RecordedPolicy:
     """Computes a policy's mean actions step by step, and carries gradients with respect to them
     back to the observations and to the policy's parameters.
 
-    Compiled perceptrons keep what their layers gave in each step: to compute it again would take
-    a third of the backward pass.
+    Compiled perceptrons keep the activations of each step: computing them again would take a third
+    of the backward pass.
 
-    :param n_steps: of a flight.
+    :param n_steps: steps of a flight.
     :param n: rows of each step.
     """
 
@@ -149,7 +150,7 @@ class RecordedPolicy:
         network = network_of(policy)
         self._policy = policy
         self._actor = network.actor if isinstance(network, Perceptrons) else None
-        # What the backward pass needs of each step: what the layers gave, or the observations.
+        # What the backward pass needs from each step: the activations, or the observations.
         self._activations: Any = {}
         if self._actor:
             self._activations, self._sums = self._actor.allocate(n_steps, n)

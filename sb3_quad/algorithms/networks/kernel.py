@@ -3,9 +3,9 @@
 Blocks of rows go through all layers while they are in the cache. A block holds ``size`` rows of the
 mini-batch side by side, (width, size), so that every loop over rows is a vector loop. The size is
 ``ROWS``, or ``FEW`` for so few rows that half of a block would be empty. Loops are compiled for
-both: with a size that is not known in advance they take up to a fifth longer. Widths are
-padded to multiples of 4 with zeros. A layer's parameters lie in a row: weights (outputs, inputs),
-then biases. A chunk is a number of blocks; whichever thread computes it, its sums are the same.
+both: with a size that is not known in advance they take up to a fifth longer. Widths are padded to
+multiples of 4 with zeros. The parameters of a layer are contiguous: weights (outputs, inputs), then
+biases. A chunk is a number of blocks; its sums do not depend on the thread that computes it.
 """
 
 from typing import NamedTuple
@@ -17,25 +17,26 @@ from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
 from sb3_quad.base.types import Float32Array, IntArray
 from sb3_quad.simulation.compiled import compiled
 
-# Rows of a block: long loops, and yet a layer of 64 and its gradients fit into half a megabyte
+# Rows per block: loops are long, yet a layer of 64 units and its gradients fit into half a
+# megabyte.
 ROWS = 256
 FEW = 128
 LINEAR, TANH, RELU = range(3)
 _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
-# Inputs at once: their rows stay in the first cache
+# Inputs per tile, so that their rows stay in the L1 cache
 _TILE = np.uint64(16)
 # Not "nnan": NaN and infinity must stay what they are
 _FAST = {"reassoc", "contract", "nsz"}
-# Beyond, float32's tanh is 1
+# Beyond this, tanh is 1 in float32
 _END = np.float32(7.90531110763549805)
 
 
 class Layers(NamedTuple):
     """The layers of a perceptron.
 
-    :param widths: of all layers, the inputs first, padded.
+    :param widths: padded widths of all layers, the inputs first.
     :param kinds: the activation of each but the first.
-    :param parameters: of one layer after another.
+    :param parameters: the parameters of all layers, one layer after another.
     """
 
     widths: IntArray
@@ -46,7 +47,7 @@ class Layers(NamedTuple):
 @compiled(fastmath=_FAST)
 def _multiply(w, x, h, size):
     """h = w x; w (rows, columns), x (columns, size), h (rows, size)."""
-    # Unsigned: Python's indices from the end would cost a third.
+    # Unsigned, since support for negative indices would cost a third.
     rows = uint64(w.shape[0])
     columns = uint64(w.shape[1])
     for tile in range(_0, columns, _TILE):
@@ -120,7 +121,7 @@ def _activate(h, bias, kind, size):
                 q = float32(1.19825839466702e-06) * s + float32(1.18534705686654e-04)
                 q = q * s + float32(2.26843463243900e-03)
                 q = q * s + float32(4.89352518554385e-03)
-                # The last term lets NaN and infinity come out as NaN.
+                # The last term makes NaN and infinity come out as NaN.
                 h[j, i] = u * p / q + float32(0.0) * x
         elif kind == RELU:
             for i in range(size):
@@ -181,7 +182,7 @@ def _layer(scratch, at, width, size):
 
 @compiled
 def _forward(scratch, x, index, first, count, layers, size):
-    """Compute all layers of a block, which lie behind one another, the inputs first.
+    """Compute all layers of a block, which follow one another in memory, the inputs first.
 
     :return: where the outputs begin.
     """
@@ -206,8 +207,8 @@ def _forward(scratch, x, index, first, count, layers, size):
 def _backward(activations, scratch, layers, sums, last_layer, size):
     """Add the gradient of a block with respect to the parameters to ``sums``.
 
-    The block's layers lie in ``activations``. The gradient with respect to the outputs lies in
-    ``scratch``, behind the memory for the layers. From there on, two layers' gradients take turns.
+    ``activations`` holds the block's layers. ``scratch`` holds the gradient with respect to the
+    outputs, after the memory for the layers. From there on, the gradients of two layers alternate.
 
     :param last_layer: 1: stop at the parameters of the first layer; 0: go on to the inputs.
     :return: where the gradient of that layer begins.
@@ -248,18 +249,18 @@ def gradient(
     A block stays in the cache for its forward and its backward pass. Further arguments are as for
     :func:`forward`.
 
-    :param targets: (m, columns) of the loss, of the same rows.
+    :param targets: (m, columns), the targets of the loss in the same rows.
     :param loss: :class:`~sb3_quad.algorithms.networks.losses.Loss`.
-    :param log_std: of the actions, (a,); of size 0 for a critic.
+    :param log_std: log_std of the actions, (a,); of size 0 for a critic.
     :param sums: float32 (chunks, parameters + a), the gradient of each chunk.
-    :param terms: float64 (chunks, TERMS), likewise, the loss's terms.
+    :param terms: float64 (chunks, TERMS), likewise, the terms of the loss.
     """
     size = ROWS
     n = len(index)
     n_parameters = len(layers.parameters)
     outputs = layers.widths[-1]
     blocks = (n + size - 1) // size
-    behind = layers.widths.sum() * size
+    past_layers = layers.widths.sum() * size
     for chunk in range(first_chunk, last_chunk):
         sums[chunk, :] = 0.0
         terms[chunk, :] = 0.0
@@ -268,7 +269,7 @@ def gradient(
             count = min(size, n - first)
             at = _forward(scratch, x, index, first, count, layers, size)
             y = _layer(scratch, at, outputs, size)
-            g = _layer(scratch, behind, outputs, size)
+            g = _layer(scratch, past_layers, outputs, size)
             g[:, :] = 0.0
             g[0, 0] = 0.0 * _touch(targets, index, first, count)
             g_log_std = sums[chunk, n_parameters:]
@@ -288,13 +289,13 @@ def for_blocks(size):
     def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out, activations):
         """Write the outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs) into ``out``.
 
-        It does so for the chunks from ``first_chunk`` to ``last_chunk`` of all ``chunks``.
+        It does so for the chunks from ``first_chunk`` up to ``last_chunk``, of ``chunks`` in all.
 
         :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each
             unit of all layers, and twice for the widest layer's gradients.
         :param layers: :class:`Layers`.
-        :param activations: (blocks, ``size`` numbers for each unit), is written for ``pullback``;
-            or (0, any).
+        :param activations: (blocks, ``size`` numbers for each unit), written for ``pullback``; or
+            (0, any), to keep nothing.
         """
         n = len(index)
         blocks = (n + size - 1) // size
@@ -320,16 +321,16 @@ def for_blocks(size):
 
         :param activations: what ``forward`` has written for the same rows.
         :param grad_outputs: (m, outputs).
-        :param grad_inputs: float32 (m, inputs), is written.
-        :param sums: float32 (chunks, parameters), the gradient of each chunk is added.
+        :param grad_inputs: float32 (m, inputs), is written to.
+        :param sums: float32 (chunks, parameters), to which the gradient of each chunk is added.
         """
         blocks = (len(index) + size - 1) // size
-        behind = layers.widths.sum() * size
+        past_layers = layers.widths.sum() * size
         for chunk in range(first_chunk, last_chunk):
             for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
                 first = block * size
                 count = min(size, len(index) - first)
-                g = _layer(scratch, behind, layers.widths[-1], size)
+                g = _layer(scratch, past_layers, layers.widths[-1], size)
                 _load(grad_outputs, index, first, count, g, size)
                 here = _backward(activations[block], scratch, layers, sums[chunk], 0, size)
                 g = _layer(scratch, here, layers.widths[0], size)

@@ -1,12 +1,12 @@
 """The losses of Eqs. 4.3 and 4.4: tensors for autograd, and the same compiled with derivatives.
 
 In shapes, ``b`` is the mini-batch, ``a`` the action dimension. Compiled losses read their targets
-from rows of numbers. A row for an actor holds, as far as the loss has such a term:
+from rows of numbers. A row for an actor holds, for the terms that the loss has:
 
 - the cloning term: the expert's action (a);
 - the policy term: the action flown (a), its log-probability then, its advantage.
 
-A row for a critic holds V from when the rollout was flown, and the return.
+A row for a critic holds V at the time of the rollout, and the return.
 """
 
 import math
@@ -24,9 +24,9 @@ CLONING_LOSSES: tuple[CloningLoss, ...] = get_args(CloningLoss)
 MSE, NLL, HUBER, HUBER_MSE = range(4)
 CloningFilter = Literal["none", "agreement", "q"]
 BC_FILTERS: tuple[CloningFilter, ...] = get_args(CloningFilter)
-"""Where to clone. ``"q"`` needs critics of actions, which SACBC alone has."""
+"""Where to clone. ``"q"`` needs critics of actions, which only SACBC has."""
 AGREEMENT = BC_FILTERS.index("agreement")
-# The range of an action is 2. "huber" grows linearly from this error on.
+# Actions span 2. "huber" is linear beyond this error.
 HUBER_DELTA = 0.05
 # Weight of the squared error in "huber_mse".
 MSE_WEIGHT = 3.0
@@ -35,7 +35,7 @@ _SQUARED = (1.0, 0.0, 0.0, MSE_WEIGHT)
 # "agreement" clones up to this root mean squared difference of actions.
 NEAR = 0.3
 CLONING, POLICY, KL, CLIPPED, TERMS = range(5)
-"""The sums that a compiled actor's loss adds up to. A critic's has one only, ``VALUE``."""
+"""Indices of the sums of a compiled actor's loss. A critic's has only one, ``VALUE``."""
 VALUE = 0
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -76,14 +76,14 @@ WEIGHTS = {
 def cloning_errors(
     kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor
 ) -> th.Tensor:
-    """Return how far the policy is from the expert's ``actions`` (b, a), by row, (b,).
+    """Return how far the policy is from the expert's ``actions`` (b, a), for each row, (b,).
 
     L_BC is the mean over the rows. ``"nll"`` is Eq. 3.12, the negative log-likelihood, a sum over
-    the action's dimensions; it also shrinks the standard deviation towards the error that is left.
-    The others are means over the dimensions and leave the deviation alone. ``"mse"``: squared.
-    ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. A tumble, where
-    little can be learnt from noise, then takes less of the gradient. ``"huber_mse"``: that and
-    three times the squared error.
+    the action's dimensions; it also shrinks the standard deviation towards the remaining error. The
+    others are means over the dimensions and leave the deviation alone. ``"mse"``: squared.
+    ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. Tumbling, where
+    errors are large and mostly noise, then dominates the gradient less. ``"huber_mse"``: the same
+    plus three times the squared error.
     """
     if kind == "nll":
         return gaussian_nll(mean, log_std, actions)
@@ -140,7 +140,7 @@ def max_clipped_value_loss(
 ) -> th.Tensor:
     """Return the critic's loss by Eq. 3.8, a scalar: the larger of clipped and unclipped error.
 
-    So leaving the clip range is never rewarded.
+    Leaving the clip range is thus never rewarded.
 
     :param values: V(s) now, (b,).
     :param old_values: V(s) when the rollout was flown, (b,).
@@ -153,7 +153,7 @@ def max_clipped_value_loss(
 def l2_loss(parameters: list[th.nn.Parameter]) -> th.Tensor:
     """Return ½ Σ w² over the weight matrices of actor and critic (Eq. 2.25), a scalar.
 
-    Biases and log_std take no part.
+    Biases and log_std are excluded.
     """
     sums = [weights.square().sum() for weights in parameters if weights.ndim > 1]
     return 0.5 * th.stack(sums).sum()
@@ -161,7 +161,7 @@ def l2_loss(parameters: list[th.nn.Parameter]) -> th.Tensor:
 
 @compiled
 def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, terms):
-    """Add an actor's loss over ``count`` rows of a mini-batch, from ``first`` on, to the terms.
+    """Add an actor's loss over ``count`` rows of a mini-batch, from ``first`` on, to ``terms``.
 
     Its gradient with respect to the means is added to ``g``, that with respect to log_std to
     ``g_log_std``.
@@ -201,7 +201,7 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
             terms[POLICY] -= least
             terms[KL] += ratio - 1.0 - change
             terms[CLIPPED] += abs(ratio - 1.0) > loss.clip_range
-            # Written so that NaN passes, too.
+            # Written so that NaN passes through, too.
             if not gain > least:
                 slope = -loss.policy_coef / n * advantage * ratio
                 for k in range(a):

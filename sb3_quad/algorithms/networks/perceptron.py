@@ -22,17 +22,17 @@ from sb3_quad.algorithms.networks.kernel import (
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
 from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, IntArray
 
-# A mini-batch is cut into at most this many chunks. Their sums are added up in order, so that the
-# number of threads changes no bit.
+# A mini-batch is cut into at most this many chunks. Their sums are added up in order, so that
+# results do not depend on the number of threads, to the bit.
 CHUNKS = 16
-# Fewer blocks than this are done before another thread has woken.
+# With fewer blocks than this, the work is done before another thread wakes up.
 WORTHWHILE = 4
-# Parts of a mini-batch for each thread. One that is held up does fewer of them.
+# Parts of a mini-batch per thread, so that a thread that is held up can do fewer of them.
 PARTS = 4
 # Bytes; vectors that straddle two cache lines take a third longer.
 CACHE_LINE = 64
 _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
-# The passes of a call, by the rows of its blocks.
+# The compiled passes, by rows per block.
 _PASSES = {size: for_blocks(size) for size in (FEW, ROWS)}  # type: ignore[no-untyped-call]
 _NONE = np.empty(0)
 _NOT_KEPT = np.empty((0, 0), np.float32)
@@ -76,7 +76,8 @@ class Perceptron:
         self._size = int((widths[1:] * (widths[:-1] + 1)).sum())
         packed = np.zeros(self._size, np.float32)
         self._layers = Layers(widths, kinds, packed)
-        # Views of those and of PyTorch's memory, which :meth:`pack` copies into them
+        # Views of ``packed``, each with the view of PyTorch's memory that :meth:`pack` copies into
+        # it
         own = [parameter.detach().numpy() for parameter in self.parameters()]
         self._copies = [*zip(self._views(packed), own, strict=True)]
 
@@ -115,7 +116,7 @@ class Perceptron:
         return len(modules) % 2 == 1
 
     def pack(self) -> None:
-        """Take the parameters as they are now, for calls that keep what the layers give."""
+        """Copy the current parameters, for calls that keep activations."""
         for packed, parameter in self._copies:
             packed[...] = parameter
 
@@ -124,8 +125,8 @@ class Perceptron:
     ) -> Float32Array:
         """Return the outputs (n, outputs) for observations (n, ...).
 
-        :param activations: of :meth:`allocate`, is written for :meth:`pullback`. The parameters are
-            then those of the last :meth:`pack`, else those of now.
+        :param activations: memory from :meth:`allocate`, written for :meth:`pullback`. The call
+            then uses the parameters of the last :meth:`pack`, otherwise the current ones.
         """
         if activations is _NOT_KEPT:
             self.pack()
@@ -138,7 +139,7 @@ class Perceptron:
     def gradient(self, batch: Batch, loss: Loss, log_std: th.Tensor | None = None) -> FloatArray:
         """Set ``.grad`` of all parameters to the gradient of a loss.
 
-        :param log_std: of an actor, (a,); its gradient is set, too.
+        :param log_std: log_std of an actor, (a,); its gradient is set, too.
         :return: the terms of the loss, means over the rows.
         """
         self.pack()
@@ -157,9 +158,9 @@ class Perceptron:
         return np.asarray(terms.sum(axis=0) / len(rows))
 
     def allocate(self, calls: int, n: int) -> tuple[Float32Array, Float32Array]:
-        """Return memory for what :meth:`pullback` needs of some calls with n rows each.
+        """Return memory for what :meth:`pullback` needs from ``calls`` calls with n rows each.
 
-        :return: for what the layers give, (calls, ...), and for the sums of all calls.
+        :return: memory for the activations, (calls, ...), and for the sums of all calls.
         """
         rows = _block_rows(n)
         blocks = -(-n // rows)
@@ -201,7 +202,7 @@ class Perceptron:
         chunks = _chunks(n)
         threads = _threads if n > (WORTHWHILE - 1) * ROWS else 1
         size = -(-chunks // (PARTS * threads)) if threads > 1 else chunks
-        # Each part is taken by one thread: `next` holds Python's lock.
+        # Each part goes to one thread only, since `next` holds Python's global lock.
         firsts = iter(range(0, chunks, size))
 
         def work() -> None:
@@ -232,7 +233,7 @@ def _chunks(n: int) -> int:
 
 
 def _aligned(size: int) -> Float32Array:
-    """Return memory for ``size`` numbers that begins with a cache line."""
+    """Return memory for ``size`` numbers that begins at a cache line."""
     memory = np.empty(size + CACHE_LINE // 4, np.float32)
     to_next_line = -memory.ctypes.data % CACHE_LINE // 4
     return memory[to_next_line : to_next_line + size]
@@ -259,9 +260,9 @@ def use_one_torch_thread() -> None:
 
 @contextmanager
 def one_torch_thread(compiled: bool) -> Iterator[None]:
-    """Call :func:`use_one_torch_thread` for the block alone.
+    """Call :func:`use_one_torch_thread` for the duration of the block.
 
-    :param compiled: whether there is work for perceptrons; else nothing is changed.
+    :param compiled: whether there is work for perceptrons; otherwise nothing changes.
     """
     global _threads, _pool
     torch_threads = th.get_num_threads()
@@ -273,7 +274,7 @@ def one_torch_thread(compiled: bool) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(torch_threads)
-        # A process that is forked later does not have these threads.
+        # A process that is forked later would not have these threads.
         if _pool is not pool:
             _pool.shutdown()
         _threads = threads

@@ -1,8 +1,8 @@
 """Trained policies that come with the package.
 
-Each ``NAME.zip``, which stock PPO loads, has a card ``NAME.md``. The card says what the policy
-flies, how it was trained (command, seed, commit) and what was measured. ``examples/publish.py``
-writes both.
+Each ``NAME.zip``, which stock PPO loads, has a card ``NAME.md`` that says what the policy flies,
+how it was trained (command, seed, commit) and what was measured. ``examples/publish.py`` writes
+both.
 """
 
 from pathlib import Path
@@ -40,8 +40,8 @@ def pretrained(name: str) -> Path:
 def load_pretrained(name: str, **kwargs: Any) -> "PPO":
     """Return a policy that comes with the package, as a stock PPO model.
 
-    It takes the observations of an environment made with :func:`env_kwargs` of that name, and gives
-    4 actions in [-1, 1].
+    It takes the observations of an environment made with :func:`env_kwargs` of that name, and
+    returns 4 actions in [-1, 1].
 
     :param kwargs: passed on to ``PPO.load``, such as ``env`` and ``device`` (default: "cpu").
     :raises ConfigError: an unknown name.
@@ -67,9 +67,9 @@ def agent_path(text: str) -> str:
 
 
 def run_agent(folder: Path, name: str) -> Path:
-    """Return the agent that a run offers.
+    """Return the agent of a run.
 
-    It is the one with corrected offset, else the best one, else the last one, ``<name>.zip``.
+    It is the one with corrected offset, or else the best one, or else the last one, ``<name>.zip``.
     """
     for path in (folder / CORRECTED, folder / BEST):
         if path.is_file():

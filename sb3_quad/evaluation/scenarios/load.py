@@ -1,6 +1,6 @@
 """Suites of scenarios from YAML files: those of the package by name, your own by path.
 
-With ``vary``, one scenario is written down and a grid of them is flown, for heat maps and sweeps.
+With ``vary``, one scenario in the file becomes a grid of scenarios, for heat maps and sweeps.
 """
 
 import copy
@@ -54,7 +54,7 @@ def load_suite(source: StrPath) -> Suite:
     """Read a suite by name (``"thesis"``) or by the path of a YAML file.
 
     :raises ConfigError: an unknown name, a missing or unreadable file, an unknown key (the nearest
-        valid one is named), or a value that is impossible: a target below ground, say.
+        valid one is named), or an impossible value, such as a target below ground.
     """
     text, where = SUITES.text(source)
     return parse_suite(text, where, Path(source).parent if SUITES.is_path(source) else Path())
@@ -104,11 +104,11 @@ def _beside(folder: Path, source: object) -> object:
 def grid(entry: StrMapping, where: str) -> list[StrDict]:
     """Return the scenarios of one entry: a cell for each combination of the values in ``vary``.
 
-    Without ``vary`` it is the entry alone.
+    Without ``vary``, this is only the entry itself.
 
-    :param entry: as YAML gives it; ``vary`` maps keys such as ``start.attitude.tilt`` to lists of
+    :param entry: as read from YAML; ``vary`` maps keys such as ``start.attitude.tilt`` to lists of
         numbers.
-    :raises ConfigError: ``vary`` is not such a mapping, or names no place in the entry.
+    :raises ConfigError: ``vary`` is not such a mapping, or a key of it is not in the entry.
     """
     if "vary" not in entry:
         return [dict(entry)]
@@ -119,7 +119,7 @@ def grid(entry: StrMapping, where: str) -> list[StrDict]:
             f"{where}: vary must map keys to lists of numbers, such as 'noise: [0, 0.05, 0.1]'"
         )
     for key, values in axes.items():
-        # A bool is an int to Python, but no number to a reader.
+        # A bool is an int to Python, but not a number to a reader.
         numbers = isinstance(values, list) and {*map(type, values)} in NUMBERS
         if not numbers or len({*values}) < len(values) or not all(map(math.isfinite, values)):
             raise ConfigError(
@@ -157,7 +157,7 @@ def axis_values(cell: Mapping[str, float]) -> list[str]:
 def axis_label(key: str, scenario: Scenario | None = None) -> str:
     """Return the name of a varied key with its unit, for the axes of plots.
 
-    :param scenario: one of those that vary, which says the unit of its wrenches; None: SI.
+    :param scenario: one of the cells, whose wrenches decide about the unit; None: SI.
     """
     name = axis_name(key)
     unit = UNITS.get(name)

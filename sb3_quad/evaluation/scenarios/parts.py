@@ -1,5 +1,5 @@
-"""The parts of a scenario: start, target, wrenches, the vehicle's changes. SI units, angles in
-degrees where they say so.
+"""The parts of a scenario: start, target, wrenches, changes of the vehicle. Units are SI, angles in
+degrees where noted.
 """
 
 import math
@@ -20,7 +20,9 @@ Factor = Annotated[float, Field(ge=0.1, le=10)]
 
 
 class OneOf(Frozen):
-    """A part with several ways to give it; a file uses exactly one. A list is the first way."""
+    """A part that can be given in several ways, of which a file uses exactly one. A list means the
+    first.
+    """
 
     ways: ClassVar[tuple[str, ...]]
 
@@ -106,7 +108,7 @@ class Start(Frozen):
     velocity_frame: Frame = "world"
     """world or body: the axes of velocity"""
     body_rates: VectorDistribution = ZERO
-    """body frame, rad/s: given as velocity is"""
+    """body frame, rad/s: in the same forms as velocity"""
 
     @model_validator(mode="after")
     def _turnable(self) -> "Start":
@@ -136,7 +138,7 @@ class Target(OneOf):
 
     @model_validator(mode="after")
     def _radius_of_waypoints(self) -> "Target":
-        # A scenario that was read before gives the default.
+        # A scenario that was read before has the default.
         if self.waypoints is None and self.radius != Target.model_fields["radius"].default:
             raise ValueError("radius: is that of waypoints; remove it, or give tolerances")
         return self
@@ -159,11 +161,13 @@ class Wrench(Frozen):
     force: VectorDistribution = ZERO
     """N, or as unit says: [x, y, z], {std: …} or {magnitude: …}"""
     torque: VectorDistribution = ZERO
-    """N m, or as unit says: as force is given"""
+    """N m, or as unit says: in the same forms as force"""
     unit: Literal["SI", "weight"] = "SI"
-    """weight: force in weights m g of the vehicle, torque in weights times its arm length"""
+    """weight: force in multiples of the vehicle's weight m g, torque in those of m g times its arm
+    length
+    """
     factor: float = 1.0
-    """multiplies force and torque alike; to vary the size of a hit"""
+    """multiplies force and torque, to vary the size of a hit"""
     force_frame: Frame = "world"
     """world or body: the axes of force"""
     torque_frame: Frame = "body"
@@ -178,26 +182,26 @@ class Wrench(Frozen):
 
 
 class VehicleChanges(Frozen):
-    """Differences of the vehicle that flies from the one its controller was made for.
+    """Differences between the vehicle that flies and the one its controller was made for.
 
     Motors and limits stay as they are.
     """
 
     mass: Factor = 1.0
-    """is a factor: 1.3 is 30 % more; thrust limits in N stay"""
+    """factor: 1.3 is 30 % more; thrust limits in N do not change"""
     inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = 1.0
     """factor of Ixx, Iyy and Izz, or one for each"""
     motor_gain: Factor = 1.0
-    """is a factor of k_m (Eq. 4.1): 1.3 is 30 % more"""
+    """factor of k_m (Eq. 4.1): 1.3 is 30 % more"""
     delay: int | None = Field(default=None, ge=0, le=100)
     """control steps from a command to its effect; default: the vehicle's own"""
 
     def apply(self, vehicle: Vehicle) -> Vehicle:
         """The changed vehicle.
 
-        Rotor thrusts in N answer actions as before: the limits, which a vehicle gives in hover
-        thrusts of its own mass (Eq. 3.18), are divided by the mass factor, so that action 0 is the
-        hover of the unchanged vehicle.
+        Actions command the same rotor thrusts in N as before: the limits, which are in hover
+        thrusts of the vehicle's own mass (Eq. 3.18), are divided by the mass factor, so that action
+        0 is hover of the unchanged vehicle.
 
         :raises ConfigError: it cannot fly, for example because it is too heavy for its rotors.
         """

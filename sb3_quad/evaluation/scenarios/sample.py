@@ -17,11 +17,11 @@ Generators = Sequence[np.random.Generator]  # one for each episode
 
 
 class Plan(NamedTuple):
-    """The events of n episodes, whoever flies them.
+    """The events of n episodes, which do not depend on who flies them.
 
-    :param start: replaces the environments' own sample: any of position, quaternion, velocity,
+    :param start: replaces what the environments sample: any of position, quaternion, velocity,
         body_rates, target; (n, 3) or (n, 4).
-    :param wrenches: by control step, the external wrench from that step on, (n, WRENCH_SIZE).
+    :param wrenches: external wrenches (n, WRENCH_SIZE) by the control step from which they act.
     :param waypoints: targets one after the other, (W, 3), m; ``start`` holds the first as its
         target.
     :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
@@ -36,7 +36,7 @@ class Plan(NamedTuple):
 def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     """Sample the events of some episodes of a scenario, beyond those that its task samples.
 
-    :param seeds: of the episodes, (n,).
+    :param seeds: seeds of the episodes, (n,).
     """
     generators = [np.random.default_rng([SCENARIO_STREAM, seed]) for seed in seeds]
     attitude = scenario.start.attitude
@@ -59,7 +59,7 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
 
 
 def sample_wrenches(scenario: Scenario, generators: Generators) -> dict[int, FloatArray]:
-    """Sum the wrenches of a scenario over the time of n episodes, for a :class:`Plan`."""
+    """Add up the wrenches of a scenario over the time of n episodes, for a :class:`Plan`."""
     vehicle = scenario.nominal_vehicle()
     acting = []
     times = set[int]()

@@ -19,7 +19,7 @@ from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
-# m: those of Figs. 4.6 and 4.7, and a tighter one.
+# m: the tolerances of Figs. 4.6 and 4.7, and a tighter one
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
 DEFAULT_VEHICLE = "itm"
@@ -29,7 +29,7 @@ _by_name = cache(load_vehicle)
 
 
 class Published(Frozen):
-    """Metrics that others measured, printed next to our own; a pair is a range."""
+    """Metrics that others have published, printed next to our own; a pair is a range."""
 
     success: Printed = None
     """share of flights that end at their target, 0 to 1"""
@@ -40,19 +40,19 @@ class Published(Frozen):
     time_to: dict[float, Printed] = {}
     """from tolerances in m to mean times in s; null: never within it"""
     path: Printed = None
-    """mean path, m"""
+    """mean length of the path, m"""
     final_error: Printed = None
     """|r - r_T| at the end, m"""
     flown: Printed = None
-    """until the flight ended, s"""
+    """mean time until the flight ended, s"""
     recovery_time: Printed = None
-    """until the vehicle was stable again, s"""
+    """mean time until the vehicle was stable again, s"""
     note: str = ""
     """the source's own words"""
 
 
 class Scenario(Frozen):
-    """One way to judge a controller: the episodes, their number, and others' metrics.
+    """One way to judge a controller: the episodes, their number, and published metrics.
 
     Units m, s, rad, N, N m, kg.
     """
@@ -68,16 +68,17 @@ class Scenario(Frozen):
     target: Target = Target(distance=0.0)
     """where to fly; default: to the start"""
     reference: Reference | None = None
-    """what the target does from there on: a curve's name, the path of a CSV file (relative to the
-    suite's) or fields of Reference; default: it rests"""
+    """how the target moves from there: a curve's name, the path of a CSV file (relative to the
+    suite's) or fields of Reference; default: it rests
+    """
     wrenches: tuple[Wrench, ...] = ()
     """external forces and torques"""
     noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
     """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
     duration: float = Field(default=15.0, gt=0, le=600)
-    """of an episode; the unit is s"""
+    """length of an episode, s"""
     max_distance: PositiveFloat = 30.0
-    """farther than this from the target ends an episode, m"""
+    """distance from the target beyond which an episode ends, m"""
     vehicle: str | Vehicle | None = None
     """name, or path of a YAML file (relative to the suite's); default: the agent's own, or itm"""
     vehicle_changes: VehicleChanges = VehicleChanges()
@@ -89,13 +90,13 @@ class Scenario(Frozen):
     episodes: int = Field(default=240, ge=1, le=1_000_000)
     """number of episodes"""
     seed: Seed = 0
-    """every episode derives its own from it"""
+    """each episode derives its own seed from it"""
     tolerances: Annotated[
         tuple[PositiveFloat, ...], AfterValidator(lambda values: tuple(sorted(set(values))))
     ] = Field(default=TOLERANCES, min_length=1)
     """of arrival, |r - r_T|, m"""
     published: dict[str, Published] = {}
-    """from a column's title to others' metrics"""
+    """published metrics, by column title"""
     group: str | None = None
     """the scenario that this one is a cell of; set by vary"""
     cell: dict[str, float] = {}
@@ -112,12 +113,12 @@ class Scenario(Frozen):
     @model_validator(mode="after")
     def _check_flight(self) -> "Scenario":
         vehicle = self.flown_vehicle()
-        # Of a distribution, the vehicle that can do least decides.
+        # For a distribution, the least capable vehicle decides.
         if self.vehicles is not None:
             self._refuse_nominal()
             vehicle = self.vehicles.hardest(vehicle)
         self._check_way(vehicle)
-        # The task checks the ranges of its own fields.
+        # The task checks the ranges of its fields.
         _ = self.task
         if self.randomize is not None:
             self.randomize.hardest(vehicle)
@@ -139,7 +140,7 @@ class Scenario(Frozen):
         return self
 
     def _refuse_nominal(self) -> None:
-        """Refuse what is about the nominal vehicle where each episode has another one."""
+        """Refuse changes of the nominal vehicle if each episode has another vehicle."""
         # The delay is the nominal vehicle's in all episodes.
         if self.vehicle_changes != VehicleChanges(delay=self.vehicle_changes.delay):
             raise ValueError(
@@ -233,7 +234,7 @@ class Scenario(Frozen):
     @property
     def physical_limit(self) -> float | None:
         """The least possible mean settling time (0.1 m) of the vehicle, s; None: unknown."""
-        # It is known of undisturbed flights from the tasks' own start.
+        # It is known only for undisturbed flights from the start of the tasks.
         changed = self.start != Start() or self.wrenches or self.randomize or self.vehicles
         if changed or self.reference or 0.1 not in self.tolerances:
             return None
@@ -309,7 +310,7 @@ class Suite(Frozen):
     ) -> "Suite":
         """Return a suite of some of these scenarios, with other numbers, seeds or another vehicle.
 
-        :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
+        :param names: names of scenarios, or of those whose cells ``vary`` makes; none: all.
         :param vehicle: name, or path of a YAML file, that flies all scenarios, also those
             with ``vehicles``. Forces and torques stay the same, in N and N m; published metrics, of
             another vehicle, are removed.

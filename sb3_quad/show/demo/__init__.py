@@ -1,3 +1,3 @@
-"""A page in which quadcopters fly under several controllers side by side: its sources, and what
-Python puts into it.
+"""A page in which quadcopters fly side by side under several controllers: its sources, and the data
+that Python puts into it.
 """

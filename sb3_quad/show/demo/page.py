@@ -37,7 +37,7 @@ DEFAULT_AGENTS = (
     "any-quadcopter",
     "imitation agent=itm-imitation",
 )
-EXACT = 50_000  # numbers of a network, above which they are rounded to half precision
+EXACT = 50_000  # networks with more numbers than this are rounded to half precision
 # The modules of the page in the order of their imports: those that need no browser, and the others.
 MODEL = [
     "tables",
@@ -65,7 +65,7 @@ VIEW = [
     "app",
 ]
 EXPERTS = ("pid", "geometric")
-FEATURES = {"position", "rotation", "velocity", "body_rates"}  # that observation.js computes
+FEATURES = {"position", "rotation", "velocity", "body_rates"}  # as observation.js computes them
 TABLES = {
     "X": X._asdict(),
     "SIZES": STATE,
@@ -75,7 +75,7 @@ TABLES = {
     "OBSERVATION_SIZE": OBSERVATION_SIZE,
     "DEFAULT_STD": DEFAULT_STD.tolist(),
 }
-# Parts of a script: strings, templates (also with a template in them) and comments at the end of a
+# Parts of a script: strings, templates (even with a template in them) and comments at the end of a
 # line are kept as they are; documentation, imports, the word export, indentation and comment lines
 # are removed.
 PARTS = re.compile(
@@ -94,14 +94,14 @@ PARTS = re.compile(
 def make_page(
     specs: Sequence[ControllerSpec], vehicle: Vehicle | None = None
 ) -> tuple[str, Vehicle, list[str]]:
-    """Return the page as text, the vehicle that all fly at first, and the agents whose weights are
-    rounded to make the page small.
+    """Return the page as text, the vehicle that all fly at first, and the agents whose weights were
+    rounded to keep the page small.
 
-    :param specs: the controllers, from the first on as many as are shown.
-    :param vehicle: that all fly at first; None: the first agent's own, else ``itm``.
+    :param specs: the controllers, of which the first ones are shown.
+    :param vehicle: the vehicle that all fly at first; None: the first agent's own, or else ``itm``.
     :raises ConfigError: a controller that the page cannot fly, or settings that cannot be read.
     """
-    # A vehicle that is given comes first, then those of the agents, each under a name of its own.
+    # A given vehicle comes first, then those of the agents, each with a unique name.
     colours = colours_of([spec.label for spec in specs])
     vehicles = {name: load_vehicle(name) for name in VEHICLES.names()}
     first = vehicle and _add(vehicles, vehicle)
@@ -135,8 +135,8 @@ def make_page(
 
 
 def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
-    """Add a vehicle to others unless one of them flies the same. It gets another name if its own
-    is taken.
+    """Add a vehicle to others, unless one of them has the same parameters. It gets another name if
+    its own is taken.
     """
     while vehicle.name in vehicles:
         known = vehicles[vehicle.name]
@@ -147,7 +147,7 @@ def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
 
 
 def describe(spec: ControllerSpec) -> StrDict:
-    """Return a controller as the page knows it.
+    """Return a controller as data for the page.
 
     :raises ConfigError: neither an expert of the page nor an agent in a zip that exports, or an
         observation with a feature that the page does not compute.
@@ -185,7 +185,7 @@ def pack(network: Network) -> StrDict:
     # The page stays small because large networks are rounded.
     values = parameters_to_vector(network.parameters()).numpy()
     values = values.astype("<f2" if values.size > EXACT else "<f4")
-    # Sorted by byte, the signs and exponents stand together and deflate better.
+    # Sorted by byte, signs and exponents are adjacent and deflate better.
     planes = values.view(np.uint8).reshape(values.size, -1).T.tobytes()
     return {
         "bits": 8 * values.itemsize,
