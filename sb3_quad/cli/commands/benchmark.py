@@ -4,9 +4,10 @@ The environments are the compiled batch and, where it is installed, PyBullet's,
 alone and vectorised. A training loop is a rollout with its update; APG's
 includes the backward pass through the recorded flights.
 
-The last line compares a core of your machine with one of the machine that the
-documentation's CPU seconds are from: at 0.5, expect twice as many. It needs the
-batch with 240 rows, and counts CPU seconds, so other programs hardly matter.
+The last line compares a core of your machine with a core of the one on which
+the CPU seconds in the documentation were measured: at 0.5, expect twice as
+many. It needs the batch with 240 rows, and counts CPU seconds, so other
+programs hardly matter.
 
 examples:
   # everything, about a minute

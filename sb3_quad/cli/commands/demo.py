@@ -16,8 +16,8 @@ examples:
 
 A controller is pid, geometric, an agent of the package such as itm-recovery,
 the path of an SB3 zip, or a run folder. NAME=CONTROLLER labels it. All fly the
-same vehicle, first that of the first agent. The page also offers the vehicles
-of the package.
+same vehicle, at first that of the first agent. The page also offers the
+vehicles of the package.
 """
 
 from argparse import Namespace

@@ -60,7 +60,7 @@ FLAGS: Flags = {
         [],
         f"panels to draw, of {', '.join(PANELS)} (success reward)",
     ),
-    "--task": "one of the runs' eval_tasks, whose evaluations to draw (the runs' own task)",
+    "--task": "draw the evaluations on this one of the runs' eval_tasks (the runs' own task)",
     "--title": (str, "", "title of the picture"),
     "-o --output FILE": (str, "curves.png", "picture to write: .png, .svg or .pdf (curves.png)"),
     **OVERWRITE,

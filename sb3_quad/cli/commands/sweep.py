@@ -55,7 +55,7 @@ PLACES = {
 FLAGS: Flags = {
     "sweep SWEEP": (
         {"nargs": "?"},
-        "YAML file, or the name of a sweep of the package; the flags below replace its keys",
+        "YAML file, or the name of a sweep of the package; the flags below override its keys",
     ),
     "--seed N": ({"nargs": "+", "type": seed}, "seeds of each configuration (0)"),
     "-conf --conf-file FILE": (
