@@ -13,11 +13,11 @@ from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.physics import rotation, to_body, to_world
 from sb3_quad.simulation.state import AHEAD, P, W, X
 from sb3_quad.simulation.vectors import (
+    add,
     cross,
-    difference,
-    divided,
+    divide,
     dot,
-    total,
+    subtract,
     vector_at,
 )
 
@@ -45,31 +45,31 @@ def fly_geometric(state, constants, wrench, actions):
         # The effect of the external wrench: an acceleration in the world frame, a torque in the
         # body frame.
         pushed = to_world(body_to_world, vector_at(wrench, W.force_body, j))
-        force = total(vector_at(wrench, W.force_world, j), pushed)
+        force = add(vector_at(wrench, W.force_world, j), pushed)
         turned = to_body(body_to_world, vector_at(wrench, W.torque_world, j))
-        torque = total(vector_at(wrench, W.torque_body, j), turned)
+        torque = add(vector_at(wrench, W.torque_body, j), turned)
 
         # The desired force of the rotors per mass, and its direction b as the body will see it when
         # the command acts. All motion is relative to the reference, whose acceleration pushes the
         # vehicle backwards.
         f = desired_force(
-            difference(vector_at(state, X.target, i), vector_at(state, X.position, i)),
-            difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i)),
-            difference(
-                divided(force, mass),
+            subtract(vector_at(state, X.target, i), vector_at(state, X.position, i)),
+            subtract(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i)),
+            subtract(
+                divide(force, mass),
                 reference_acceleration(state, i, constants.lag[k], gains[G.attitude]),
             ),
             gains,
             g,
         )
         size = math.sqrt(dot(f, f))
-        b = divided(to_body(body_to_world, f), size)
+        b = divide(to_body(body_to_world, f), size)
         b = seen_later(b, omega, constants.lag[k])
 
         # Moments for the turn, against the yaw rate, and against the external torque.
         mx, my = turn_moments(b, omega, gains, inertia)
         mz = yaw_moment(state, i, body_to_world, omega[2], gains, inertia[2])
-        moments = difference((mx, my, mz), torque)
+        moments = subtract((mx, my, mz), torque)
         allocate(
             mass * size * b[2],
             moments,
@@ -89,10 +89,10 @@ def reference_acceleration(state, i, lag, attitude):
     Upwards, that is when a command acts; sideways, only after the vehicle has also turned.
     """
     now = vector_at(state, X.target_acceleration, i)
-    dx, dy, dz = difference(vector_at(state, X.target_ahead, i), now)
+    dx, dy, dz = subtract(vector_at(state, X.target_ahead, i), now)
     upwards = lag / AHEAD
     sideways = upwards + 1.0 / (attitude * AHEAD)
-    return total(now, (sideways * dx, sideways * dy, upwards * dz))
+    return add(now, (sideways * dx, sideways * dy, upwards * dz))
 
 
 @compiled
@@ -183,7 +183,7 @@ def seen_later(b, omega, time):
     rate = math.sqrt(dot(omega, omega))
     if rate < 1e-9:
         return b
-    n = divided(omega, rate)
+    n = divide(omega, rate)
     n_cross_b = cross(n, b)
     cosine = math.cos(rate * time)
     sine = -math.sin(rate * time)

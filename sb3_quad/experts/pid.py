@@ -9,7 +9,7 @@ from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.physics import rotation, to_body
 from sb3_quad.simulation.state import QuadcopterState, X
-from sb3_quad.simulation.vectors import difference, vector_at
+from sb3_quad.simulation.vectors import subtract, vector_at
 from sb3_quad.vehicles.vehicle import VehicleSource
 
 # The thesis scales φ_des and θ_des to a quarter, "to ensure smoother rotations" (3.2.1).
@@ -81,14 +81,14 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
     half = (high - low) / 2
     thrusts = np.empty(4)
     for i in range(actions.shape[0]):
-        position_error = difference(vector_at(state, X.target, i), vector_at(state, X.position, i))
+        position_error = subtract(vector_at(state, X.target, i), vector_at(state, X.position, i))
         ahead = vector_at(state, X.target_ahead, i)
         c, s, yaw_rate = vector_at(state, X.target_heading, i)
         if c == s == 0.0:
             c = 1.0
         # The velocity in the body frame, and the Euler angles Z-Y-X.
         body_to_world = rotation(state[X.quaternion :], i)
-        v = difference(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i))
+        v = subtract(vector_at(state, X.velocity, i), vector_at(state, X.target_velocity, i))
         vx, vy, vz = to_body(body_to_world, v)
         p, q, r = vector_at(state, X.body_rates, i)
         (r11, _, _), (r21, _, _), (r31, r32, r33) = body_to_world

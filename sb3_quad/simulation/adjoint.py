@@ -2,9 +2,9 @@
 step to the state before it.
 
 ``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost with respect to
-the first ``MOVING`` rows of a block's state. Each function here undoes one function of
-:mod:`.physics` or :mod:`.observation`: it turns the gradient with respect to the results into the
-gradient with respect to the arguments.
+the first ``MOVING`` rows of a block's state. Each function here is the vector-Jacobian product
+(vjp) of one function of :mod:`.physics` or :mod:`.observation`: it turns the gradient with respect
+to the results into the gradient with respect to the arguments.
 
 The states between the physics steps of a control step are computed again: that costs less than
 keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as 1.
@@ -25,14 +25,14 @@ from sb3_quad.simulation.physics import (
 )
 from sb3_quad.simulation.state import X
 from sb3_quad.simulation.vectors import (
-    difference,
+    add,
     dot,
     four,
-    product,
+    matvec,
+    multiply,
     scaled,
     store,
-    times,
-    total,
+    subtract,
     transposed,
     turn,
     vector,
@@ -49,7 +49,7 @@ def _add_rotation(quaternion, gradient, lane, matrix):
     """
     qw, qx, qy, qz = four(quaternion, lane)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
-    x, y, z = difference((zy, xz, yx), (yz, zx, xy))
+    x, y, z = subtract((zy, xz, yx), (yz, zx, xy))
     gradient[X.quaternion, lane] += 2.0 * (qx * x + qy * y + qz * z)
     turned = (
         qy * (xy + yx) + qz * (xz + zx) - 2.0 * qx * (yy + zz) + qw * x,
@@ -67,8 +67,8 @@ def _add(gradient, row, lane, a):
 
 
 @fast
-def undo_move(before, after, gradient, dt):
-    """Undo :func:`.physics.move`, in place.
+def move_vjp(before, after, gradient, dt):
+    """Vector-Jacobian product of :func:`.physics.move`, in place.
 
     :param before: the state before the physics step, (MOVING, LANES); only its attitude is read.
     :param after: the state after it; only its body rates are read.
@@ -109,13 +109,13 @@ def undo_move(before, after, gradient, dt):
         slope = (h2 / 10.0 * slope - 1.0) / 3.0
         t = tx, ty, tz
         along = slope * dot(h, t) - sinc * tw
-        turned = total(scaled(sinc, t), scaled(along, h))
+        turned = add(scaled(sinc, t), scaled(along, h))
         _add(gradient, X.body_rates, lane, scaled(half_step, turned))
 
 
 @fast
-def undo_accelerate(b, before, after, gradient, grad_wanted):
-    """Undo :func:`.physics.accelerate`, in place.
+def accelerate_vjp(b, before, after, gradient, grad_wanted):
+    """Vector-Jacobian product of :func:`.physics.accelerate`, in place.
 
     :param b: a block whose vehicle, wrench, wind and wanted speeds are loaded.
     :param before: the state before the physics step, (MOVING, LANES), and ``after`` that after it.
@@ -127,9 +127,9 @@ def undo_accelerate(b, before, after, gradient, grad_wanted):
 
         # Gradient with respect to the torque in the body frame, and through the gyroscopic terms to
         # the body rates
-        torque = product(vector(b.rates_gain, lane), vector(gradient[X.body_rates :], lane))
+        torque = multiply(vector(b.rates_gain, lane), vector(gradient[X.body_rates :], lane))
         wx, wy, wz = vector(before[X.body_rates :], lane)
-        gx, gy, gz = product(vector(b.gyro, lane), torque)
+        gx, gy, gz = multiply(vector(b.gyro, lane), torque)
         gyroscopic = gy * wz + gz * wy, gx * wz + gz * wx, gx * wy + gy * wx
         _add(gradient, X.body_rates, lane, scaled(-1.0, gyroscopic))
 
@@ -155,24 +155,26 @@ def undo_accelerate(b, before, after, gradient, grad_wanted):
             ) * grad_new + grad_thrust * exact * new
 
         # Recompute the force in the body frame: drag from the airspeed, and the thrusts.
-        airspeed = difference(vector(before[X.velocity :], lane), vector(b.wind, lane))
+        airspeed = subtract(vector(before[X.velocity :], lane), vector(b.wind, lane))
         drag = vector(b.drag, lane)
-        fx, fy, fz = difference(vector(b.force_body, lane), product(drag, to_body(r, airspeed)))
+        fx, fy, fz = subtract(vector(b.force_body, lane), multiply(drag, to_body(r, airspeed)))
         force = fx, fy, fz + total_thrust(b, lane)
 
         # Gradient with respect to the velocity, through the drag, and to the attitude: forces, drag
         # and torques turn.
-        braked = product(scaled(-1.0, drag), in_body)
+        braked = multiply(scaled(-1.0, drag), in_body)
         _add(gradient, X.velocity, lane, to_world(r, braked))
         x, y, z = transposed((push, airspeed, vector(b.torque_world, lane)))
         turned = transposed((force, braked, torque))
-        matrix = times(turned, x), times(turned, y), times(turned, z)
+        matrix = matvec(turned, x), matvec(turned, y), matvec(turned, z)
         _add_rotation(before[X.quaternion :], gradient, lane, matrix)
 
 
 @compiled
-def undo_flight(b, states, gradient, grad_wanted, dt, substeps):
-    """Undo :func:`.physics.fly`: the physics steps of a control step, the last one first.
+def flight_vjp(b, states, gradient, grad_wanted, dt, substeps):
+    """Vector-Jacobian product of :func:`.physics.fly`.
+
+    It takes the physics steps of a control step, the last one first.
 
     :param b: a block with the state before the control step; its flight is computed again.
     :param states: memory for the states in between, (substeps + 1, MOVING, LANES).
@@ -185,13 +187,13 @@ def undo_flight(b, states, gradient, grad_wanted, dt, substeps):
     grad_wanted[:] = 0.0
     for substep in range(substeps - 1, -1, -1):
         before, after = states[substep], states[substep + 1]
-        undo_move(before, after, gradient, dt)
-        undo_accelerate(b, before, after, gradient, grad_wanted)
+        move_vjp(before, after, gradient, dt)
+        accelerate_vjp(b, before, after, gradient, grad_wanted)
 
 
 @compiled
-def undo_limits(b, grad_speed):
-    """Undo :func:`.physics.limit_speeds`, in place.
+def limits_vjp(b, grad_speed):
+    """Vector-Jacobian product of :func:`.physics.limit_speeds`, in place.
 
     :param b: a block with the speeds before it, ``command``, and after it, ``wanted_speeds``.
     :param grad_speed: (4, LANES), with respect to the speeds after it.
@@ -215,8 +217,8 @@ def undo_limits(b, grad_speed):
 
 
 @fast
-def undo_noise(b, grad_feature):
-    """Undo noise and scaling of the features (Eq. 3.16), in place.
+def noise_vjp(b, grad_feature):
+    """Vector-Jacobian product of noise and scaling of the features (Eq. 3.16), in place.
 
     :param b: a block whose features without noise, noise and scaling are computed.
     :param grad_feature: float64 (OBSERVATION_SIZE, LANES), with respect to the scaled features.
@@ -234,8 +236,8 @@ def undo_noise(b, grad_feature):
 
 
 @fast
-def undo_relation(b, grad_feature):
-    """Undo what :func:`.observation.features` does for a moving reference, in place."""
+def relation_vjp(b, grad_feature):
+    """Vector-Jacobian product of what :func:`.observation.features` does for a moving reference."""
     f = grad_feature
     for lane in range(LANES):
         cosine, sine = heading_of(b, lane)
@@ -253,9 +255,10 @@ DIFFERENTIATED = {"position", "rotation", "velocity", "body_rates"}
 
 
 @fast
-def undo_features(b, grad_feature, gradient, for_px4):
-    """Undo :func:`.observation.features`: add to the gradient with respect to the state of a
-    loaded block.
+def features_vjp(b, grad_feature, gradient, for_px4):
+    """Vector-Jacobian product of :func:`.observation.features`.
+
+    It is added to the gradient with respect to the state of a loaded block.
 
     :param grad_feature: float64 (OBSERVATION_SIZE, LANES), with respect to the features in
         their units.
@@ -275,9 +278,9 @@ def undo_features(b, grad_feature, gradient, for_px4):
             v = vector(b.velocity, lane)
         _add(gradient, X.velocity, lane, of_velocity)
         # The observed matrix is Rᵀ, row by row: its columns are the rows of R.
-        x = total(_column(f, 0, lane), scaled(v[0], observed))
-        y = total(_column(f, 1, lane), scaled(v[1], observed))
-        z = total(_column(f, 2, lane), scaled(v[2], observed))
+        x = add(_column(f, 0, lane), scaled(v[0], observed))
+        y = add(_column(f, 1, lane), scaled(v[1], observed))
+        z = add(_column(f, 2, lane), scaled(v[2], observed))
         _add_rotation(b.quaternion, gradient, lane, (x, y, z))
 
 

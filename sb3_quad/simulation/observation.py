@@ -16,9 +16,9 @@ from sb3_quad.simulation.physics import rotation, to_body
 from sb3_quad.simulation.random import random_words, standard_normals
 from sb3_quad.simulation.state import first_rows, row_slices
 from sb3_quad.simulation.vectors import (
-    difference,
     dot,
     store,
+    subtract,
     transposed,
     turn,
     vector,
@@ -111,7 +111,7 @@ def _features_at_rest(b, for_px4):
         v = vector(b.velocity, lane)
         if not for_px4:
             v = to_body(r, v)
-        offset = difference(vector(b.position, lane), vector(b.target, lane))
+        offset = subtract(vector(b.position, lane), vector(b.target, lane))
         store(b.observed_position, lane, offset)
         # From world to body: the columns of r
         x, y, z = transposed(r)

@@ -18,14 +18,14 @@ import math
 
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
 from sb3_quad.simulation.vectors import (
-    difference,
+    add,
     dot,
     four,
-    product,
+    matvec,
+    multiply,
     scaled,
     store,
-    times,
-    total,
+    subtract,
     transposed,
     vector,
 )
@@ -53,13 +53,13 @@ def rotation(quaternion, lane):
 @inlined
 def to_world(r, a):
     """Rotate a vector from the body frame to the world frame."""
-    return times(r, a)
+    return matvec(r, a)
 
 
 @inlined
 def to_body(r, a):
     """Rotate a vector from the world frame to the body frame."""
-    return times(transposed(r), a)
+    return matvec(transposed(r), a)
 
 
 @fast
@@ -151,23 +151,23 @@ def accelerate(b):
 
         # The force without gravity, first in the body frame. Drag is that of the airspeed.
         v = vector(b.velocity, lane)
-        airspeed = to_body(r, difference(v, vector(b.wind, lane)))
-        drag = product(vector(b.drag, lane), airspeed)
-        fx, fy, fz = difference(vector(b.force_body, lane), drag)
+        airspeed = to_body(r, subtract(v, vector(b.wind, lane)))
+        drag = multiply(vector(b.drag, lane), airspeed)
+        fx, fy, fz = subtract(vector(b.force_body, lane), drag)
         force = to_world(r, (fx, fy, fz + total_thrust(b, lane)))
-        force = total(vector(b.force_world, lane), force)
+        force = add(vector(b.force_world, lane), force)
         fall = (0.0, 0.0, b.fall[lane])
-        v = total(v, difference(scaled(b.velocity_gain[lane], force), fall))
+        v = add(v, subtract(scaled(b.velocity_gain[lane], force), fall))
 
         # Euler's equations in the body frame
         torque = to_body(r, vector(b.torque_world, lane))
         w = vector(b.body_rates, lane)
         wx, wy, wz = w
         in_body = vector(b.torque_body, lane)
-        gyroscopic = product(vector(b.gyro, lane), (wy * wz, wz * wx, wx * wy))
+        gyroscopic = multiply(vector(b.gyro, lane), (wy * wz, wz * wx, wx * wy))
         moments = moment(b, 0, lane), moment(b, 1, lane), moment(b, 2, lane)
-        torque = total(torque, total(difference(in_body, gyroscopic), moments))
-        w = total(w, product(vector(b.rates_gain, lane), torque))
+        torque = add(torque, add(subtract(in_body, gyroscopic), moments))
+        w = add(w, multiply(vector(b.rates_gain, lane), torque))
 
         store(b.velocity, lane, v)
         store(b.body_rates, lane, w)
@@ -232,7 +232,7 @@ def move(b, dt):
     """
     for lane in range(LANES):
         way = scaled(dt, vector(b.velocity, lane))
-        store(b.position, lane, total(vector(b.position, lane), way))
+        store(b.position, lane, add(vector(b.position, lane), way))
         h = scaled(0.5 * dt, vector(b.body_rates, lane))
         sinc, cosine = sinc_and_cosine(dot(h, h))
         w, x, y, z = quaternion_product(four(b.quaternion, lane), (cosine, *scaled(sinc, h)))

@@ -5,7 +5,7 @@
 import math
 
 from sb3_quad.simulation.compiled import LANES, compiled, fast, inlined
-from sb3_quad.simulation.vectors import difference, dot, four, polynomial, vector
+from sb3_quad.simulation.vectors import dot, four, polynomial, subtract, vector
 
 # Coefficients of Cephes' arctangent, the highest power first
 _NUMERATOR = (
@@ -55,7 +55,7 @@ def score(b):
     which the thesis does not have, is steep in the last metre, where Eq. 4.5 is not.
     """
     for lane in range(LANES):
-        distance = _length(difference(vector(b.position, lane), vector(b.target, lane)))
+        distance = _length(subtract(vector(b.position, lane), vector(b.target, lane)))
         qw, qx, qy, qz = four(b.quaternion, lane)
         tilt = _tilt(qx * qx + qy * qy, qw * qw + qz * qz)
         near = distance / (distance + b.precision_range[lane])

@@ -12,11 +12,11 @@ from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.simulation.adjoint import (
     DIFFERENTIATED,
     MOVING,
-    undo_features,
-    undo_flight,
-    undo_limits,
-    undo_noise,
-    undo_relation,
+    features_vjp,
+    flight_vjp,
+    limits_vjp,
+    noise_vjp,
+    relation_vjp,
 )
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
@@ -65,7 +65,7 @@ class FlightTape:
     def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
         if FEATURE_SIZES.keys() != DIFFERENTIATED:
             names = ", ".join(FEATURE_SIZES.keys() - DIFFERENTIATED)
-            raise ConfigError(f"features {names}: have no gradient yet; see undo_features")
+            raise ConfigError(f"features {names}: have no gradient yet; see features_vjp")
         n = batch.n
         self.substeps = batch.substeps if substeps is None else substeps
         self.control_step = batch.physics_step * batch.substeps
@@ -166,7 +166,7 @@ class FlightTape:
         batch = self.batch
         self.grad_start += self._grad_states[step, :MOVING]
         share_out(
-            undo,
+            step_vjp,
             batch.helpers,
             step,
             self.lengths,
@@ -196,12 +196,12 @@ class FlightTape:
 
 
 @compiled
-def undo(
+def step_vjp(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
     moves, for_px4, ages, integrals, integral_numbers, grad_observation, grad_frames, grad_integral,
     gradient, grad_actions, physics_step, substeps,
 ):  # fmt: skip
-    """Undo a control step and the observation after it; see :class:`FlightTape`.
+    """Vector-Jacobian product of a control step and the observation after it, see FlightTape.
 
     The arguments are as in :func:`.kernel.step`, with a leading axis for the control steps, and:
 
@@ -244,16 +244,16 @@ def undo(
                 features(b, moves, for_px4)
                 random_words(b)
                 standard_normals(b)
-                _undo_frames(
+                _frames_vjp(
                     b, first, count, step + 1, lengths, actions, ages, integrals, integral_numbers,
                     grad_observation, grad_frames, grad_integral, grad_feature, grad_actions,
                 )  # fmt: skip
                 if for_px4:
                     clear_hidden(grad_feature[F.rotation : F.velocity])
-                undo_noise(b, grad_feature)
+                noise_vjp(b, grad_feature)
                 if moves and not for_px4:
-                    undo_relation(b, grad_feature)
-                undo_features(b, grad_feature, own, for_px4)
+                    relation_vjp(b, grad_feature)
+                features_vjp(b, grad_feature, own, for_px4)
 
             load_rows(states[step], first, b.state)
             load_rows(wrench, first, b.wrench)
@@ -270,8 +270,8 @@ def undo(
                 limit_speeds(b, b.wanted_speeds, lane)
                 if step >= lengths[i]:
                     own[:, lane] = 0.0
-            undo_flight(b, substep_states, own, grad_wanted, physics_step, substeps)
-            undo_limits(b, grad_wanted)
+            flight_vjp(b, substep_states, own, grad_wanted, physics_step, substeps)
+            limits_vjp(b, grad_wanted)
             save_rows(own, first, count, gradient)
             for lane in range(count):
                 i = first + lane
@@ -287,7 +287,7 @@ def undo(
 
 
 @compiled
-def _undo_frames(
+def _frames_vjp(
     b, first, count, step, lengths, actions, ages, integrals, numbers, grad_observation,
     grad_frames, grad_integral, grad_feature, grad_actions,
 ):  # fmt: skip
@@ -310,15 +310,16 @@ def _undo_frames(
             if abs(actions[step - 1, i, k]) < float32(1.0):
                 grad_actions[step - 1, i, k] += frame[OBSERVATION_SIZE + k]
         if grad_integral.shape[0] > 0:
-            _undo_integral(b, lane, i, integrals[step], numbers, frame, grad_integral)
+            _integral_vjp(b, lane, i, integrals[step], numbers, frame, grad_integral)
         grad_feature[:, lane] = frame[:OBSERVATION_SIZE]
         frame[:] = 0.0
 
 
 @compiled
-def _undo_integral(b, lane, i, integral, numbers, frame, grad_integral):
-    """Undo :func:`.frames.integrate_position` of a row; ``frame`` is the gradient with respect
-    to its frame.
+def _integral_vjp(b, lane, i, integral, numbers, frame, grad_integral):
+    """Vector-Jacobian product of :func:`.frames.integrate_position` of a row.
+
+    :param frame: the gradient with respect to its frame.
     """
     error2 = speed2 = 0.0
     for axis in range(3):

@@ -48,19 +48,19 @@ def cross(a, b):
 
 
 @inlined
-def total(a, b):
+def add(a, b):
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @inlined
-def difference(a, b):
+def subtract(a, b):
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @inlined
-def product(a, b):
+def multiply(a, b):
     """Return the products of the components of a and b."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
@@ -72,7 +72,7 @@ def scaled(factor, a):
 
 
 @inlined
-def divided(a, divisor):
+def divide(a, divisor):
     """Return a / divisor."""
     return a[0] / divisor, a[1] / divisor, a[2] / divisor
 
@@ -85,7 +85,7 @@ def transposed(matrix):
 
 
 @inlined
-def times(matrix, a):
+def matvec(matrix, a):
     """Return matrix times a."""
     return dot(matrix[0], a), dot(matrix[1], a), dot(matrix[2], a)
 

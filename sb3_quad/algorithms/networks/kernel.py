@@ -133,7 +133,7 @@ def _activate(h, bias, kind, size):
 
 
 @compiled(fastmath=_FAST)
-def _undo_activation(g, h, kind, db, size):
+def _activation_vjp(g, h, kind, db, size):
     """g = g f'(x) with h = f(x), both (rows, size).
 
     db (rows,) += the sums of g over the rows of the mini-batch.
@@ -226,7 +226,7 @@ def _backward(activations, scratch, layers, sums, last_layer, size):
         at -= columns * size
         place -= rows * (columns + 1)
         middle = place + rows * columns
-        _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows], size)
+        _activation_vjp(g, h, kinds[layer - 1], sums[middle : middle + rows], size)
         _add_products(
             g,
             _layer(activations, at, columns, size),

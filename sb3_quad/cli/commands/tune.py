@@ -67,7 +67,7 @@ FLAGS: Flags = {
     "--n-evaluations N": (positive, 10, "evaluations per trial, for the pruner (10)"),
     "--storage WHERE": "journal file, or URL of a database (study.log in the new folder)",
     "--study-name NAME": "name of the study in the storage (ALGO_ENV)",
-    "--search-space FILE": "YAML file of the settings to vary (the package's file for the algorithm)",
+    "--search-space FILE": "YAML file of settings to vary (the package's file for the algorithm)",
     "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
     "--seed N": (seed, "seed of trainings and sampler, negative for a random one (0)"),
     "--eval-episodes N": (positive, "episodes per evaluation (batch: 240, else 48)"),
