@@ -335,7 +335,7 @@ def test_studies_of_others_are_refused_and_one_that_was_left_at_its_birth_is_beg
     optuna.create_study(study_name="left", storage=storage, direction="maximize")
     known = [*command, "--n-trials", "1", "--storage", "studies.log", "--study-name"]
     assert main([*known, "others"]) == 2
-    assert "not of tune" in one_line_of_error(capsys)
+    assert "not made by tune" in one_line_of_error(capsys)
     assert main([*known, "left"]) == 0
     assert [row["state"] for row in trials()] == ["COMPLETE"]
 

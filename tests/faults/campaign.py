@@ -183,11 +183,11 @@ def again(kind: str, folder: Path) -> list[str]:
 
 def never_began(path: Path) -> bool:
     """Whether a file is in a folder of a command that was killed before it had written its
-    settings; it is nobody's.
+    settings, or in that of a run before its pipeline had noted it; it is nobody's.
     """
     folders = [each for each in path.parents if re.fullmatch(NUMBERED, each.name)]
     return not all(
-        any(each.glob(MARKS.get(each.name.rpartition("_")[0], "*/args.yml"))) for each in folders
+        any(each.glob(MARKS.get(each.name.rpartition("_")[0], "0.monitor.csv"))) for each in folders
     )
 
 
