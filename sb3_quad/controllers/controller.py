@@ -110,16 +110,16 @@ class Controller:
         # The source may use other limits: a model those that it has learnt with, an expert on the
         # true state those of the quadcopter without wrappers.
         own = getattr(source, "action_space", None)
-        through_wrapper = False
+        converts_actions = False
         if self._true_state is not None and env is not None and env.has_attr(KEY):
             own = spaces.Box(-1.0, 1.0, action_space.shape)
-            through_wrapper = env.has_attr("action")
+            converts_actions = env.has_attr("action")
         self._own_limits: Float32Array | None = None
         if isinstance(own, spaces.Box):
             if not np.allclose(limits_of(own), self._limits):
                 self._own_limits = limits_of(own)
-                through_wrapper = True
-            if through_wrapper and not _is_straight(env, action_space, own):
+                converts_actions = True
+            if converts_actions and not _is_straight(env, action_space, own):
                 way_out = "no wrapper such as RescaleAction converts one into the other"
                 if hasattr(source, "action_space"):
                     way_out = (

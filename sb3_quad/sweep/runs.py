@@ -107,7 +107,9 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     changes = all_changes(configuration.hyperparams, configuration.given(SettingsOptions))
     if configuration.vehicle is not None:
         if "vehicle" in changes.get("env_kwargs", {}):
-            raise ConfigError(f"vehicle {configuration.vehicle}: env_kwargs have one, too")
+            raise ConfigError(
+                f"vehicle {configuration.vehicle}: env_kwargs have one, too; remove one"
+            )
         put_key(changes, "env_kwargs.vehicle", configuration.vehicle, "vehicle")
     plan = plan_training(configuration.given(Configuration), changes)
     # A single run is a pipeline of one stage.

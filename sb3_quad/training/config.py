@@ -417,11 +417,12 @@ def with_absolute_paths(env_id: str, settings: StrDict) -> StrDict:
     packages' environments is unknown.
     """
     settings = dict(settings)
-    for key in ENV_KEYS & settings.keys() if env_id in ENVIRONMENTS else ():
-        settings[key] = {
-            name: _absolute(value) if name in FILE_KEYS else value
-            for name, value in parse_mapping(settings[key], key).items()
-        }
+    if env_id in ENVIRONMENTS:
+        for key in ENV_KEYS & settings.keys():
+            settings[key] = {
+                name: _absolute(value) if name in FILE_KEYS else value
+                for name, value in parse_mapping(settings[key], key).items()
+            }
     if isinstance(settings.get("demonstrations"), str):
         settings["demonstrations"] = str(Path(settings["demonstrations"]).absolute())
     expert = str(settings.get("expert"))
