@@ -42,7 +42,7 @@ linkcheck_anchors = False
 nitpick_ignore_regex = [("py:.*", r"(?!sb3_quad).*"), ("py:class", r".*\.(Bounded|a_number)")]
 
 # The reference must have every name in the __all__ of these.
-PACKAGES = ("sb3_quad", "sb3_quad.envs", "sb3_quad.callbacks", "sb3_quad.vehicles")
+PACKAGES = ("sb3_quad", "sb3_quad.envs", "sb3_quad.callbacks", "sb3_quad.envs.vehicles")
 IMPORTED = re.compile(r"^from (sb3_quad[\w.]*) import ([\w, ]+)", re.MULTILINE)
 
 
@@ -114,7 +114,7 @@ def check_coverage(app: Sphinx, env: BuildEnvironment) -> None:
 
 def link_cards(app: Sphinx, page: str, source: list[str]) -> None:
     """Let links to the agents' cards lead to the page of all cards."""
-    card = re.compile(r"\]\((?:\.\./)+sb3_quad/controllers/pretrained/([\w-]+)\.md\)")
+    card = re.compile(r"\]\((?:\.\./)+sb3_quad/agents/pretrained/([\w-]+)\.md\)")
     source[0] = card.sub(r"](/reference/cards.md#\1)", source[0])
 
 

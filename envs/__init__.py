@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from sb3_quad.envs.batch_vec_env import BatchVecEnv
     from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+    from sb3_quad.envs.simulation.tasks import TASKS, Task
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
-    from sb3_quad.simulation.tasks import TASKS, Task
 
 __all__ = [
     "TASKS",
@@ -26,8 +26,8 @@ _LAZY = {
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
     "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",
-    "TASKS": "sb3_quad.simulation.tasks",
-    "Task": "sb3_quad.simulation.tasks",
+    "TASKS": "sb3_quad.envs.simulation.tasks",
+    "Task": "sb3_quad.envs.simulation.tasks",
 }
 
 __getattr__, __dir__ = lazy_names(__name__, _LAZY)

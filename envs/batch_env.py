@@ -13,18 +13,18 @@ from typing_extensions import Unpack
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.types import AnyArray, FloatArray, StrDict, StrMapping
 from sb3_quad.base.validate import validate
-from sb3_quad.simulation.batch import QuadcopterBatch, Rows, StepResult
-from sb3_quad.simulation.checks import per_row
-from sb3_quad.simulation.frames import PositionIntegral
-from sb3_quad.simulation.motions import Motion
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.randomization import Randomization
-from sb3_quad.simulation.references import Reference
-from sb3_quad.simulation.settings import FlightSettings, Noise
-from sb3_quad.simulation.state import QUATERNION, TARGET, QuadcopterState, make_wrench
-from sb3_quad.simulation.tasks import TaskSpec
-from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
-from sb3_quad.vehicles.vehicle import Vehicle, VehicleSource
+from sb3_quad.envs.simulation.batch import QuadcopterBatch, Rows, StepResult
+from sb3_quad.envs.simulation.checks import per_row
+from sb3_quad.envs.simulation.frames import PositionIntegral
+from sb3_quad.envs.simulation.motions import Motion
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.envs.simulation.randomization import Randomization
+from sb3_quad.envs.simulation.references import Reference
+from sb3_quad.envs.simulation.settings import FlightSettings, Noise
+from sb3_quad.envs.simulation.state import QUATERNION, TARGET, QuadcopterState, make_wrench
+from sb3_quad.envs.simulation.tasks import TaskSpec
+from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
+from sb3_quad.envs.vehicles.vehicle import Vehicle, VehicleSource
 
 # Keys of an info, and the fields of ``batch.outcome`` that they show.
 INFOS = {
@@ -39,8 +39,8 @@ INFOS = {
 class FlightKeywords(TypedDict, total=False):
     """Keywords of the environments for editors and type checkers.
 
-    :class:`~sb3_quad.simulation.settings.FlightSettings` declares them, with their defaults and
-    meanings. Each constructor adds ``task``, and a test keeps both lists equal.
+    :class:`~sb3_quad.envs.simulation.settings.FlightSettings` declares them, with their
+    defaults and meanings. Each constructor adds ``task``, and a test keeps both lists equal.
     """
 
     task_kwargs: StrMapping | None
@@ -221,7 +221,7 @@ class BatchEnv:
         """Set the observation noise until you set another.
 
         :param level: the relative standard deviation, one number or one for each of these rows; or
-            a :class:`~sb3_quad.simulation.settings.Noise` or its fields. 0: no noise.
+            a :class:`~sb3_quad.envs.simulation.settings.Noise` or its fields. 0: no noise.
         :raises ConfigError: a wrong shape, or a level below 0 or above 100.
         """
         self.batch.set_noise(level, indices)

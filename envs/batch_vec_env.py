@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import AnyArray, IntArray, StrDict
-from sb3_quad.simulation.settings import ENDLESS
+from sb3_quad.envs.simulation.settings import ENDLESS
 
 
 class BatchVecEnv(VecEnv):

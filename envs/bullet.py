@@ -5,8 +5,8 @@ import weakref
 
 import numpy as np
 
-from sb3_quad.base.bullet import p
 from sb3_quad.base.types import FloatArray, Image
+from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Lens, chasing, framing_camera
 from sb3_quad.envs.rendering.scene import Pose, Scene
 from sb3_quad.envs.rendering.window import (
@@ -14,8 +14,8 @@ from sb3_quad.envs.rendering.window import (
     point_window,
     start_drawing,
 )
-from sb3_quad.simulation.physics import rotation_rows, to_body
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.physics import rotation_rows, to_body
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     FORCE_WORLD,
     POSITION,
@@ -27,7 +27,7 @@ from sb3_quad.simulation.state import (
     P,
     QuadcopterState,
 )
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
 # PyBullet's window makes the simulation wait for each frame, so it draws only this many per second.

@@ -11,7 +11,7 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, BoolArray, Float32Array, StrDict
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
-from sb3_quad.simulation.tasks import TaskSpec
+from sb3_quad.envs.simulation.tasks import TaskSpec
 
 MODES = ("NextStep", "SameStep")
 
@@ -28,7 +28,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArr
     The infos of every step hold ``is_success``, ``survival``, ``distance``, ``collision`` and
     ``out_of_range``, (n,) each. ``_is_success`` and so on are masks of the rows that have a value.
 
-    Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
+    Further keywords are the fields of :class:`~sb3_quad.envs.simulation.settings.FlightSettings`.
 
     :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. With ``"SameStep"`` a
         row that ends returns the first observation and infos of its next episode; the last ones are

@@ -14,10 +14,10 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.envs.rendering.window import Client, has_display, open_window
-from sb3_quad.simulation.checks import check_size
-from sb3_quad.simulation.settings import ENDLESS, AsList
-from sb3_quad.simulation.state import POSITION, P
-from sb3_quad.simulation.tasks import TaskSpec
+from sb3_quad.envs.simulation.checks import check_size
+from sb3_quad.envs.simulation.settings import ENDLESS, AsList
+from sb3_quad.envs.simulation.state import POSITION, P
+from sb3_quad.envs.simulation.tasks import TaskSpec
 
 Vector = Annotated[tuple[float, float, float], AsList]
 Quaternion = Annotated[tuple[float, float, float, float], AsList]
@@ -179,12 +179,13 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     target. Render mode `"human"` opens a
     real-time window, one per process; `"rgb_array"` makes pictures and needs no display.
 
-    The classes are :class:`~sb3_quad.simulation.tasks.Task`,
-    :class:`~sb3_quad.vehicles.vehicle.Vehicle`, :class:`~sb3_quad.simulation.settings.Noise`,
-    :class:`~sb3_quad.simulation.frames.PositionIntegral`,
-    :class:`~sb3_quad.simulation.vehicle_distribution.VehicleDistribution`,
-    :class:`~sb3_quad.simulation.randomization.Randomization` and
-    :class:`~sb3_quad.simulation.references.Reference`.
+    The classes are :class:`~sb3_quad.envs.simulation.tasks.Task`,
+    :class:`~sb3_quad.envs.vehicles.vehicle.Vehicle`,
+    :class:`~sb3_quad.envs.simulation.settings.Noise`,
+    :class:`~sb3_quad.envs.simulation.frames.PositionIntegral`,
+    :class:`~sb3_quad.envs.simulation.vehicle_distribution.VehicleDistribution`,
+    :class:`~sb3_quad.envs.simulation.randomization.Randomization` and
+    :class:`~sb3_quad.envs.simulation.references.Reference`.
 
     ## While Flying
 

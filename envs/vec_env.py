@@ -15,8 +15,8 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import IntArray, StrDict
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.batch_vec_env import BatchVecEnv, refuse_options
-from sb3_quad.simulation.tape import FlightTape
-from sb3_quad.simulation.tasks import TaskSpec
+from sb3_quad.envs.simulation.tape import FlightTape
+from sb3_quad.envs.simulation.tasks import TaskSpec
 
 _OF_ROWS = (
     "target",
@@ -63,7 +63,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     infos of other rows are empty. The environment reuses the list of infos and the dictionaries in
     it: a wrapper that writes into one should write into a copy. The arrays are new ones.
 
-    Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
+    Further keywords are the fields of :class:`~sb3_quad.envs.simulation.settings.FlightSettings`.
 
     :param n_envs: number of rows.
     :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over

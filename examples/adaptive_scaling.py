@@ -16,13 +16,15 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.colors import to_hex, to_rgb
 
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.offset_correction import N_OFFSETS, ROUNDS, hover_offset
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.cli.output import console
-from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.envs.simulation.observation import DEFAULT_STD, GROUPS
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
@@ -31,8 +33,6 @@ from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.report.scenario_plots import arrivals_plot
-from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS
-from sb3_quad.simulation.settings import FlightSettings
 
 POSITION = GROUPS["position"]
 

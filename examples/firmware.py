@@ -16,7 +16,8 @@ import numpy as np
 from stable_baselines3 import PPO
 
 from sb3_quad import env_kwargs, fly
-from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import Flights, Hook
 from sb3_quad.evaluation.supervisor import (
     FREE_FALL,
@@ -25,7 +26,6 @@ from sb3_quad.evaluation.supervisor import (
     UPSIDE_DOWN,
     UPSIDE_DOWN_TIME,
 )
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("state_recovery", "target_tracking")
 # src/platform/interface/platform_defaults_cf2.h and _cf21bl.h: the thrust of a rotor, N, is a

@@ -21,9 +21,9 @@ import numpy as np
 import pybullet
 
 import sb3_quad  # noqa: F401  (registers the environments)
-from sb3_quad.controllers.agent_settings import env_kwargs
-from sb3_quad.controllers.pretrained import pretrained
-from sb3_quad.controllers.zips import load_model
+from sb3_quad.agents.agent_settings import env_kwargs
+from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.zips import load_model
 from sb3_quad.envs.rendering.window import has_display
 
 FLOOR = 2.0  # m, the lowest height of the reference

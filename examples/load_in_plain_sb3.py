@@ -1,6 +1,6 @@
 """Fly a trained agent where only Stable-Baselines3 is installed.
 
-    python examples/load_in_plain_sb3.py sb3_quad/controllers/pretrained/itm-robust.zip
+    python examples/load_in_plain_sb3.py sb3_quad/agents/pretrained/itm-robust.zip
 
 Nothing here imports sb3_quad: the zip says what its agent observes. Copy `Observation` to your own
 simulator or vehicle, which `Quadcopter` represents here.

@@ -23,7 +23,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from sb3_quad.base.files import write_text
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.simulation.observation import FEATURES, GROUPS, OBSERVATION_SIZE
+from sb3_quad.envs.simulation.observation import FEATURES, GROUPS, OBSERVATION_SIZE
 
 
 class ObservationStatistics(EveryTimesteps):

@@ -18,8 +18,8 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import DAgger, GeometricExpert, PIDExpert
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -36,6 +36,9 @@ import stable_baselines3
 import yaml
 from stable_baselines3 import PPO
 
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
 from sb3_quad.base.imports import require
@@ -43,9 +46,9 @@ from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli import app
 from sb3_quad.cli.parser import OVERWRITE, SWITCH, TRUST, Flags, positive
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
+from sb3_quad.envs.simulation.frames import ObservationSettings
+from sb3_quad.envs.simulation.settings import FlightSettings, in_words
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metric_tables import (
     FOLLOWING,
@@ -65,10 +68,7 @@ from sb3_quad.evaluation.scenarios.parts import Target
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.export.network import check_policy
-from sb3_quad.simulation.frames import ObservationSettings
-from sb3_quad.simulation.settings import FlightSettings, in_words
 from sb3_quad.training.runs import MADE_WITH, open_run
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 UNKNOWN = "not recorded"
 

@@ -16,17 +16,17 @@ from typing import Any
 
 import numpy as np
 
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.agents.zips import load_model
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.zips import load_model
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.vehicles.vehicle import first_vehicle, load_vehicle
 from sb3_quad.evaluation.fleets import Fleet
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export.policy import export_policy
 from sb3_quad.export.px4 import load_px4
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
 TASKS = ("state_recovery", "target_tracking")
 SECONDS = 15.0

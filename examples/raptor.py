@@ -22,9 +22,9 @@ import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 # The GRU's hidden state, (n, 16), and the last motor commands, (n, 4).
 State = tuple[Float32Array, Float32Array]
@@ -45,8 +45,8 @@ class Raptor:
     It sees the 18 features as an agent does, with their noise. Of the vehicle it knows only the
     order of the rotors and the range of their speeds.
 
-    :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that it flies; or
-        a sequence of n of them, and row i flies number i modulo n.
+    :param vehicle: name, YAML path or :class:`~sb3_quad.envs.vehicles.vehicle.Vehicle` that it
+        flies; or a sequence of n of them, and row i flies number i modulo n.
     :param observation_mean: μ of Eq. 3.16, shape (18,), which is undone; None: the environment's
         default.
     :param observation_std: σ of Eq. 3.16, shape (18,), likewise.

@@ -16,6 +16,9 @@ import pandas as pd
 from rich.console import Console
 
 from sb3_quad import PIDExpert, load_vehicle
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import TORQUE_BODY, QuadcopterState
 from sb3_quad.evaluation.real_flights import (
     QUANTITIES,
     error_table,
@@ -24,9 +27,6 @@ from sb3_quad.evaluation.real_flights import (
     read_logs,
 )
 from sb3_quad.evaluation.tables import text_table
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import TORQUE_BODY, QuadcopterState
 
 STEP = 0.01  # s, of the estimates
 GRAVITY = np.array([0.0, 0.0, 9.81])

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad import PIDExpert
+from sb3_quad.envs.simulation.state import QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.state import QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle
 
 # Table A.1
 KP = 1.5

@@ -16,11 +16,11 @@ import argparse
 import casadi as ca
 import numpy as np
 
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import TARGET
+from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
 from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import TARGET
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 NEAR = 0.1  # m
 START = 100.0  # m; the height of the start, so that the ground does not matter

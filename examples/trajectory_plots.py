@@ -22,10 +22,10 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import Arrays
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly, fly_settings
-from sb3_quad.simulation import MAX_EPISODE_STEPS
-from sb3_quad.simulation.settings import FlightSettings
 
 
 class TrajectoryPlots(EveryTimesteps):

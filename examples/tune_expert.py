@@ -23,12 +23,12 @@ from optuna.storages.journal import JournalFileBackend
 
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.types import BoolArray
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import QuadcopterState
+from sb3_quad.envs.vehicles.gains import GAIN_NAMES, GeometricGains
+from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
 from sb3_quad.evaluation.flights import Flights, Hook, fly, fly_settings
 from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import QuadcopterState
-from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 NEAR = 0.1  # m
 CLOSE = 1.5  # m; the cost of a low flight falls by a factor of e over this height

@@ -12,32 +12,26 @@ _is_command = "sb3_quad.cli" in sys.orig_argv or Path(sys.argv[0]).stem == "sb3-
 if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` are next to this folder rather than in it;
-# an installed package contains them, and then this does nothing.
-_checkout = Path(__file__).resolve().parent.parent
-if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():
-    __path__.append(str(_checkout))
-
 from sb3_quad.base import __version__  # noqa: E402
 from sb3_quad.base.imports import lazy_names  # noqa: E402
 from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:
+    from sb3_quad.agents.agent_settings import env_kwargs
+    from sb3_quad.agents.pretrained import load_pretrained, pretrained
     from sb3_quad.algorithms.apg import APG
     from sb3_quad.algorithms.dagger import DAgger
     from sb3_quad.algorithms.ppo_bc import PPOBC
     from sb3_quad.algorithms.sac_bc import SACBC
-    from sb3_quad.controllers.agent_settings import env_kwargs
-    from sb3_quad.controllers.pretrained import load_pretrained, pretrained
     from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+    from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
+    from sb3_quad.envs.vehicles.vehicle import load_vehicle
     from sb3_quad.evaluation.compare import compare
     from sb3_quad.evaluation.flights import fly
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
-    from sb3_quad.simulation.sampled_vehicles import sample_vehicles
-    from sb3_quad.vehicles.vehicle import load_vehicle
 
 __all__ = [
     "APG",
@@ -71,12 +65,12 @@ _LAZY = {
     "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",
     "SACBC": "sb3_quad.algorithms.sac_bc",
     "compare": "sb3_quad.evaluation.compare",
-    "env_kwargs": "sb3_quad.controllers.agent_settings",
+    "env_kwargs": "sb3_quad.agents.agent_settings",
     "fly": "sb3_quad.evaluation.flights",
-    "load_pretrained": "sb3_quad.controllers.pretrained",
-    "load_vehicle": "sb3_quad.vehicles.vehicle",
-    "pretrained": "sb3_quad.controllers.pretrained",
-    "sample_vehicles": "sb3_quad.simulation.sampled_vehicles",
+    "load_pretrained": "sb3_quad.agents.pretrained",
+    "load_vehicle": "sb3_quad.envs.vehicles.vehicle",
+    "pretrained": "sb3_quad.agents.pretrained",
+    "sample_vehicles": "sb3_quad.envs.simulation.sampled_vehicles",
 }
 
 register_environments()

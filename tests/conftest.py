@@ -59,7 +59,7 @@ class WithoutPyBullet(importlib.abc.MetaPathFinder):
     """
 
     def find_spec(self, name, path=None, target=None):
-        if name in ("pybullet", "sb3_quad.base.bullet"):
+        if name in ("pybullet", "sb3_quad.envs.rendering.bullet_client"):
             pytest.skip("needs PyBullet, the extra [pybullet]", allow_module_level=True)
 
 

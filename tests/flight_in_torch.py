@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.random import STEP
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.envs.simulation.random import STEP
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     FORCE_BODY,
     FORCE_WORLD,

@@ -3,7 +3,7 @@
 import torch
 from stable_baselines3 import PPO
 
-from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained
 
 
 def teach_to_hover(model, std):

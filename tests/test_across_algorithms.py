@@ -6,8 +6,8 @@ import torch as th
 from stable_baselines3 import A2C, PPO, SAC
 
 from sb3_quad import APG, PPOBC, SACBC, DAgger, QuadcopterVecEnv
+from sb3_quad.agents.zips import load_model, load_zip
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.controllers.zips import load_model, load_zip
 
 SHORT = {"n_steps": 20, "batch_size": 40, "n_epochs": 1, "seed": 0, "device": "cpu"}
 SMALL = {"learning_starts": 8, "buffer_size": 1000, "batch_size": 16, "seed": 0, "device": "cpu"}

@@ -12,10 +12,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_quad import PPOBC, DAgger
+from sb3_quad.agents.controller import Controller
 from sb3_quad.algorithms import dagger, ppo_bc
 from sb3_quad.algorithms.networks.losses import CLONING_LOSSES
 from sb3_quad.base.errors import ConfigError, ExpertError
-from sb3_quad.controllers.controller import Controller
 
 BOXES = {"torque": (-0.002, 0.002), "PWM": (1000.0, 2000.0), "rpm": (0.0, 21702.0)}
 SIZES = {"n_steps": 50, "batch_size": 100, "seed": 0, "device": "cpu"}

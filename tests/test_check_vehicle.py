@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from sb3_quad.cli import main
 from sb3_quad.cli.commands.check_vehicle import warnings
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.vehicles.vehicle import VEHICLES, load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.geometric_gains import derived_gains
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
 ITM = load_vehicle("itm")
 names = st.sampled_from(VEHICLES.names())

@@ -22,17 +22,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.results_plotter import load_results
 
 import sb3_quad
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import TrainingError
 from sb3_quad.cli import closing, main
 from sb3_quad.cli.app import COMMANDS
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.envs.simulation.tasks import TASKS
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
-from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.training.config import TrainingJob, as_agent, build_config, load_config
 from sb3_quad.training.trainer import resume, train
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 ENV = "QuadTargetTracking-v0"
 SMALL = {

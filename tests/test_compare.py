@@ -8,10 +8,10 @@ import pytest
 from sb3_quad import PIDExpert, env_kwargs, load_pretrained, pretrained
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.tasks import Task
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.flights import fly, fly_settings
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.tasks import Task
 
 
 def hover(observation):

@@ -9,14 +9,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_quad import PPOBC, SACBC, DAgger
+from sb3_quad.agents.controller import Controller
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.envs.simulation.state import STATE_SIZE, QuadcopterState
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import privileged_geometric
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 
 class Stateful(gym.Env):

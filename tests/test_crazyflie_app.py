@@ -19,17 +19,17 @@ import torch
 from stable_baselines3 import PPO
 from test_export import physical_features
 
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.agents.zips import load_model
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.zips import load_model
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export.load import load_header
 from sb3_quad.export.policy import FOLDERS, export_policy
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 HERE = Path(__file__).resolve().parent
 STUBS = HERE / "firmware_stubs"

@@ -19,12 +19,16 @@ import torch
 from hovering import teach_to_hover
 from stable_baselines3 import A2C, PPO, SAC, TD3
 
+from sb3_quad.agents.agent_settings import env_kwargs
+from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.controllers.agent_settings import env_kwargs
-from sb3_quad.controllers.pretrained import pretrained
-from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import STATE_SIZE, X
+from sb3_quad.envs.vehicles.layout import NamedLayout, find_turn
+from sb3_quad.envs.vehicles.vehicle import VEHICLES, load_vehicle
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flights import fly as fly_flights
 from sb3_quad.show.demo import page as page_module
@@ -36,10 +40,6 @@ from sb3_quad.show.demo.page import (
     make_page,
     script,
 )
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import STATE_SIZE, X
-from sb3_quad.vehicles.layout import NamedLayout, find_turn
-from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
 STEPS = 1000  # control steps
 NODE = shutil.which("node")

@@ -13,8 +13,8 @@ import pytest
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_quad.algorithms.offset_correction
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.cli import main
-from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from stable_baselines3 import PPO
 
+from sb3_quad.agents.pretrained import pretrained
 from sb3_quad.base.yaml_files import YamlFolder, parse_keys
 from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS
-from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.evaluation import evaluate
 from sb3_quad.evaluation.scenarios import load
-from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training import pipeline
 
 ROOT = Path(__file__).resolve().parent.parent

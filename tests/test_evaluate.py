@@ -16,12 +16,14 @@ import pytest
 import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
+from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.zips import load_model, saved_algorithm
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.cli import main
-from sb3_quad.controllers.pretrained import pretrained
-from sb3_quad.controllers.zips import load_model, saved_algorithm
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import evaluate as evaluate_suite
 from sb3_quad.evaluation.flightlog import read_flights
@@ -29,8 +31,6 @@ from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.results import load_results
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 SUITE = """
 name: small

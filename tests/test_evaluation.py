@@ -14,6 +14,7 @@ from rich.console import Console
 from sb3_quad import env_kwargs, load_pretrained
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation import statistics
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, Hook, fly, fly_settings
@@ -24,7 +25,6 @@ from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.statistics import bootstrap, share
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.simulation.settings import FlightSettings
 
 BACKENDS = ("batch", "pybullet")
 

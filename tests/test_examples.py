@@ -12,12 +12,12 @@ import yaml
 from PIL import Image
 from stable_baselines3 import PPO
 
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.cli import main
-from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.simulation.frames import PositionIntegral
-from sb3_quad.simulation.state import X
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.simulation.frames import PositionIntegral
+from sb3_quad.envs.simulation.state import X
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SHORT = ("--timesteps", "100")  # a single rollout

@@ -11,16 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sb3_quad  # noqa: F401  (registers the environments)
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.imports import import_packages
-from sb3_quad.controllers.resolve import resolve_expert
-from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import Hook, fly
-from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.experts.geometric_gains import derived_gains
-from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     QUATERNION,
     STATE_SIZE,
@@ -28,8 +23,13 @@ from sb3_quad.simulation.state import (
     QuadcopterState,
     X,
 )
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
+from sb3_quad.evaluation.flights import Hook, fly
+from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.experts.geometric_gains import derived_gains
+from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.training.algorithms import import_class
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 TO_R0 = np.array([0.0, 0.0, 15.0])
 

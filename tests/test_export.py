@@ -23,21 +23,21 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 from test_extending import DIFFS, ROOT, apply
 
 from sb3_quad import DAgger
+from sb3_quad.agents.agent_settings import env_kwargs
+from sb3_quad.agents.pretrained import agent_path, load_pretrained
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
-from sb3_quad.controllers.agent_settings import env_kwargs
-from sb3_quad.controllers.pretrained import agent_path, load_pretrained
+from sb3_quad.envs.simulation.frames import ObservationSettings
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import X
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export import c_header, network, policy
 from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
 from sb3_quad.export.network import Network, build_network
 from sb3_quad.export.policy import FORMATS, export_policy
-from sb3_quad.simulation.frames import ObservationSettings
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import X
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
 DOCS = (Path(__file__).resolve().parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
@@ -607,7 +607,7 @@ EXPORT = """
 from stable_baselines3 import PPO
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.export.policy import export_policy
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.settings import FlightSettings
 
 sees = {"history": [0, 2], "last_action": True, "position_integral": {}}
 env = QuadcopterVecEnv(1, seed=0, **sees)

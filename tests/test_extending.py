@@ -25,11 +25,11 @@ from sb3_quad import DAgger, GeometricExpert
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
-from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.export.policy import export_policy
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.observation import FEATURE_NAMES
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.observation import FEATURE_NAMES
+from sb3_quad.envs.simulation.settings import FlightSettings
 
 def batch(**task_kwargs):
     given = {"task_kwargs": task_kwargs, "vehicle": "trainer_quad", "noise": 0.0}

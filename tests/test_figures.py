@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import sb3_quad
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import pretrained_names
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.pretrained import pretrained_names
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.statistics import share
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "docs/research/readme"

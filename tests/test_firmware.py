@@ -15,13 +15,9 @@ from sb3_quad import APG, PIDExpert
 from sb3_quad.algorithms.flight_cost import cost_and_gradients, low_force_cost
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.metric_tables import metric_cells
-from sb3_quad.evaluation.metrics import summarise
-from sb3_quad.evaluation.supervisor import Supervisor
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import (
     FORCE_BODY,
     FORCE_WORLD,
     STATE_SIZE,
@@ -29,8 +25,12 @@ from sb3_quad.simulation.state import (
     WRENCH_SIZE,
     QuadcopterState,
 )
-from sb3_quad.simulation.tape import FlightTape
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.simulation.tape import FlightTape
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.metric_tables import metric_cells
+from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.supervisor import Supervisor
 
 CRAZYFLIE = load_vehicle("crazyflie")
 WEIGHT = CRAZYFLIE.mass * CRAZYFLIE.gravity

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
+from sb3_quad.envs.simulation.observation import DEFAULT_STD
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.simulation.observation import DEFAULT_STD
 
 LIMIT = 40
 

@@ -5,10 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, privileged_derived
-from sb3_quad.experts.geometric_gains import derived_gains
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     POSITION,
     QUATERNION,
@@ -18,7 +15,10 @@ from sb3_quad.simulation.state import (
     VELOCITY,
     QuadcopterState,
 )
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.geometric import GeometricExpert, privileged_derived
+from sb3_quad.experts.geometric_gains import derived_gains
 
 ITM = load_vehicle("itm")
 EXPERT = GeometricExpert()

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from test_export import compiled, load, physical_features
 
 import sb3_quad
+from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.controllers.pretrained import pretrained
-from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.envs.vehicles.layout import find_turn
+from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export.policy import export_policy
-from sb3_quad.vehicles.layout import find_turn
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 ITM, CRAZYFLIE = load_vehicle("itm"), load_vehicle("crazyflie")
 ORDERS = list(itertools.permutations(range(4)))

@@ -5,8 +5,7 @@ flights whose answer is known.
 import numpy as np
 import pytest
 
-from sb3_quad.evaluation.flights import Arrivals, Motion
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     POSITION,
     QUATERNION,
@@ -14,6 +13,7 @@ from sb3_quad.simulation.state import (
     TARGET,
     QuadcopterState,
 )
+from sb3_quad.evaluation.flights import Arrivals, Motion
 
 
 def state(position=(0, 0, 0), target=(10, 0, 0), tilt=0.0, rate=0.0):

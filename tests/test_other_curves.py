@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from sb3_quad.envs.simulation.references import Reference
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.export.policy import export_policy
-from sb3_quad.simulation.references import Reference
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 OTHERS = Path(__file__).resolve().parent.parent / "examples" / "other_simulators"
 

@@ -12,9 +12,9 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.training.config import load_config
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 ENV = "QuadStateRecovery-v0"
 TINY = {

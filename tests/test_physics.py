@@ -6,9 +6,9 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     POSITION,
     QUATERNION,
@@ -16,7 +16,7 @@ from sb3_quad.simulation.state import (
     STATE_SIZE,
     VELOCITY,
 )
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
 
 URDF = """<robot name="body"><link name="base"><inertial><mass value="{m!r}"/>
 <inertia ixx="{i[0]!r}" iyy="{i[1]!r}" izz="{i[2]!r}"

@@ -13,6 +13,7 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_quad.agents.pretrained import load_pretrained
 from sb3_quad.algorithms.offset_correction import (
     Correction,
     correct_offset,
@@ -26,7 +27,6 @@ from sb3_quad.base.seeds import LARGEST
 from sb3_quad.callbacks.every import ProgressLine
 from sb3_quad.cli import main
 from sb3_quad.cli.parser import PAIRS
-from sb3_quad.controllers.pretrained import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.training import pipeline as pipeline_module

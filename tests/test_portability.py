@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from sb3_quad.base.compiled import _CacheFile
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import LOCK, locked
-from sb3_quad.simulation.compiled import _CacheFile
 
 ROOT = Path(__file__).resolve().parent.parent
 WITHOUT_POSIX = """

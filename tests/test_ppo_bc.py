@@ -22,16 +22,16 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_quad import load_pretrained
+from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.algorithms import PPOBC, SACBC, DAgger, offset_correction
 from sb3_quad.algorithms.networks.losses import CLONING_LOSSES
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.simulation.settings import KEY
+from sb3_quad.envs.simulation.settings import KEY
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.training.config import load_config
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 STOCK = {
     name: parameter.default

@@ -17,16 +17,16 @@ import yaml
 from stable_baselines3 import PPO
 
 import sb3_quad
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import FOLDER, agent_path, pretrained_names
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.cli import main
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.pretrained import FOLDER, agent_path, pretrained_names
-from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 FAST = ("itm-recovery", "any-quadcopter", "itm-robust")
 OTHERS = sorted(set(pretrained_names()) - set(FAST))

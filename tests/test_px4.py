@@ -9,16 +9,16 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
+from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli import main
-from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.export import px4
 from sb3_quad.export.policy import export_policy
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 X500 = load_vehicle("x500")
 HIDDEN = [5, 8, 11]

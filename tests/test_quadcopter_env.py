@@ -20,9 +20,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.batch_env import FlightKeywords
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 IDS = ["QuadTargetTracking-v0", "QuadStateRecovery-v0"]
 HIGH = {"start_position": (0.0, 0.0, 5000.0), "max_distance": 1e6}  # nothing ends a flight up there

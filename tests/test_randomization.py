@@ -12,13 +12,13 @@ from sb3_quad import envs, sample_vehicles
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import QUATERNION, P, W
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, privileged_geometric
 from sb3_quad.experts.geometric_gains import PRIVILEGED_YAW
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import QUATERNION, P, W
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 RANDOMIZE = {
     "mass": [0.8, 1.25],

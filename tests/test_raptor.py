@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.scenarios.load import parse_suite
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 pytest.importorskip("foundation_policy")
 

@@ -14,6 +14,8 @@ from real_flights import Cascade, Run, estimates, fit, lagged, started
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
+from sb3_quad.envs.simulation.state import QUATERNION
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.real_flights import (
     CAPTURE_COLUMNS,
     GYRO_COLUMNS,
@@ -26,8 +28,6 @@ from sb3_quad.evaluation.real_flights import (
     read_logs,
     rotated_by,
 )
-from sb3_quad.simulation.state import QUATERNION
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 FOLDER = os.environ.get("SB3_QUAD_FLIGHTS", "")
 STEP = 0.01

@@ -9,11 +9,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sb3_quad.agents.agent_settings import settings_of_record
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli.app import main
-from sb3_quad.controllers.agent_settings import settings_of_record
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.simulation.motions import read_points
+from sb3_quad.envs.simulation.references import NEEDED, Reference
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import evaluate, fly_scenario
@@ -24,10 +28,6 @@ from sb3_quad.evaluation.metric_tables import overview
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.report.scenario_plots import paths_plot
-from sb3_quad.simulation.motions import read_points
-from sb3_quad.simulation.references import NEEDED, Reference
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
 
 DT = 0.01
 WAYPOINTS = [(3, 0, 1), (3, 3, 0), (0, 0, 0)]

@@ -13,7 +13,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.rendering.window import Client
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 HOVER = np.zeros(4, dtype=np.float32)
 Picture = npt.NDArray[np.uint8]

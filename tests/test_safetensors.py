@@ -10,11 +10,11 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_quad
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.resolve import resolve_expert
+from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.resolve import resolve_expert
-from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.export.policy import export_policy

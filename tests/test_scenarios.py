@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.simulation.state import QuadcopterState, make_wrench
+from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.scenarios.load import SUITES, axis_label, load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.parts import VehicleChanges
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
-from sb3_quad.simulation.state import QuadcopterState, make_wrench
-from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 
 def suite(*entries: str) -> Suite:

@@ -23,13 +23,13 @@ from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.picture import Trail, draw_trails
 from sb3_quad.envs.rendering.scene import Scene
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.evaluation.scenarios.sample import sample_wrenches
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.show import film, sequence
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, HOLD, film_frames, following_cameras, frame_times, write_film
-from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.config import load_config
 from sb3_quad.training.runs import claim_run
 

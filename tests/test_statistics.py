@@ -14,16 +14,16 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_quad import DAgger
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.controller import Controller
+from sb3_quad.agents.resolve import resolve_expert
+from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.networks.gradients import Perceptrons
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.callbacks import BestModel
 from sb3_quad.cli import main
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.controller import Controller
-from sb3_quad.controllers.resolve import resolve_expert
-from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.flights import fly_settings

@@ -22,11 +22,11 @@ from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
 from torch.nn.utils import parameters_to_vector
 
+from sb3_quad.agents.zips import load_model
 from sb3_quad.base.errors import ConfigError, WorkerDied
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.cli import main
-from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.executors import as_they_end, start_executor
 from sb3_quad.sweep import run

@@ -11,18 +11,18 @@ from sb3_quad import envs
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.simulation import MAX_EPISODE_STEPS
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.observation import (
+from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.observation import (
     DEFAULT_STD,
     FEATURE_NAMES,
     GROUPS,
     OBSERVATION_SIZE,
     turn_features,
 )
-from sb3_quad.simulation.random import EPISODE, STEP, philox
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.random import EPISODE, STEP, philox
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     POSITION,
     QUATERNION,
@@ -31,9 +31,9 @@ from sb3_quad.simulation.state import (
     VELOCITY,
     QuadcopterState,
 )
-from sb3_quad.simulation.tasks import SCORED, TASK, T, Task, in_words, resolve_tasks
-from sb3_quad.vehicles.layout import find_turn
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.simulation.tasks import SCORED, TASK, T, Task, in_words, resolve_tasks
+from sb3_quad.envs.vehicles.layout import find_turn
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
 NOISE = {"relative": 0.05, "additive": 0.1}

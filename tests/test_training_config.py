@@ -14,14 +14,15 @@ from hypothesis import strategies as st
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, RolloutBuffer
 
+from sb3_quad.agents.resolve import DEFAULT_EXPERT
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.cli.commands.train import DEFAULT_PIPELINE, THESIS
-from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.envs.simulation.tasks import TASKS
+from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
+from sb3_quad.envs.vehicles.vehicle import VEHICLES
 from sb3_quad.training.algorithms import (
     ALGORITHMS,
     constructor_parameters,
@@ -39,7 +40,6 @@ from sb3_quad.training.config import (
 )
 from sb3_quad.training.pipeline import load_pipeline
 from sb3_quad.training.trainer import build_model
-from sb3_quad.vehicles.vehicle import VEHICLES
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}

@@ -18,14 +18,14 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_quad import envs
+from sb3_quad.base.compiled import compile_notice
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import print_once
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.simulation.compiled import compile_notice
-from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("target_tracking", "state_recovery")
 MIXTURE = {"target_tracking": 1.0, "state_recovery": 2.0}

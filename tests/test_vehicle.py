@@ -12,12 +12,12 @@ from pydantic import ValidationError
 
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.cli import main
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import ROTOR_SPEEDS
+from sb3_quad.envs.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import ROTOR_SPEEDS
-from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
 
 ITM = load_vehicle("itm")
 GAINS = ITM.model_dump(mode="json")["geometric_gains"]

@@ -7,7 +7,7 @@ import pytest
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.yaml_files import YamlFolder
 
-VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
+VEHICLES = YamlFolder("vehicle", "sb3_quad.envs.vehicles")
 SETTINGS = YamlFolder("settings", "sb3_quad.zoo_configs", ".yml", folders=("thesis",))
 
 # A few hundred bytes that stand for a billion values.

@@ -14,11 +14,11 @@ from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_quad
 from sb3_quad import PPOBC, SACBC, DAgger, GeometricExpert, PIDExpert
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.pretrained import pretrained_names
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import pretrained_names
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 FLY = """
 import json, sys

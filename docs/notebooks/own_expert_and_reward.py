@@ -26,12 +26,12 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.simulation.state import TARGET, QuadcopterState
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.results import colours_of
 from sb3_quad.experts.protocol import Expert
 from sb3_quad.report.plots import STYLE
-from sb3_quad.simulation.state import TARGET, QuadcopterState
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 

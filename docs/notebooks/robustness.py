@@ -23,7 +23,7 @@ import tempfile
 import matplotlib.pyplot as plt
 import numpy as np
 
-from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.scenarios.load import axis_label, parse_suite

@@ -9,10 +9,10 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from sb3_quad.base.bullet import p
 from sb3_quad.base.types import FloatArray
+from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.window import Client
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 Vector: TypeAlias = tuple[float, float, float]
 Colour: TypeAlias = tuple[float, float, float, float]

@@ -8,15 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image as Pillow
 
-from sb3_quad.base.bullet import p
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.rendering import models
+from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import Camera, Lens
 from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, add_body
 from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Trail, backdrop, draw_trails
 from sb3_quad.envs.rendering.window import Client
-from sb3_quad.simulation.state import POSITION, QUATERNION
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.envs.simulation.state import POSITION, QUATERNION
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 MARKER = (0.10, 0.72, 0.28, 1.0)
 FORCE = (0.86, 0.10, 0.14, 1.0)

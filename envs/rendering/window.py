@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray
+from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import Camera
 
 

@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
-from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.export.cost import PER_CALL, PER_MULTIPLICATION, PER_UNIT
 from sb3_quad.export.policy import export_policy
-from sb3_quad.simulation.settings import FlightSettings
 
 HERE = Path(__file__).resolve().parent
 # The firmware of the Crazyflie is compiled with these flags.

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from flights import Array, Cell, Policy, Raptor, State, main
 
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import STATE, row_slices
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import STATE, row_slices
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 NEVER = 10**6  # control steps
 

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from table import HEADER, print_row
 
 from sb3_quad import fly, load_vehicle
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 
 Array = npt.NDArray[Any]
 VEHICLE = load_vehicle(Path(__file__).with_name("l2f_zoo.yaml"))

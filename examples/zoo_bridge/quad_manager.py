@@ -15,13 +15,13 @@ import rl_zoo3.exp_manager
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
+from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_mapping
-from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.algorithms import constructor_parameters, convert, takes_expert
 from sb3_quad.training.config import SETTINGS, VecEnvKind
 

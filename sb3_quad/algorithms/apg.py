@@ -32,7 +32,7 @@ from sb3_quad.algorithms.soap import SOAP
 from sb3_quad.algorithms.transfer import model_of
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
-from sb3_quad.simulation.tape import FlightCost
+from sb3_quad.envs.simulation.tape import FlightCost
 
 
 class Tape(Protocol):

@@ -17,6 +17,9 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
+from sb3_quad.agents.controller import Controller, limits_of
+from sb3_quad.agents.expert_like import ExpertLike
+from sb3_quad.agents.statistics import STATISTICS, share_statistics
 from sb3_quad.algorithms import offset_correction
 from sb3_quad.algorithms.networks.gradients import Terms, network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
@@ -24,10 +27,7 @@ from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, raised_as
 from sb3_quad.base.files import one_line
 from sb3_quad.base.types import Float32Array, StrDict
-from sb3_quad.controllers.controller import Controller, limits_of
-from sb3_quad.controllers.expert_like import ExpertLike
-from sb3_quad.controllers.statistics import STATISTICS, share_statistics
-from sb3_quad.simulation.settings import KEY, FlightSettings
+from sb3_quad.envs.simulation.settings import KEY, FlightSettings
 
 _MOST = 2**40
 # Arguments that are whole numbers

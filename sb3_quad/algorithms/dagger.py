@@ -20,6 +20,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
 
+from sb3_quad.agents.controller import limits_of
+from sb3_quad.agents.expert_like import ExpertLike
+from sb3_quad.agents.statistics import statistics_of
 from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, sample_rows
 from sb3_quad.algorithms.common import (
     ExpertMixin,
@@ -47,9 +50,6 @@ from sb3_quad.algorithms.networks.perceptron import Batch
 from sb3_quad.algorithms.transfer import model_of
 from sb3_quad.base.errors import ConfigError, ExpertError, refuse_unknown
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.controllers.controller import limits_of
-from sb3_quad.controllers.expert_like import ExpertLike
-from sb3_quad.controllers.statistics import statistics_of
 
 # Observations that the critic evaluates at once after a rollout
 _VALUE_CHUNK = 16384
@@ -97,7 +97,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         so that a large error of the critic does not slow down the actor. None: no clipping
     :param expert: What labels the states: an object with ``actions(state)`` such as
         ``GeometricExpert``, another SB3 model, or a function from observations to actions;
-        :class:`~sb3_quad.controllers.controller.Controller` says what each of them sees. Or a name,
+        :class:`~sb3_quad.agents.controller.Controller` says what each of them sees. Or a name,
         as in YAML, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
         :meth:`set_expert`, before learning continues
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a

@@ -8,8 +8,8 @@ from torch.nn.functional import avg_pool1d, pad
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
-from sb3_quad.simulation.state import STATE
-from sb3_quad.vehicles.vehicle import GRAVITY
+from sb3_quad.envs.simulation.state import STATE
+from sb3_quad.envs.vehicles.vehicle import GRAVITY
 
 # Distances, m, at which the coarse and the fine term of the position reach half of their limit.
 COARSE, FINE = 0.5, 0.05
@@ -72,7 +72,7 @@ def cost_and_gradients(
     actions: Float32Array,
     counts: BoolArray,
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Evaluate a cost as :data:`~sb3_quad.simulation.tape.FlightCost` says, by autograd.
+    """Evaluate a cost as :data:`~sb3_quad.envs.simulation.tape.FlightCost` says, by autograd.
 
     :raises ConfigError: the cost is not a tensor (steps, n) that depends on states or actions.
     """

@@ -16,13 +16,13 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_quad.agents.statistics import statistics_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import FloatArray
-from sb3_quad.controllers.statistics import statistics_of
+from sb3_quad.envs.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.settings import FlightSettings
 
 _POSITION = GROUPS["position"]
 # The offset is the mean final offset of this many flights to random targets. It is measured again

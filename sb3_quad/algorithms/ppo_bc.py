@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
 
+from sb3_quad.agents.expert_like import ExpertLike
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import (
     ExpertMixin,
@@ -42,7 +43,6 @@ from sb3_quad.algorithms.networks.losses import (
 from sb3_quad.algorithms.transfer import model_of
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.controllers.expert_like import ExpertLike
 
 # By default a rollout is split into this many mini-batches, but none gets fewer than this many
 # rows.

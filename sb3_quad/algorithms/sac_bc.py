@@ -19,6 +19,7 @@ from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
+from sb3_quad.agents.expert_like import ExpertLike
 from sb3_quad.algorithms.common import ExpertMixin, History, policy_arguments
 from sb3_quad.algorithms.networks.losses import (
     BC_FILTERS,
@@ -31,7 +32,6 @@ from sb3_quad.algorithms.networks.losses import (
 from sb3_quad.algorithms.transfer import model_of
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import AnyArray, Float32Array, StrDict, StrPath
-from sb3_quad.controllers.expert_like import ExpertLike
 
 _STOCK_BUFFERS = (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer)
 

@@ -11,16 +11,16 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import update_learning_rate
 
+from sb3_quad.agents.agent_settings import warn_of_observation
+from sb3_quad.agents.controller import Controller
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.agents.statistics import share_statistics, statistics_of
+from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.buffers import AggregatedDataset
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.types import StrPath
-from sb3_quad.controllers.agent_settings import warn_of_observation
-from sb3_quad.controllers.controller import Controller
-from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.statistics import share_statistics, statistics_of
-from sb3_quad.controllers.zips import load_model
-from sb3_quad.simulation.settings import KEY
+from sb3_quad.envs.simulation.settings import KEY
 
 
 def model_of(source: BaseAlgorithm | StrPath | None) -> BaseAlgorithm | None:
@@ -131,7 +131,7 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     states that it gets into itself. A SAC actor's ``log_std`` becomes the ``log_std_init`` of its
     ``policy_kwargs`` in every state, or -2 without one. Reset the environments before learning.
 
-    :param teacher: a source of :class:`~sb3_quad.controllers.controller.Controller`.
+    :param teacher: a source of :class:`~sb3_quad.agents.controller.Controller`.
     :raises ConfigError: Dict observations.
     :return: root mean squared error of the actions over the last 100 steps; actions span 2.
     """

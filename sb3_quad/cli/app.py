@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         # Ctrl-C ends the imports at once. All commands need these, which take seconds.
         with interrupts_leave():
-            importlib.import_module("sb3_quad.controllers.zips")
+            importlib.import_module("sb3_quad.agents.zips")
         with trusting(getattr(options, "trust", False)):
             return int(COMMANDS[options.command].run(options))
     except KeyboardInterrupt:

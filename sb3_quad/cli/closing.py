@@ -6,15 +6,15 @@ The tables are of fresh episodes, the same for all.
 import shlex
 from typing import Any
 
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.zips import saved_data
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli.output import console
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.zips import saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.envs.simulation.settings import KEY
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.tables import Table
-from sb3_quad.simulation.settings import KEY
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run

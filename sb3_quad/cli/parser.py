@@ -16,10 +16,10 @@ from typing import Any, ClassVar, NoReturn, TypeAlias
 
 from pydantic import BaseModel
 
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict
-from sb3_quad.controllers.pretrained import agent_path
 
 SHORT_FLAGS = {
     "n_timesteps": "-n",

@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 from rich.console import Group
 
+from sb3_quad.agents.agent_settings import settings_of_model
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrDict, StrMapping
-from sb3_quad.controllers.agent_settings import settings_of_model
-from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.envs.simulation.settings import FlightSettings, levels
+from sb3_quad.envs.simulation.tasks import Task, in_words
+from sb3_quad.envs.vehicles.vehicle import first_vehicle, load_vehicle
 from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
 from sb3_quad.evaluation.flights import (
     OwnReward,
@@ -27,9 +30,6 @@ from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.evaluation.tables import Column, Table
-from sb3_quad.simulation.settings import FlightSettings, levels
-from sb3_quad.simulation.tasks import Task, in_words
-from sb3_quad.vehicles.vehicle import first_vehicle, load_vehicle
 
 THESIS_VEHICLE = "itm"  # the thesis has metrics of no other one
 
@@ -83,7 +83,8 @@ def compare(
     :param controllers: controllers by label: the name of an expert (``"pid"``) or of an agent that
         comes with the package (``"itm-robust"``), the path of a zip, ``"package.module:factory"``,
         an SB3 model, an expert, or a function from observations (n, 18) to actions (n, 4).
-    :param tasks: names, :class:`~sb3_quad.simulation.tasks.Task` or mixtures ``{name: weight}``, or
+    :param tasks: names,
+        :class:`~sb3_quad.envs.simulation.tasks.Task` or mixtures ``{name: weight}``, or
         only one of these.
     :param n_flights: episodes of each task.
     :param seed: seed of the episodes, as for :func:`~sb3_quad.evaluation.flights.fly`; None: one
@@ -93,8 +94,9 @@ def compare(
         mean is shown below that of the task.
     :param thesis_columns: columns of the thesis to add if its vehicle flies one of its tasks:
         ``"expert"``, ``"IL-agent"``, ``"RL-agent"``.
-    :param env_kwargs: fields of :class:`~sb3_quad.simulation.settings.FlightSettings` that apply to
-        all controllers, such as ``vehicle`` or ``noise``.
+    :param env_kwargs: fields of
+        :class:`~sb3_quad.envs.simulation.settings.FlightSettings` that apply to all
+        controllers, such as ``vehicle`` or ``noise``.
     :return: ``result[label][task]`` are :class:`~sb3_quad.evaluation.metrics.Metrics`, each with
         its 95 % interval; ``print(result)`` shows the tables.
     :raises ConfigError: no controllers, an unknown name or keyword, several tasks of one name, a

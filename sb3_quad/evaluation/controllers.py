@@ -7,18 +7,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.agents.resolve import EXPERTS, import_factory
+from sb3_quad.agents.tensors import AGENTS, ENDING
+from sb3_quad.agents.zips import saved_algorithm
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrDict
-from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
-from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.resolve import EXPERTS, import_factory
-from sb3_quad.controllers.tensors import AGENTS, ENDING
-from sb3_quad.controllers.zips import saved_algorithm
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.vehicles.vehicle import VehicleSource, load_vehicle
 from sb3_quad.evaluation.flights import OwnReward, Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
 
 
 @dataclass(frozen=True)

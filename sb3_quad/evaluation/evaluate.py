@@ -10,13 +10,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sb3_quad.agents.agent_settings import settings_of_model
+from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays
 from sb3_quad.base.types import Arrays, Report, StrMapping
-from sb3_quad.controllers.agent_settings import settings_of_model
-from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
+from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
@@ -44,7 +45,6 @@ from sb3_quad.evaluation.results import (
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
 from sb3_quad.executors import start_executor
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
 # The number of flights whose trajectories are kept: of a scenario that is the same each time, and
@@ -106,7 +106,7 @@ def evaluate(
     refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
         # Here a missing PyBullet is a single error, rather than one for each controller.
-        from sb3_quad.base import bullet  # noqa: F401
+        from sb3_quad.envs.rendering import bullet_client  # noqa: F401
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
     # An error in it shows now, rather than as a failure of each controller.

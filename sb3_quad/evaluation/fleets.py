@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.types import Float32Array, FloatArray
-from sb3_quad.simulation.batch import QuadcopterBatch, StepResult
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.simulation.state import TARGET
+from sb3_quad.envs.simulation.batch import QuadcopterBatch, StepResult
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.envs.simulation.settings import ENDLESS, FlightSettings
+from sb3_quad.envs.simulation.state import TARGET
 
 # The environment on PyBullet; its task comes with the settings.
 ENV_ID = "QuadTargetTracking-v0"

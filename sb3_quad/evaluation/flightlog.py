@@ -11,17 +11,17 @@ import numpy as np
 
 from sb3_quad.base.files import read_arrays
 from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, StrPath
-from sb3_quad.evaluation.flights import Flights, Hook
-from sb3_quad.evaluation.following import FOLLOWED
-from sb3_quad.evaluation.supervisor import SUPERVISED
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.state import (
     FORCE_BODY,
     FORCE_WORLD,
     TORQUE_BODY,
     TORQUE_WORLD,
     QuadcopterState,
 )
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.envs.vehicles.vehicle import Vehicle
+from sb3_quad.evaluation.flights import Flights, Hook
+from sb3_quad.evaluation.following import FOLLOWED
+from sb3_quad.evaluation.supervisor import SUPERVISED
 
 SAMPLE_RATE = 50.0  # Hz
 OUTCOMES = ("success", "missed", "collision", "out_of_range")

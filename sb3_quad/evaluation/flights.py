@@ -16,28 +16,28 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown, unknown
-from sb3_quad.base.files import write_arrays
-from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
-from sb3_quad.controllers.agent_settings import (
+from sb3_quad.agents.agent_settings import (
     settings_of_model,
     unlike_trained,
     warn_of_observation,
 )
-from sb3_quad.controllers.controller import Controller, warn_of_vehicle
-from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.agents.controller import Controller, warn_of_vehicle
+from sb3_quad.agents.resolve import resolve_expert
+from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown, unknown
+from sb3_quad.base.files import write_arrays
+from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
 from sb3_quad.envs.batch_env import quadcopter_spaces
+from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
+from sb3_quad.envs.simulation.batch import MAX_ROWS
+from sb3_quad.envs.simulation.checks import per_row, whole_number
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import TARGET, QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.evaluation.supervisor import Supervisor
-from sb3_quad.simulation import MAX_EPISODE_STEPS
-from sb3_quad.simulation.batch import MAX_ROWS
-from sb3_quad.simulation.checks import per_row, whole_number
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import TARGET, QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance if it is not among them

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_quad.base.types import BoolArray, FloatArray
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.envs.simulation.state import QuadcopterState
 
 SETTLED = 2.0  # time after which errors count, s
 FOLLOWED = ("rms_error", "greatest_error", "path_error", "heading_error", "lag")

@@ -16,20 +16,20 @@ import pandas as pd
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import BoolArray, FloatArray, StrPath
-from sb3_quad.evaluation.tables import Table, text_table
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.motions import refuse_falling_times, refuse_gaps
-from sb3_quad.simulation.physics import quaternion_product
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.motions import refuse_falling_times, refuse_gaps
+from sb3_quad.envs.simulation.physics import quaternion_product
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     POSITION,
     QUATERNION,
     VELOCITY,
     rotation_matrices,
 )
-from sb3_quad.vehicles.layout import find_turn
-from sb3_quad.vehicles.vehicle import GRAVITY, Vehicle, first_vehicle
+from sb3_quad.envs.vehicles.layout import find_turn
+from sb3_quad.envs.vehicles.vehicle import GRAVITY, Vehicle, first_vehicle
+from sb3_quad.evaluation.tables import Table, text_table
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s

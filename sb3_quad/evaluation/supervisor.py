@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_quad.base.types import BoolArray
-from sb3_quad.simulation.state import QuadcopterState
-from sb3_quad.vehicles.vehicle import GRAVITY, Vehicle
+from sb3_quad.envs.simulation.state import QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import GRAVITY, Vehicle
 
 # Specific forces in g, and the times in s that they may last
 LOW = 0.5

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_quad.base.types import FloatArray
-from sb3_quad.simulation.state import P, first_rows
-from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.envs.simulation.state import P, first_rows
+from sb3_quad.envs.vehicles.gains import GAIN_NAMES, GeometricGains
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 

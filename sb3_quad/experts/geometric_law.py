@@ -8,11 +8,10 @@ import math
 
 import numpy as np
 
-from sb3_quad.experts.geometric_gains import G
-from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.physics import rotation, to_body, to_world
-from sb3_quad.simulation.state import AHEAD, P, W, X
-from sb3_quad.simulation.vectors import (
+from sb3_quad.base.compiled import compiled
+from sb3_quad.envs.simulation.physics import rotation, to_body, to_world
+from sb3_quad.envs.simulation.state import AHEAD, P, W, X
+from sb3_quad.envs.simulation.vectors import (
     add,
     cross,
     divide,
@@ -20,6 +19,7 @@ from sb3_quad.simulation.vectors import (
     subtract,
     vector_at,
 )
+from sb3_quad.experts.geometric_gains import G
 
 
 @compiled

@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from sb3_quad.base.errors import ExpertError
 from sb3_quad.base.types import Float32Array, FloatArray
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.state import (
+from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     POSITION,
     QUATERNION,
@@ -16,7 +16,7 @@ from sb3_quad.simulation.state import (
     VELOCITY,
     QuadcopterState,
 )
-from sb3_quad.vehicles.vehicle import VehicleSource, load_vehicle
+from sb3_quad.envs.vehicles.vehicle import VehicleSource, load_vehicle
 
 Actions = Float32Array
 Floats = npt.NDArray[np.floating]
@@ -32,8 +32,8 @@ class Expert(ABC):
     Anything with such an ``actions(state)`` method can teach. This class adds ``predict``, so that
     ``evaluate_policy(PIDExpert(), env)`` works as for an SB3 model.
 
-    :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that the expert
-        is designed for.
+    :param vehicle: name, YAML path or a :class:`~sb3_quad.envs.vehicles.vehicle.Vehicle` that the
+        expert is designed for.
     """
 
     # μ and σ of Eq. 3.16, shape (18,), which `predict` undoes. They are the environments' defaults;

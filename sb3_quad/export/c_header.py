@@ -8,8 +8,8 @@ import numpy as np
 
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE, F
 from sb3_quad.export.network import Network
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 WIDTH = 110  # columns
 

@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_quad.agents.statistics import statistics_of
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.types import FloatArray
-from sb3_quad.controllers.statistics import statistics_of
-from sb3_quad.export.load import Call
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.observation import (
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.observation import (
     OBSERVATION_SIZE,
     turn_features,
 )
-from sb3_quad.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.simulation.state import REFERENCE_PARTS, X, row_slices
-from sb3_quad.simulation.tasks import TASKS, Task
-from sb3_quad.simulation.tracks import ACCELERATION_STD
-from sb3_quad.vehicles.layout import find_turn
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.envs.simulation.settings import ENDLESS, FlightSettings
+from sb3_quad.envs.simulation.state import REFERENCE_PARTS, X, row_slices
+from sb3_quad.envs.simulation.tasks import TASKS, Task
+from sb3_quad.envs.simulation.tracks import ACCELERATION_STD
+from sb3_quad.envs.vehicles.layout import find_turn
+from sb3_quad.envs.vehicles.vehicle import Vehicle
+from sb3_quad.export.load import Call
 
 N_OBSERVATIONS = 10_000
 # Control steps of a flight: for a policy that sees only the present features, and for one with a

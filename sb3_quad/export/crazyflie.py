@@ -4,9 +4,9 @@ import math
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE, F
 from sb3_quad.export.cost import cost_of
 from sb3_quad.export.network import Network
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 FILES = ("Makefile", "Kbuild", "app-config", "README.md", "src/Kbuild", "src/sb3quad.c")
 CALL = 0.001  # time between calls of the firmware, s

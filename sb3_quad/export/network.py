@@ -20,10 +20,10 @@ from torch import nn
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import StrDict
+from sb3_quad.envs.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
+from sb3_quad.envs.simulation.tracks import ACCELERATION_STD
 from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import TrainedPolicy
-from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
-from sb3_quad.simulation.tracks import ACCELERATION_STD
 
 ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
@@ -40,10 +40,11 @@ class Network(nn.Module):
     2.4).
 
     A policy that sees more than the present features keeps the frames of
-    :mod:`sb3_quad.simulation.frames` in a state, float32 (batch, ``state_size``). The state is zero
-    when a flight begins. It has those of these parts that the policy sees: the last action (4); the
-    integral s (3), m, with a 1 once a flight has begun; the earlier frames, scaled, the latest
-    first.
+
+    :mod:`sb3_quad.envs.simulation.frames` in a state, float32 (batch, ``state_size``). The state is
+    zero when a flight begins. It has those of these parts that the policy sees: the last action
+    (4); the integral s (3), m, with a 1 once a flight has begun; the earlier frames, scaled, the
+    latest first.
 
     A policy that previews its reference takes the accelerations, m/s², after the features of
     ``observation``: (batch, OBSERVATION_SIZE + 3 * previews).

@@ -9,13 +9,16 @@ from typing import Any, NamedTuple
 
 from torch.nn.utils import parameters_to_vector
 
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.tensors import ENDING, write_tensors
+from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.tensors import ENDING, write_tensors
-from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
+from sb3_quad.envs.simulation.observation import FEATURES, GROUPS
+from sb3_quad.envs.simulation.settings import KEY
+from sb3_quad.envs.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
 from sb3_quad.export import crazyflie, load, px4
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, TrainedPolicy, compare
@@ -23,9 +26,6 @@ from sb3_quad.export.cost import cost_of
 from sb3_quad.export.crazyflie import plan_app
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.export.px4 import load_px4, motor_order, write_px4
-from sb3_quad.simulation.observation import FEATURES, GROUPS
-from sb3_quad.simulation.settings import KEY
-from sb3_quad.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
 
 # Formats, with the suffixes of their files or folders
 FORMATS = {

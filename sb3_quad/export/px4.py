@@ -13,11 +13,11 @@ import numpy as np
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import Float32Array, StrDict
+from sb3_quad.envs.simulation.observation import GROUPS, F
+from sb3_quad.envs.vehicles.layout import ORDERS
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.export.load import Call
 from sb3_quad.export.network import Network
-from sb3_quad.simulation.observation import GROUPS, F
-from sb3_quad.vehicles.layout import ORDERS
-from sb3_quad.vehicles.vehicle import Vehicle
 
 PARAMETERS = "px4.params"
 FILES = ("control_net.cpp", "control_net.hpp", PARAMETERS)

@@ -9,6 +9,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrPath
+from sb3_quad.envs.simulation.settings import in_words
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import (
     NOTHING,
@@ -33,7 +34,6 @@ from sb3_quad.report.scenario_plots import (
     group_plots,
     paths_plot,
 )
-from sb3_quad.simulation.settings import in_words
 
 OVERVIEW = (
     "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, which"

@@ -11,14 +11,14 @@ from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
 from sb3_quad.envs.rendering.camera import DOWN, ON_PATH, broadside
 from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import MARKER, Pose
+from sb3_quad.envs.simulation.checks import per_row
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.state import WRENCH_SIZE, QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
-from sb3_quad.simulation.checks import per_row
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 # The path of a target has the colour of its hoops.
 TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pillow
 
-from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
+from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import open_window, point_window, start_drawing
+from sb3_quad.envs.simulation.state import POSITION, TARGET
 from sb3_quad.show.episodes import Episode, Recording, outlook
 from sb3_quad.show.labels import mark_lost, side_by_side, with_header
-from sb3_quad.simulation.state import POSITION, TARGET
 
 FPS = 25
 HOLD = 0.4  # the last picture stays for this long, s

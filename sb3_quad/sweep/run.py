@@ -10,21 +10,21 @@ import numpy as np
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from sb3_quad.agents.agent_settings import env_kwargs
+from sb3_quad.agents.statistics import STATISTICS, share_statistics
+from sb3_quad.agents.zips import load_model
 from sb3_quad.base.errors import ConfigError, WorkerDied
 from sb3_quad.base.files import kind_and_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
-from sb3_quad.controllers.agent_settings import env_kwargs
-from sb3_quad.controllers.statistics import STATISTICS, share_statistics
-from sb3_quad.controllers.zips import load_model
+from sb3_quad.envs.simulation.settings import KEY
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import Progress, fly_scenario
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
-from sb3_quad.simulation.settings import KEY
 from sb3_quad.sweep.folder import RunResult, Sweep, read_results, write_result
 from sb3_quad.sweep.runs import Run
 from sb3_quad.sweep.spec import Evaluation, SweepSpec

@@ -6,17 +6,17 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
 from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.envs.vehicles.vehicle import first_vehicle
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import Configuration, SweepSpec
 from sb3_quad.training.options import RunOptions, SettingsOptions, all_changes
 from sb3_quad.training.pipeline import Pipeline, Stage, plan_training, stage_jobs
-from sb3_quad.vehicles.vehicle import first_vehicle
 
 NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # keys whose value says enough
 LONGEST = 80  # characters of a name

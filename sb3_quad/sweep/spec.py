@@ -16,10 +16,10 @@ from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.envs.vehicles.vehicle import NAME
 from sb3_quad.training.algorithms import as_list
 from sb3_quad.training.config import SETTINGS
 from sb3_quad.training.options import RunOptions, SettingsOptions
-from sb3_quad.vehicles.vehicle import NAME
 
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 

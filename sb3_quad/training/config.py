@@ -21,6 +21,11 @@ from pydantic import (
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
+from sb3_quad.agents.pretrained import agent_path, pretrained_names
+from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
+from sb3_quad.agents.tensors import AGENTS
+from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
@@ -28,14 +33,11 @@ from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.controllers.agent_settings import agent_settings, unlike_trained
-from sb3_quad.controllers.pretrained import agent_path, pretrained_names
-from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.controllers.tensors import AGENTS
-from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.tasks import TASK_NAMES, in_words
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.tasks import TASK_NAMES, in_words
+from sb3_quad.envs.vehicles.layout import Turn, find_turn
+from sb3_quad.envs.vehicles.vehicle import VEHICLES, first_vehicle
 from sb3_quad.training.algorithms import (
     as_list,
     check,
@@ -46,8 +48,6 @@ from sb3_quad.training.algorithms import (
     takes_expert,
 )
 from sb3_quad.training.options import JobOptions
-from sb3_quad.vehicles.layout import Turn, find_turn
-from sb3_quad.vehicles.vehicle import VEHICLES, first_vehicle
 
 _FOLDERS = ("any_quadcopter", "nominal", "px4", "robust", "thesis", "value_based")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
@@ -138,7 +138,7 @@ class TrainingConfig(Frozen):
     def make_expert(self) -> Any:
         """Return the expert, or the default one, for the vehicle of the environments.
 
-        :raises SB3QuadError: see :func:`~sb3_quad.controllers.resolve.resolve_expert`.
+        :raises SB3QuadError: see :func:`~sb3_quad.agents.resolve.resolve_expert`.
         """
         return resolve_expert(
             DEFAULT_EXPERT if self.expert is None else self.expert,

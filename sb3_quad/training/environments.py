@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.process import ignore_interrupts
+from sb3_quad.envs.simulation.settings import ENDLESS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
-from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.algorithms import as_list, instance
 from sb3_quad.training.config import TrainingConfig
 
@@ -84,7 +84,7 @@ def make_environments(
                 )
             # A worker process could not say that PyBullet is missing.
             if config.task:
-                from sb3_quad.base import bullet  # noqa: F401
+                from sb3_quad.envs.rendering import bullet_client  # noqa: F401
             phases = n_envs if staggered else 1
             env = SINGLE[config.vec_env](
                 [partial(_make_row, config, row, phases) for row in range(n_envs)]

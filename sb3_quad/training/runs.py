@@ -10,13 +10,13 @@ import stable_baselines3
 import torch
 import yaml
 
+from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
+from sb3_quad.agents.zips import saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import make_folder, remove_half_written, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
-from sb3_quad.controllers.pretrained import BEST, CORRECTED, run_agent
-from sb3_quad.controllers.zips import saved_data
 
 MADE_WITH = ("commit", "versions")  # keys of args.yml
 

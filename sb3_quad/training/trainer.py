@@ -25,6 +25,9 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad.agents.controller import Controller
+from sb3_quad.agents.statistics import STATISTICS
+from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
@@ -35,9 +38,6 @@ from sb3_quad.base.types import Report, StrDict
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
-from sb3_quad.controllers.controller import Controller
-from sb3_quad.controllers.statistics import STATISTICS
-from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.training.algorithms import instance
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config

@@ -25,7 +25,7 @@ from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.training.algorithms import constructor_parameters, takes_whole
 from sb3_quad.training.config import TrainingConfig, build_config
 

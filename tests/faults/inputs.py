@@ -25,11 +25,11 @@ from campaign import forked
 import sb3_quad.cli.closing
 from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.cli.app import COMMANDS, make_parser
+from sb3_quad.envs.simulation.tasks import Task
+from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.simulation.tasks import Task
 from sb3_quad.training.algorithms import constructor_parameters
 from sb3_quad.training.config import TrainingConfig
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 SECONDS, MEMORY = 60.0, 3 * 2**30  # bytes; the imports take half a GB
 OUTSIDE = "../escaped"

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 CODE = """
 import numpy as np
-from sb3_quad.simulation.physics import rotation_rows
+from sb3_quad.envs.simulation.physics import rotation_rows
 print(rotation_rows(1.0, 0.0, 0.0, 0.0)[0], sum(rotation_rows.stats.cache_hits.values()))
 """
 

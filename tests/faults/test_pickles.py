@@ -28,9 +28,9 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_quad.agents import unpickle as own
+from sb3_quad.agents.pretrained import pretrained
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.controllers import unpickle as own
-from sb3_quad.controllers.pretrained import pretrained
 
 COUNT = int(os.environ.get("SB3_QUAD_PICKLES", "100"))
 SECONDS, MEMORY = 5, 2**30  # of one core; bytes

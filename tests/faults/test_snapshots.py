@@ -9,8 +9,8 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.runs import open_run

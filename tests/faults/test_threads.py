@@ -10,16 +10,16 @@ import threading
 import numpy as np
 import pytest
 
-from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
 
 # After every interrupt a batch flies on as one whose steps are not interrupted. A timer interrupts
 # at any moment of a step; more threads than cores make workers late.
 INTERRUPTED = """
 import random, signal, sys
 import numpy as np
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation import threads
+from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation import threads
 
 threads.REST = 0  # so that no step does without its threads
 rows = 1280

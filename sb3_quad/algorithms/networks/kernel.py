@@ -14,8 +14,8 @@ import numpy as np
 from numba import float32, uint64
 
 from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
+from sb3_quad.base.compiled import compiled
 from sb3_quad.base.types import Float32Array, IntArray
-from sb3_quad.simulation.compiled import compiled
 
 # Rows per block: loops are long, yet a layer of 64 units and its gradients fit into half a
 # megabyte.

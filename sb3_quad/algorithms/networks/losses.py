@@ -17,7 +17,7 @@ import torch as th
 from numba import float32
 from torch.nn import functional as F
 
-from sb3_quad.simulation.compiled import compiled
+from sb3_quad.base.compiled import compiled
 
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
 CLONING_LOSSES: tuple[CloningLoss, ...] = get_args(CloningLoss)

@@ -28,7 +28,7 @@ from sb3_quad.cli.parser import (
 )
 
 if TYPE_CHECKING:
-    from sb3_quad.vehicles.vehicle import Vehicle
+    from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 # Rotor speed, rpm. Above it a unit must be wrong.
 FASTEST_HOVER = 95_000.0
@@ -53,11 +53,11 @@ def run(options: Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if the vehicle cannot hover."""
     from sb3_quad.base.seeds import seed_for
     from sb3_quad.cli.output import console
+    from sb3_quad.envs.vehicles.vehicle import load_vehicle
     from sb3_quad.evaluation.compare import compare
     from sb3_quad.evaluation.tables import text_table
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
-    from sb3_quad.vehicles.vehicle import load_vehicle
 
     try:
         vehicle = load_vehicle(options.vehicle)

@@ -44,9 +44,9 @@ FLAGS: Flags = {
 def run(options: Namespace) -> int:
     """Make the page and write it. Returns the exit code."""
     from sb3_quad.cli.output import warn
+    from sb3_quad.envs.vehicles.vehicle import load_vehicle
     from sb3_quad.evaluation.controllers import parse_controllers
     from sb3_quad.show.demo.page import DEFAULT_AGENTS, make_page
-    from sb3_quad.vehicles.vehicle import load_vehicle
 
     refuse_existing(options.output, options.overwrite)
     specs = parse_controllers(options.agents or DEFAULT_AGENTS)

@@ -174,8 +174,8 @@ def _check(options: Namespace, window: bool) -> None:
     :raises ConfigError: No controller, a bad size or file, or no display for a window.
     """
     from sb3_quad.envs.rendering.window import has_display
+    from sb3_quad.envs.simulation.checks import check_size
     from sb3_quad.show.film import check_film
-    from sb3_quad.simulation.checks import check_size
 
     if not (options.controllers or options.algo):
         raise ConfigError(
@@ -207,11 +207,11 @@ def _check(options: Namespace, window: bool) -> None:
 
 def _setting(options: Namespace) -> tuple[Any, StrDict]:
     """Return the :class:`~sb3_quad.show.episodes.Setting` of all, and the controllers by label."""
+    from sb3_quad.agents.resolve import resolve_expert
     from sb3_quad.cli.output import warn
-    from sb3_quad.controllers.resolve import resolve_expert
+    from sb3_quad.envs.vehicles.vehicle import first_vehicle
     from sb3_quad.evaluation.controllers import ControllerSpec, parse_controllers
     from sb3_quad.show.episodes import fixed_setting, scenario_setting
-    from sb3_quad.vehicles.vehicle import first_vehicle
 
     specs = parse_controllers(options.controllers)
     if options.algo:
@@ -241,11 +241,11 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
 
 
 def _flight_settings(options: Namespace, first: Any) -> Any:
-    """Return the :class:`~sb3_quad.simulation.settings.FlightSettings` of all flights.
+    """Return the :class:`~sb3_quad.envs.simulation.settings.FlightSettings` of all flights.
 
     :param first: Those of the first agent, or None.
     """
-    from sb3_quad.simulation.settings import FlightSettings
+    from sb3_quad.envs.simulation.settings import FlightSettings
 
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)

@@ -31,6 +31,7 @@ ONNX and safetensors: pip install '.[export]' from a clone; PX4: pip install
 from argparse import Namespace
 from pathlib import Path
 
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import (
@@ -39,7 +40,6 @@ from sb3_quad.cli.parser import (
     TRUST,
     Flags,
 )
-from sb3_quad.controllers.pretrained import agent_path
 
 FLAGS: Flags = {
     "model MODEL": (

@@ -141,8 +141,8 @@ def _make_search(options: Namespace) -> Any:
 
 def _print_results(search: Any) -> None:
     """Print the best trial, its agent on fresh episodes, and where everything is."""
+    from sb3_quad.agents.zips import load_model
     from sb3_quad.cli.closing import print_agent
-    from sb3_quad.controllers.zips import load_model
     from sb3_quad.training.runs import open_run
     from sb3_quad.tuning.results import train_command, trial_line
     from sb3_quad.tuning.search import RUN

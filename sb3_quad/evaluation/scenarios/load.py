@@ -14,8 +14,8 @@ from sb3_quad.base.literals import put_key
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import YamlFolder, parse_keys
+from sb3_quad.envs.vehicles.vehicle import VEHICLES
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
-from sb3_quad.vehicles.vehicle import VEHICLES
 
 SUITES = YamlFolder("suite", "sb3_quad.evaluation.scenarios.suites")
 OF_VEHICLE = "× the vehicle's own"

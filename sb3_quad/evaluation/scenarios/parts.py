@@ -10,8 +10,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, mo
 
 from sb3_quad.base.errors import unknown
 from sb3_quad.base.validate import Frozen
-from sb3_quad.simulation.randomization import flyable
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.envs.simulation.randomization import flyable
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

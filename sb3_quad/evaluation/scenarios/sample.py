@@ -9,9 +9,9 @@ import numpy as np
 
 from sb3_quad.base.seeds import SCENARIO_STREAM
 from sb3_quad.base.types import FloatArray
+from sb3_quad.envs.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices
 from sb3_quad.evaluation.scenarios.parts import Attitude, VectorDistribution
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices
 
 Generators = Sequence[np.random.Generator]  # one for each episode
 

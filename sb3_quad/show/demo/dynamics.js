@@ -1,5 +1,5 @@
 /**
- * The physics of one control step, as sb3_quad/simulation/physics.py has them: rotors (Eqs. 2.4 and 4.1), external wrench,
+ * The physics of one control step, as envs/simulation/physics.py has them: rotors (Eqs. 2.4 and 4.1), external wrench,
  * drag, and PyBullet's integrator. All of it in double precision.
  *
  * @typedef {import("./vehicle.js").Parameters} Parameters

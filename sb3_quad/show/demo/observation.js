@@ -1,5 +1,5 @@
 /**
- * The observation of a policy, as sb3_quad/simulation/{observation,frames}.py have it, in float32 where they are: features
+ * The observation of a policy, as envs/simulation/{observation,frames}.py have it, in float32 where they are: features
  * (thesis 3.3.1), relative to a reference that moves, with their noise and scaling (Eq. 3.16), last action, earlier frames, the
  * integral of the position error, and what is seen of the reference's future.
  *

@@ -2,7 +2,7 @@
 that needs no network.
 
 The scripts are ES modules without dependencies. They become one script here, so that no build step
-is needed; the tables of states and features in it are those of :mod:`sb3_quad.simulation`.
+is needed; the tables of states and features in it are those of :mod:`sb3_quad.envs.simulation`.
 """
 
 import base64
@@ -15,19 +15,19 @@ from importlib.resources import files
 import numpy as np
 from torch.nn.utils import parameters_to_vector
 
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.zips import load_model
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict
-from sb3_quad.controllers.agent_settings import agent_settings
-from sb3_quad.controllers.zips import load_model
+from sb3_quad.envs.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
+from sb3_quad.envs.simulation.state import AHEAD, STATE, STATE_SIZE, X
+from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.results import COLOURS, colours_of
 from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.network import Network, build_network
-from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE, F
-from sb3_quad.simulation.state import AHEAD, STATE, STATE_SIZE, X
-from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
 DEFAULT_AGENTS = (
     "pid",

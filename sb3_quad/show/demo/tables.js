@@ -1,6 +1,6 @@
 /**
  * Where the quantities of a state and the features of an observation stand. page.py puts the tables of
- * sb3_quad/simulation/state.py and observation.py here, so that both languages use the same ones.
+ * envs/simulation/state.py and observation.py here, so that both languages use the same ones.
  *
  * @typedef {{position: number, quaternion: number, velocity: number, body_rates: number, rotor_speeds: number, target: number, target_velocity: number, target_acceleration: number, target_heading: number, target_heading_rate: number, target_ahead: number}} StateRows
  * @typedef {{position: number, rotation: number, velocity: number, body_rates: number}} FeatureRows

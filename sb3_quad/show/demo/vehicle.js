@@ -1,5 +1,5 @@
 /**
- * A quadcopter as sb3_quad/vehicles/*.yaml describe it, and what a flight needs of it.
+ * A quadcopter as envs/vehicles/*.yaml describe it, and what a flight needs of it.
  *
  * @typedef {[number, number, number]} Triple
  * @typedef {[number, number, number, number]} Quadruple

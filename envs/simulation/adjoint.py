@@ -1,0 +1,290 @@
+"""The adjoint of a control step: carry the gradient of a flight's cost from the state after the
+step to the state before it.
+
+``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost with respect to
+the first ``MOVING`` rows of a block's state. Each function here is the vector-Jacobian product
+(vjp) of one function of :mod:`.physics` or :mod:`.observation`: it turns the gradient with respect
+to the results into the gradient with respect to the arguments.
+
+The states between the physics steps of a control step are computed again: that costs less than
+keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as 1.
+"""
+
+import math
+
+from sb3_quad.base.compiled import LANES, compiled, fast, inlined
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE, F, heading_of
+from sb3_quad.envs.simulation.physics import (
+    fly,
+    quaternion_product,
+    rotation,
+    sinc_and_cosine,
+    to_body,
+    to_world,
+    total_thrust,
+)
+from sb3_quad.envs.simulation.state import X
+from sb3_quad.envs.simulation.vectors import (
+    add,
+    dot,
+    four,
+    matvec,
+    multiply,
+    scaled,
+    store,
+    subtract,
+    transposed,
+    turn,
+    vector,
+    vector_at,
+)
+
+MOVING = X.target  # the rows of the state that a flight changes
+
+
+@inlined
+def _add_rotation(quaternion, gradient, lane, matrix):
+    """Add the gradient with respect to a quaternion, given that with respect to its rotation
+    matrix.
+    """
+    qw, qx, qy, qz = four(quaternion, lane)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+    x, y, z = subtract((zy, xz, yx), (yz, zx, xy))
+    gradient[X.quaternion, lane] += 2.0 * (qx * x + qy * y + qz * z)
+    turned = (
+        qy * (xy + yx) + qz * (xz + zx) - 2.0 * qx * (yy + zz) + qw * x,
+        qx * (xy + yx) + qz * (yz + zy) - 2.0 * qy * (xx + zz) + qw * y,
+        qx * (xz + zx) + qy * (yz + zy) - 2.0 * qz * (xx + yy) + qw * z,
+    )
+    _add(gradient, X.quaternion + 1, lane, scaled(2.0, turned))
+
+
+@inlined
+def _add(gradient, row, lane, a):
+    gradient[row, lane] += a[0]
+    gradient[row + 1, lane] += a[1]
+    gradient[row + 2, lane] += a[2]
+
+
+@fast
+def move_vjp(before, after, gradient, dt):
+    """Vector-Jacobian product of :func:`.physics.move`, in place.
+
+    :param before: the state before the physics step, (MOVING, LANES); only its attitude is read.
+    :param after: the state after it; only its body rates are read.
+    """
+    half_step = 0.5 * dt
+    k = X.quaternion
+    for lane in range(LANES):
+        _add(gradient, X.velocity, lane, scaled(dt, vector_at(gradient, X.position, lane)))
+
+        # The new quaternion is n = q a, with a = (cos |h|, h sin |h| / |h|) and h = dt ω / 2.
+        h = scaled(half_step, vector_at(after, X.body_rates, lane))
+        h2 = dot(h, h)
+        sinc, cosine = sinc_and_cosine(h2)
+        ax, ay, az = scaled(sinc, h)
+        qw, qx, qy, qz = four(before[k:], lane)
+        n = quaternion_product((qw, qx, qy, qz), (cosine, ax, ay, az))
+        nw, nx, ny, nz = n
+
+        # n is scaled by s = 1.5 - |n|² / 2, so the gradient g becomes s g - n (n g).
+        gw, gx, gy, gz = four(gradient[k:], lane)
+        scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
+        along = nw * gw + nx * gx + ny * gy + nz * gz
+        g = (
+            scale * gw - along * nw,
+            scale * gx - along * nx,
+            scale * gy - along * ny,
+            scale * gz - along * nz,
+        )
+
+        # A product with a quaternion is undone by one with its conjugate: g a* for q, q* g for a.
+        tw, tx, ty, tz = quaternion_product((qw, -qx, -qy, -qz), g)
+        gw, gx, gy, gz = quaternion_product(g, (cosine, -ax, -ay, -az))
+        gradient[k, lane] = gw
+        store(gradient[k + 1 :], lane, (gx, gy, gz))
+
+        # (cos |h| - sin |h| / |h|) / |h|², the slope of the sinc over |h|, by Horner's scheme.
+        slope = 1.0 - h2 / 28.0 * (1.0 - h2 / 54.0 * (1.0 - h2 / 88.0))
+        slope = (h2 / 10.0 * slope - 1.0) / 3.0
+        t = tx, ty, tz
+        along = slope * dot(h, t) - sinc * tw
+        turned = add(scaled(sinc, t), scaled(along, h))
+        _add(gradient, X.body_rates, lane, scaled(half_step, turned))
+
+
+@fast
+def accelerate_vjp(b, before, after, gradient, grad_wanted):
+    """Vector-Jacobian product of :func:`.physics.accelerate`, in place.
+
+    :param b: a block whose vehicle, wrench, wind and wanted speeds are loaded.
+    :param before: the state before the physics step, (MOVING, LANES), and ``after`` that after it.
+    :param grad_wanted: (4, LANES), to which the gradient with respect to the wanted rotor speeds is
+        added.
+    """
+    for lane in range(LANES):
+        r = rotation(before[X.quaternion :], lane)
+
+        # Gradient with respect to the torque in the body frame, and through the gyroscopic terms to
+        # the body rates
+        torque = multiply(vector(b.rates_gain, lane), vector(gradient[X.body_rates :], lane))
+        wx, wy, wz = vector(before[X.body_rates :], lane)
+        gx, gy, gz = multiply(vector(b.gyro, lane), torque)
+        gyroscopic = gy * wz + gz * wy, gx * wz + gz * wx, gx * wy + gy * wx
+        _add(gradient, X.body_rates, lane, scaled(-1.0, gyroscopic))
+
+        # Gradient with respect to the force, in the world frame and in the body frame
+        push = vector(gradient[X.velocity :], lane)
+        push = scaled(b.velocity_gain[lane], push)
+        in_body = to_body(r, push)
+
+        # Gradient with respect to the rotors: each thrust acts along the body's z axis and about
+        # all three axes.
+        for k in range(4):
+            old, new = before[X.rotor_speeds + k, lane], after[X.rotor_speeds + k, lane]
+            lift, exact = b.thrust_coefficient[lane], b.exact_motors[lane]
+            grad_thrust = lift * (in_body[2] + dot(vector(b.arm[:, k], lane), torque))
+            b.thrust[k, lane] = lift * new * (new + exact * (old - new))
+            grad_new = gradient[X.rotor_speeds + k, lane]
+            grad_new += grad_thrust * (2.0 * new * (1.0 - exact) + exact * old)
+            speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
+            factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
+            grad_wanted[k, lane] += factor * grad_new
+            gradient[X.rotor_speeds + k, lane] = (
+                1.0 - factor
+            ) * grad_new + grad_thrust * exact * new
+
+        # Recompute the force in the body frame: drag from the airspeed, and the thrusts.
+        airspeed = subtract(vector(before[X.velocity :], lane), vector(b.wind, lane))
+        drag = vector(b.drag, lane)
+        fx, fy, fz = subtract(vector(b.force_body, lane), multiply(drag, to_body(r, airspeed)))
+        force = fx, fy, fz + total_thrust(b, lane)
+
+        # Gradient with respect to the velocity, through the drag, and to the attitude: forces, drag
+        # and torques turn.
+        braked = multiply(scaled(-1.0, drag), in_body)
+        _add(gradient, X.velocity, lane, to_world(r, braked))
+        x, y, z = transposed((push, airspeed, vector(b.torque_world, lane)))
+        turned = transposed((force, braked, torque))
+        matrix = matvec(turned, x), matvec(turned, y), matvec(turned, z)
+        _add_rotation(before[X.quaternion :], gradient, lane, matrix)
+
+
+@compiled
+def flight_vjp(b, states, gradient, grad_wanted, dt, substeps):
+    """Vector-Jacobian product of :func:`.physics.fly`.
+
+    It takes the physics steps of a control step, the last one first.
+
+    :param b: a block with the state before the control step; its flight is computed again.
+    :param states: memory for the states in between, (substeps + 1, MOVING, LANES).
+    :param grad_wanted: (4, LANES), is set to the gradient with respect to the wanted rotor speeds.
+    """
+    for substep in range(substeps):
+        states[substep] = b.state[:MOVING]
+        fly(b, dt, 1)
+    states[substeps] = b.state[:MOVING]
+    grad_wanted[:] = 0.0
+    for substep in range(substeps - 1, -1, -1):
+        before, after = states[substep], states[substep + 1]
+        move_vjp(before, after, gradient, dt)
+        accelerate_vjp(b, before, after, gradient, grad_wanted)
+
+
+@compiled
+def limits_vjp(b, grad_speed):
+    """Vector-Jacobian product of :func:`.physics.limit_speeds`, in place.
+
+    :param b: a block with the speeds before it, ``command``, and after it, ``wanted_speeds``.
+    :param grad_speed: (4, LANES), with respect to the speeds after it.
+    """
+    for lane in range(LANES):
+        speeds = b.command[:, lane]
+        fastest = speeds.argmax()
+        greatest = b.greatest_speed[lane]
+        if speeds[fastest] <= greatest:
+            continue
+        is_shared = b.shared_saturation[lane] > 0.0
+        taken = 0.0
+        for k in range(4):
+            # The reduction that all rotors share may stop a rotor.
+            stops = b.wanted_speeds[k, lane] == 0.0
+            if stops or (speeds[k] > greatest and not is_shared):
+                grad_speed[k, lane] = 0.0
+            taken += grad_speed[k, lane]
+        if is_shared:
+            grad_speed[fastest, lane] -= taken
+
+
+@fast
+def noise_vjp(b, grad_feature):
+    """Vector-Jacobian product of noise and scaling of the features (Eq. 3.16), in place.
+
+    :param b: a block whose features without noise, noise and scaling are computed.
+    :param grad_feature: float64 (OBSERVATION_SIZE, LANES), with respect to the scaled features.
+    """
+    for k in range(OBSERVATION_SIZE):
+        for lane in range(LANES):
+            level, noise = b.noise_level[lane], b.noise[k, lane]
+            slope = 1.0 + level * noise
+            if b.additive[lane] > 0.0:
+                relative = level * b.feature[k, lane]
+                fixed = b.additive[lane] / b.inverse_std[k, lane]
+                both = math.sqrt(relative * relative + fixed * fixed)
+                slope = 1.0 + noise * level * relative / both
+            grad_feature[k, lane] *= slope * b.inverse_std[k, lane]
+
+
+@fast
+def relation_vjp(b, grad_feature):
+    """Vector-Jacobian product of what :func:`.observation.features` does for a moving reference."""
+    f = grad_feature
+    for lane in range(LANES):
+        cosine, sine = heading_of(b, lane)
+        rate = b.target_heading_rate[0, lane]
+        turn(f, F.position, lane, cosine, -sine)
+        for row in range(3):
+            k = F.rotation + 3 * row
+            turn(f, k, lane, cosine, -sine)
+            f[k + 2, lane] -= rate * f[F.body_rates + row, lane]
+            _add(f, k, lane, scaled(-f[F.velocity + row, lane], vector(b.target_velocity, lane)))
+
+
+# The features whose gradient it knows.
+DIFFERENTIATED = {"position", "rotation", "velocity", "body_rates"}
+
+
+@fast
+def features_vjp(b, grad_feature, gradient, for_px4):
+    """Vector-Jacobian product of :func:`.observation.features`.
+
+    It is added to the gradient with respect to the state of a loaded block.
+
+    :param grad_feature: float64 (OBSERVATION_SIZE, LANES), with respect to the features in
+        their units.
+    :param for_px4: whether the velocity has world axes.
+    """
+    f = grad_feature
+    for lane in range(LANES):
+        r = rotation(b.quaternion, lane)
+        _add(gradient, X.position, lane, vector_at(f, F.position, lane))
+        _add(gradient, X.body_rates, lane, vector_at(f, F.body_rates, lane))
+        # The observed velocity is Rᵀ v, or v itself, which the attitude does not turn.
+        observed = vector(f[F.velocity :], lane)
+        of_velocity = observed
+        v = 0.0, 0.0, 0.0
+        if not for_px4:
+            of_velocity = to_world(r, observed)
+            v = vector(b.velocity, lane)
+        _add(gradient, X.velocity, lane, of_velocity)
+        # The observed matrix is Rᵀ, row by row: its columns are the rows of R.
+        x = add(_column(f, 0, lane), scaled(v[0], observed))
+        y = add(_column(f, 1, lane), scaled(v[1], observed))
+        z = add(_column(f, 2, lane), scaled(v[2], observed))
+        _add_rotation(b.quaternion, gradient, lane, (x, y, z))
+
+
+@inlined
+def _column(f, k, lane):
+    k += F.rotation
+    return f[k, lane], f[k + 3, lane], f[k + 6, lane]

@@ -1,5 +1,0 @@
-"""Vehicles: one YAML file each, and what their parameters say they can do."""
-
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
-
-__all__ = ["Vehicle", "load_vehicle"]
