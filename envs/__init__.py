@@ -6,7 +6,7 @@ from sb3_quad.base.imports import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.envs.batch_vec_env import BatchVecEnv
-    from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
+    from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
     from sb3_quad.envs.simulation.tasks import TASKS, Task
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
@@ -15,8 +15,8 @@ __all__ = [
     "TASKS",
     "BatchVecEnv",
     "QuadcopterEnv",
+    "QuadcopterGymVectorEnv",
     "QuadcopterVecEnv",
-    "QuadcopterVectorEnv",
     "Task",
 ]
 
@@ -25,7 +25,7 @@ _LAZY = {
     "BatchVecEnv": "sb3_quad.envs.batch_vec_env",
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
-    "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",
+    "QuadcopterGymVectorEnv": "sb3_quad.envs.gym_vector",
     "TASKS": "sb3_quad.envs.simulation.tasks",
     "Task": "sb3_quad.envs.simulation.tasks",
 }

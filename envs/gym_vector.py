@@ -1,4 +1,4 @@
-"""``QuadcopterVectorEnv``: n quadcopters as one Gymnasium vector environment."""
+"""``QuadcopterGymVectorEnv``: n quadcopters as one Gymnasium vector environment."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from sb3_quad.envs.simulation.tasks import TaskSpec
 MODES = ("NextStep", "SameStep")
 
 
-class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArray]):
+class QuadcopterGymVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, AnyArray]):
     """The batched environment for users outside Stable-Baselines3.
 
     ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8,

@@ -80,7 +80,7 @@ class AdaptiveScaling:
 
 
 def measure_mean(
-    policy: Any, n_flights: int = N_OFFSETS, settings: FlightSettings | None = None
+    policy: Any, n_episodes: int = N_OFFSETS, settings: FlightSettings | None = None
 ) -> FloatArray:
     """Find the position components of μ, (3,), m, with which a policy stops at its target.
 
@@ -93,7 +93,7 @@ def measure_mean(
     std = None if settings is None else settings.observation_std
     for number in range(ROUNDS):
         seed = seed_for("offset", number)
-        mean = mean - hover_offset(AdaptiveScaling(policy, mean, std), n_flights, seed, settings)
+        mean = mean - hover_offset(AdaptiveScaling(policy, mean, std), n_episodes, seed, settings)
     return mean
 
 

@@ -219,5 +219,5 @@ if __name__ == "__main__":
     )
     model.learn(arguments.timesteps, callback=schedule)
     print(f"beta {model.current_beta:.2f}")
-    flights = fly(model, "target_tracking", n_flights=480, seed=1_000_000)
+    flights = fly(model, "target_tracking", n_episodes=480, seed=1_000_000)
     print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

@@ -83,13 +83,13 @@ class EnergyCost(VecEnvWrapper):
         return observations, rewards - ENERGY_COST * self.power.astype(np.float32), dones, infos
 
 
-def mean_reward(controller, n_flights=240, seed=1_000_000):
+def mean_reward(controller, n_episodes=240, seed=1_000_000):
     """The mean reward of fresh flights, with the energy, and the share of flights that survive."""
-    quadcopters = QuadcopterVecEnv(n_flights, "target_tracking", seed=seed)
+    quadcopters = QuadcopterVecEnv(n_episodes, "target_tracking", seed=seed)
     env = EnergyCost(quadcopters)
     observations = env.reset()
-    flying = np.ones(n_flights, dtype=bool)
-    rewards = np.zeros(n_flights)
+    flying = np.ones(n_episodes, dtype=bool)
+    rewards = np.zeros(n_episodes)
     survived = 0
     while flying.any():
         if hasattr(controller, "actions"):
@@ -101,7 +101,7 @@ def mean_reward(controller, n_flights=240, seed=1_000_000):
         for row in np.flatnonzero(dones & flying):
             survived += infos[row]["survival"]
         flying &= ~dones
-    return rewards.mean(), survived / n_flights
+    return rewards.mean(), survived / n_episodes
 
 
 parser = argparse.ArgumentParser(
@@ -149,6 +149,6 @@ if arguments.timesteps > 100_000:
 for name, controller in (("LQR", expert), ("DAgger", imitation), ("PPOBC", agent)):
     reward, survival = mean_reward(controller)
     print(f"{name}: mean reward {reward:.2f}, survival {survival:.1%}")
-flights = fly(agent, "target_tracking", n_flights=240, seed=1_000_000)
+flights = fly(agent, "target_tracking", n_episodes=240, seed=1_000_000)
 print(f"PPOBC: median final error {np.median(flights.final_error):.3f} m")
 agent.save("energy")

@@ -148,5 +148,5 @@ if __name__ == "__main__":
     model.learn(arguments.timesteps, callback=metrics)
     for name, value in metrics.metrics().items():
         print(f"{name}: {value:.3f}")
-    flights = fly(model, "target_tracking", n_flights=480, seed=1_000_000)
+    flights = fly(model, "target_tracking", n_episodes=480, seed=1_000_000)
     print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

@@ -42,10 +42,10 @@ class CartTape:
         self.env = env
         self.n_steps = n_steps
 
-    def reset(self, carry_on):
+    def reset(self, continue_flights):
         """Begin a recording; return the observations (n, 2)."""
         self.steps = []
-        return self.env.state if carry_on else self.env.reset()
+        return self.env.state if continue_flights else self.env.reset()
 
     def step(self, actions):
         """Move the carts; return the observations (n, 2)."""

@@ -22,7 +22,7 @@ import pybullet
 
 import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.agents.agent_settings import env_kwargs
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.agents.zips import load_model
 from sb3_quad.envs.rendering.window import has_display
 
@@ -120,7 +120,7 @@ def fly(agent, stick, speed=3.0, turn=1.5, render_mode="human"):
     :param stick: a function that returns forward, left, up and turn, each in [-1, 1], or None.
     """
     # A name of the package stands for a zip here; an agent brings its vehicle and observation.
-    path = pretrained(agent) or agent
+    path = pretrained_path(agent) or agent
     model = load_model(path)
     settings = {**env_kwargs(path), "task": "target_tracking", "reference": None}
     # The vehicle, where an agent flies any

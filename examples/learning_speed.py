@@ -128,7 +128,7 @@ def train_from_nothing(seed: int, limit: float, rows: list[tuple[Any, ...]]) -> 
     """Train only by the model's gradient, on windows of a second that continue their flights."""
     tasks = {"state_recovery": 0.6, "target_tracking": 0.4}
     env = QuadcopterVecEnv(256, task=tasks, seed=seed_for("training", seed))
-    model = APG("MlpPolicy", env, n_steps=100, carry_on=True, seed=seed)
+    model = APG("MlpPolicy", env, n_steps=100, continue_flights=True, seed=seed)
     evaluations = Evaluations(FROM_NOTHING, seed, 0.0, limit, rows)
     model.learn(256 * 100 * 1500, evaluations)
     evaluations.evaluate()

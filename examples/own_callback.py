@@ -73,5 +73,5 @@ less_expert = CoefficientSchedule(
     "beta", start=0.8, final=0.0, follow="my/crash_rate", between=(0.5, 0.05)
 )
 model.learn(arguments.timesteps, callback=[CrashRate(), less_expert])
-flights = fly(model, "state_recovery", n_flights=480, seed=1_000_000)
+flights = fly(model, "state_recovery", n_episodes=480, seed=1_000_000)
 print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

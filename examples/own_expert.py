@@ -70,7 +70,7 @@ if __name__ == "__main__":
     )
     model.learn(arguments.timesteps)
     for name, controller in (("PID", PIDExpert()), ("own expert", expert), ("agent", model)):
-        flights = fly(controller, "state_recovery", n_flights=480, seed=1_000_000)
+        flights = fly(controller, "state_recovery", n_episodes=480, seed=1_000_000)
         print(
             f"{name}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}"
         )

@@ -95,6 +95,6 @@ for when in ("before", "after"):
     if when == "after":
         model.learn(arguments.timesteps)
     reward, _ = evaluate_policy(model, make_env(96, 1_000_000), n_eval_episodes=96)
-    flights = fly(model, "target_tracking", n_flights=480, seed=1_000_000)
+    flights = fly(model, "target_tracking", n_episodes=480, seed=1_000_000)
     shares = f"success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}"
     print(f"agent {when} training: mean reward {reward:.2f}, {shares}")

@@ -67,5 +67,5 @@ model = DAgger(
 )
 model.learn(arguments.timesteps)
 for name, controller in (("PID", PIDExpert(vehicle)), ("geometric", expert), ("agent", model)):
-    flights = fly(controller, "state_recovery", n_flights=480, seed=1_000_000, vehicle=vehicle)
+    flights = fly(controller, "state_recovery", n_episodes=480, seed=1_000_000, vehicle=vehicle)
     print(f"{name}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

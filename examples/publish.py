@@ -237,10 +237,10 @@ def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> byte
     return buffer.getvalue()
 
 
-def measure(policy: Any, n_flights: int, **settings: Any) -> dict[str, Flights]:
+def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Flights]:
     """Fly for the rows of the table: recoveries, targets at each distance, figures of eight.
 
-    :param n_flights: episodes at each distance.
+    :param n_episodes: episodes at each distance.
     :param settings: ``vehicle``, ``noise`` and ``observation_std``, as
         :func:`~sb3_quad.evaluation.flights.fly` takes them.
     :returns: flights by the name of the row.
@@ -248,16 +248,16 @@ def measure(policy: Any, n_flights: int, **settings: Any) -> dict[str, Flights]:
     parts = []
     for number in range(N_RECOVERIES):
         seed = seed_for("card", number)
-        parts.append(fly(policy, "state_recovery", n_flights, seed, **settings))
+        parts.append(fly(policy, "state_recovery", n_episodes, seed, **settings))
     rows = {RECOVERY: Flights.concatenate(parts)}
     for name, distance in TARGETS.items():
         task = {"target_distance": distance}
         seed = seed_for("card", int(1000 * distance))
-        rows[name] = fly(policy, "target_tracking", n_flights, seed, task_kwargs=task, **settings)
+        rows[name] = fly(policy, "target_tracking", n_episodes, seed, task_kwargs=task, **settings)
     # From a hover at its start.
     task = {"target_distance": 0.0}
     how = {**settings, "task_kwargs": task, "reference": {"curve": "figure_eight", "speed": 2.0}}
-    rows[FIGURE_EIGHT] = fly(policy, "target_tracking", n_flights, seed_for("card", 8), **how)
+    rows[FIGURE_EIGHT] = fly(policy, "target_tracking", n_episodes, seed_for("card", 8), **how)
     return rows
 
 

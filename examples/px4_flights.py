@@ -112,7 +112,7 @@ def main(arguments: list[str]) -> None:
             options.flights,
             options.seed,
             vehicle=vehicle.model_copy(update=steps),
-            max_steps=round(SECONDS * rate),
+            max_episode_steps=round(SECONDS * rate),
             **seen,
         )
 

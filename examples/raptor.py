@@ -154,7 +154,7 @@ def network_inputs(features: Float32Array) -> Float32Array:
 
 if __name__ == "__main__":
     for task in ("target_tracking", "state_recovery"):
-        flights = fly(Raptor(), task, n_flights=48, seed=1_000_000)
+        flights = fly(Raptor(), task, n_episodes=48, seed=1_000_000)
         print(
             f"{task}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}"
         )

@@ -134,7 +134,7 @@ def xyz_world(vehicle: str | Vehicle) -> PIDReading:
 
 if __name__ == "__main__":
     for reading in (zyx_body, zyx_world, zxy_body, zxy_world, xyz_body, xyz_world):
-        flights = fly(reading("itm"), "state_recovery", n_flights=240, seed=0)
+        flights = fly(reading("itm"), "state_recovery", n_episodes=240, seed=0)
         print(
             f"{reading.__name__}: {flights.survival.mean():.1%} of 240 recoveries survive "
             "(thesis: 29.48%)"

@@ -30,7 +30,7 @@ model.save(arguments.output)
 
 for task in ("state_recovery", "target_tracking"):
     for name, controller in (("expert", "pid"), ("agent", model)):
-        flights = fly(controller, task, n_flights=480, seed=1_000_000)
+        flights = fly(controller, task, n_episodes=480, seed=1_000_000)
         print(
             f"{name}, {task}: success {flights.success.mean():.1%},"
             f" survival {flights.survival.mean():.1%}"

@@ -55,7 +55,7 @@ if arguments.timesteps > every:
     model.correct_offset()
 model.save(arguments.output)
 for task in ("state_recovery", "target_tracking"):
-    flights = fly(model, task, n_flights=480, seed=1_000_000)
+    flights = fly(model, task, n_episodes=480, seed=1_000_000)
     print(
         f"agent, {task}: success {flights.success.mean():.1%},"
         f" survival {flights.survival.mean():.1%}"

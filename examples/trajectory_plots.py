@@ -36,26 +36,26 @@ class TrajectoryPlots(EveryTimesteps):
     from the training: neither its environments nor its random numbers are touched.
 
     :param every: timesteps between plots.
-    :param n_flights: episodes in a plot.
+    :param n_episodes: episodes in a plot.
     :param seed: seed of the flights.
-    :param max_steps: control steps after which an episode ends at the latest.
+    :param max_episode_steps: control steps after which an episode ends at the latest.
     :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as
         ``task`` and ``vehicle``.
-    :raises ConfigError: ``every`` or ``n_flights`` below 1, or an unknown keyword.
+    :raises ConfigError: ``every`` or ``n_episodes`` below 1, or an unknown keyword.
     """
 
     def __init__(
         self,
         every: int,
-        n_flights: int = 4,
+        n_episodes: int = 4,
         seed: int = 0,
-        max_steps: int = MAX_EPISODE_STEPS,
+        max_episode_steps: int = MAX_EPISODE_STEPS,
         verbose: int = 0,
         **environment: Any,
     ) -> None:
         super().__init__(every, verbose)
-        self._seeds = row_seeds(seed, n_flights)
-        self._settings = FlightSettings().with_changes(**environment, max_episode_steps=max_steps)
+        self._seeds = row_seeds(seed, n_episodes)
+        self._settings = FlightSettings().with_changes(**environment, max_episode_steps=max_episode_steps)
 
     def _on_event(self) -> bool:
         recorder = Recorder(len(self._seeds))
@@ -125,8 +125,10 @@ if __name__ == "__main__":
         device="cpu",
         tensorboard_log="tb",
     )
-    plots = TrajectoryPlots(every=60_000, n_flights=2, max_steps=200, task="state_recovery")
+    plots = TrajectoryPlots(
+        every=60_000, n_episodes=2, max_episode_steps=200, task="state_recovery"
+    )
     model.learn(arguments.timesteps, callback=plots)
-    flights = fly(model, "state_recovery", n_flights=480, seed=1_000_000)
+    flights = fly(model, "state_recovery", n_episodes=480, seed=1_000_000)
     print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")
     print("plots are in tb/")

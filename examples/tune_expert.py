@@ -130,7 +130,7 @@ def measure_expert(
     A tracking flight that never gets within 0.1 m, or never stays there, counts as ``time_limit``
     control steps.
     """
-    keywords: dict[str, Any] = {"vehicle": vehicle, "noise": 0.0, "max_steps": time_limit}
+    keywords: dict[str, Any] = {"vehicle": vehicle, "noise": 0.0, "max_episode_steps": time_limit}
     recovery = Flights.concatenate(
         [fly(expert, "state_recovery", episodes, seed, **keywords) for seed in seeds]
     )

@@ -18,12 +18,12 @@ from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:
     from sb3_quad.agents.agent_settings import env_kwargs
-    from sb3_quad.agents.pretrained import load_pretrained, pretrained
+    from sb3_quad.agents.pretrained import load_pretrained, pretrained_path
     from sb3_quad.algorithms.apg import APG
     from sb3_quad.algorithms.dagger import DAgger
     from sb3_quad.algorithms.ppo_bc import PPOBC
     from sb3_quad.algorithms.sac_bc import SACBC
-    from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
+    from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
     from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
@@ -41,15 +41,15 @@ __all__ = [
     "GeometricExpert",
     "PIDExpert",
     "QuadcopterEnv",
+    "QuadcopterGymVectorEnv",
     "QuadcopterVecEnv",
-    "QuadcopterVectorEnv",
     "__version__",
     "compare",
     "env_kwargs",
     "fly",
     "load_pretrained",
     "load_vehicle",
-    "pretrained",
+    "pretrained_path",
     "sample_vehicles",
 ]
 
@@ -62,14 +62,14 @@ _LAZY = {
     "PPOBC": "sb3_quad.algorithms.ppo_bc",
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
-    "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",
+    "QuadcopterGymVectorEnv": "sb3_quad.envs.gym_vector",
     "SACBC": "sb3_quad.algorithms.sac_bc",
     "compare": "sb3_quad.evaluation.compare",
     "env_kwargs": "sb3_quad.agents.agent_settings",
     "fly": "sb3_quad.evaluation.flights",
     "load_pretrained": "sb3_quad.agents.pretrained",
     "load_vehicle": "sb3_quad.envs.vehicles.vehicle",
-    "pretrained": "sb3_quad.agents.pretrained",
+    "pretrained_path": "sb3_quad.agents.pretrained",
     "sample_vehicles": "sb3_quad.envs.simulation.sampled_vehicles",
 }
 

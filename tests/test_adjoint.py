@@ -385,7 +385,7 @@ def test_flights_that_carry_on_have_the_gradient_of_what_follows():
     assert np.flatnonzero(tape.lost).tolist() == LOST
     for recording in (1, 2):
         before, lost = tape.batch.state.copy(), tape.lost.copy()
-        tape.reset(carry_on=True)
+        tape.reset(continue_flights=True)
         goes_on = (tape.batch.state == before).all(axis=0)
         np.testing.assert_array_equal(goes_on, ~lost)
         assert not tape.lost.any()

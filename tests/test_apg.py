@@ -49,7 +49,7 @@ def test_its_zip_loads_in_stock_ppo_and_says_how_it_flies(tmp_path):
     for loaded in (PPO.load(tmp_path / "agent.zip"), load_model(tmp_path / "agent.zip")):
         actions, _ = loaded.predict(observations, deterministic=True)
         np.testing.assert_array_equal(actions, agent.predict(observations, deterministic=True)[0])
-    assert fly(loaded, n_flights=2, last_action=True, max_steps=5).n == 2
+    assert fly(loaded, n_episodes=2, last_action=True, max_episode_steps=5).n == 2
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_one_others():
@@ -78,13 +78,13 @@ def test_the_critic_stays_and_the_environment_is_as_it_was():
 def test_flights_that_carry_on_continue_where_they_were():
     env = QuadcopterVecEnv(8, task="target_tracking", seed=0)
     tape = env.record(5)
-    tape.reset(carry_on=False)
+    tape.reset(continue_flights=False)
     for _ in range(5):
         tape.step(np.zeros((8, 4), np.float32))
     end = env.batch.state.copy()
-    tape.reset(carry_on=True)
+    tape.reset(continue_flights=True)
     np.testing.assert_array_equal(env.batch.state, end)
-    tape.reset(carry_on=False)
+    tape.reset(continue_flights=False)
     assert not np.array_equal(env.batch.state, end)
 
 
@@ -92,7 +92,7 @@ def test_flights_that_carry_on_end_at_their_time_limit():
     env = QuadcopterVecEnv(8, task="target_tracking", max_episode_steps=12, seed=0)
     tape = env.record(5)
     for steps_before in (0, 5, 10, 0):
-        tape.reset(carry_on=True)
+        tape.reset(continue_flights=True)
         assert (env.batch.streams[STEP] == steps_before).all()
         for _ in range(5):
             tape.step(np.zeros((8, 4), np.float32))
@@ -109,7 +109,7 @@ def test_a_later_tape_carries_on_where_the_one_before_ended():
     snapshot = env.batch.snapshot()
     assert 0 < first.lost.sum() < 64
     for _ in range(2):
-        env.record(5).reset(carry_on=True)
+        env.record(5).reset(continue_flights=True)
         steps = np.where(first.lost, 0, 190)
         np.testing.assert_array_equal(env.batch.streams[STEP], steps)
         np.testing.assert_array_equal(env.batch.state[:, ~first.lost], end[:, ~first.lost])

@@ -123,7 +123,7 @@ def test_the_final_error_is_the_median_of_the_flights_that_survive(tmp_path):
         env, 1000, 8, 5, tmp_path / "best.zip", tmp_path / "evaluations.npz", lines.append
     )
     model.learn(80, callback=best)
-    flown = fly(model, n_flights=8, seed=5, max_steps=50, **how)
+    flown = fly(model, n_episodes=8, seed=5, max_episode_steps=50, **how)
     assert 0 < flown.survival.sum() < 8
     with np.load(tmp_path / "evaluations.npz") as file:
         errors = np.where(flown.survival, flown.final_error, np.nan)  # in the order of the rows

@@ -73,8 +73,8 @@ def test_the_geometric_expert_flies_them_with_gains_derived_or_found(name):
     vehicle = load_vehicle(name)
     for gains in (None, derived_gains(vehicle)):
         expert = GeometricExpert(vehicle, gains)
-        recovery = fly(expert, "state_recovery", 120, 5, vehicle, noise=0.0, max_steps=600)
-        tracking = fly(expert, "target_tracking", 30, 5, vehicle, noise=0.0, max_steps=1000)
+        recovery = fly(expert, "state_recovery", 120, 5, vehicle, noise=0.0, max_episode_steps=600)
+        tracking = fly(expert, "target_tracking", 30, 5, vehicle, noise=0.0, max_episode_steps=1000)
         assert recovery.success.mean() > 0.98 and tracking.success.all()
         assert np.nanmean(tracking.time_to[0.1]) < 3.0 and tracking.final_error.max() < 0.01
 

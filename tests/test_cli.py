@@ -83,7 +83,7 @@ def settings_file(tmp_path):
 def job(tmp_path, algo="dagger", **changes):
     settings = {**(SMALL_DAGGER if algo == "dagger" else SMALL), **changes}
     if algo == "apg":
-        settings["carry_on"] = True
+        settings["continue_flights"] = True
         del settings["batch_size"], settings["env_kwargs"]
     return TrainingJob(
         config=build_config(algo, ENV, settings), log_folder=str(tmp_path / "logs"), eval_episodes=0
@@ -521,7 +521,7 @@ def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_w
     closing.agent_and_expert(job, agent)
     assert np.allclose(seen[0][:, 12:], -2.5)  # an episode begins at rest: (0 - 5) / 2
     seen.clear()
-    compare({"agent": agent}, n_flights=4, seed=0, **job.flight_settings.in_any_task())
+    compare({"agent": agent}, n_episodes=4, seed=0, **job.flight_settings.in_any_task())
     assert np.allclose(seen[0][:, 12:], -2.5)
 
 
@@ -571,7 +571,7 @@ def test_a_command_that_runs_notes_ctrl_c_again(ignored):
 
 def test_flights_of_a_file_are_cloned_by_beta_0_alone(tmp_path, capsys):
     flights = tmp_path / "flights.npz"
-    sb3_quad.fly(sb3_quad.PIDExpert(), n_flights=4, max_steps=50, record=flights)
+    sb3_quad.fly(sb3_quad.PIDExpert(), n_episodes=4, max_episode_steps=50, record=flights)
     settings = {**SMALL_DAGGER, "demonstrations": str(flights)}
     settings["env_kwargs"] = {"max_episode_steps": 50}
     file = tmp_path / "flights.yml"
@@ -590,7 +590,9 @@ def test_flights_of_a_file_are_cloned_by_beta_0_alone(tmp_path, capsys):
 
 
 def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
-    sb3_quad.fly(sb3_quad.PIDExpert(), n_flights=4, max_steps=50, record=tmp_path / "flights.npz")
+    sb3_quad.fly(
+        sb3_quad.PIDExpert(), n_episodes=4, max_episode_steps=50, record=tmp_path / "flights.npz"
+    )
     cloned = {"demonstrations": str(tmp_path / "flights.npz"), "beta": 0}
     cloned["callback"] = {"test_cli.Interrupt": {"after": 900}}
     Interrupt.sent = True

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from sb3_quad import PIDExpert, env_kwargs, load_pretrained, pretrained
+from sb3_quad import PIDExpert, env_kwargs, load_pretrained, pretrained_path
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.simulation.settings import FlightSettings
@@ -26,13 +26,13 @@ def test_each_flies_as_it_was_trained_through_the_same_episodes():
     controllers = {
         "hover": hover,
         "agent": "crazyflie-recovery",
-        "zip": pretrained("crazyflie-recovery"),
+        "zip": pretrained_path("crazyflie-recovery"),
         "model": load_pretrained("crazyflie-recovery"),
         "other": "itm-robust",
         "PID": "pid",
         "object": PIDExpert("crazyflie"),
     }
-    result = compare(controllers, ["state_recovery"], n_flights=6, seed=3, reward=action_cost)
+    result = compare(controllers, ["state_recovery"], n_episodes=6, seed=3, reward=action_cost)
     metrics = {label: result[label]["state_recovery"] for label in controllers}
     assert metrics["agent"] == metrics["zip"] == metrics["model"] != metrics["other"]
     # Those that do not say how they fly take the vehicle of the first agent.
@@ -65,7 +65,7 @@ def test_an_agent_of_a_factory_observes_as_it_was_trained(capsys):
     )
     assert result["made"] == result["model"]
     assert not capsys.readouterr().err
-    fly(agent, n_flights=2, max_steps=2, vehicle="crazyflie")
+    fly(agent, n_episodes=2, max_episode_steps=2, vehicle="crazyflie")
     warning = capsys.readouterr().err
     assert "another observation (observation_std); sb3_quad.env_kwargs(agent)" in warning
 
@@ -83,9 +83,9 @@ def test_those_that_fly_another_vehicle_are_named(recwarn):
 def test_settings_for_all_override_those_of_the_agents():
     controllers = {"agent": "crazyflie-recovery", "PID": "pid"}
     result = compare(
-        controllers, n_flights=4, seed=1, vehicle="itm", noise=0.0, max_episode_steps=50
+        controllers, n_episodes=4, seed=1, vehicle="itm", noise=0.0, max_episode_steps=50
     )
-    pid = fly(PIDExpert(), "target_tracking", 4, 1, noise=0.0, max_steps=50)
+    pid = fly(PIDExpert(), "target_tracking", 4, 1, noise=0.0, max_episode_steps=50)
     assert result["PID"]["target_tracking"].reward.value == pytest.approx(pid.reward.mean())
     assert [*result["agent"]] == ["target_tracking", "state_recovery"]
     assert "true state" in result.tables[0].title and "flies" not in result.tables[0].caption
@@ -131,7 +131,7 @@ def test_a_comparison_is_plain_text_and_a_table_in_notebooks():
         ({"PID": "pid"}, {"vehicel": "itm"}, "did you mean 'vehicle'"),
         ({"PID": "pid"}, {"tasks": ["recovery"]}, "unknown task 'recovery'"),
         ({"PID": "pid"}, {"tasks": [Task(), Task()]}, "several tasks are named custom"),
-        ({"PID": "pid"}, {"n_flights": 0}, "n_flights 0: must be a whole number from 1 to"),
+        ({"PID": "pid"}, {"n_episodes": 0}, "n_episodes 0: must be a whole number from 1 to"),
         ({"PID": "pid"}, {"seed": -5}, "seed -5: must be a whole number from 0 to"),
         ({"PID": "pid"}, {"thesis_columns": ["expret"]}, "did you mean 'expert'"),
         ({}, {}, "give a mapping of labels"),
@@ -147,5 +147,5 @@ def test_bad_input_is_named(controllers, keywords, message):
 
 @pytest.mark.parametrize("task", ["target_tracking", {"state_recovery": 1}, Task()])
 def test_a_single_task_needs_no_list(task):
-    keywords = {"n_flights": 2, "max_episode_steps": 5}
+    keywords = {"n_episodes": 2, "max_episode_steps": 5}
     assert compare({"PID": "pid"}, task, **keywords) == compare({"PID": "pid"}, [task], **keywords)

@@ -134,7 +134,11 @@ def test_actions_in_another_unit_are_warned_of_once(recwarn):
     labeller.labels(observation)
     assert not recwarn.list
     with pytest.warns(UserWarning, match="such as 4.24, which are clipped; are they newtons"):
-        fly(lambda observation: np.full((len(observation), 4), 4.24), n_flights=2, max_steps=2)
+        fly(
+            lambda observation: np.full((len(observation), 4), 4.24),
+            n_episodes=2,
+            max_episode_steps=2,
+        )
 
 
 def test_an_expert_of_another_vehicle_is_warned_of(recwarn):
@@ -142,7 +146,7 @@ def test_an_expert_of_another_vehicle_is_warned_of(recwarn):
     with pytest.warns(UserWarning, match="made for the vehicle itm and flies crazyflie"):
         Controller.for_env(PIDExpert(), env)
     with pytest.warns(UserWarning, match="made for the vehicle itm and flies crazyflie"):
-        fly(PIDExpert(), n_flights=2, vehicle="crazyflie", max_steps=2)
+        fly(PIDExpert(), n_episodes=2, vehicle="crazyflie", max_episode_steps=2)
     # These know the vehicle, or fly another one on purpose.
     nominal = QuadcopterVecEnv(2, randomize={"mass": [0.8, 1.2]}, seed=0)
     Controller.for_env("pid", env)
@@ -155,7 +159,7 @@ def test_a_model_of_other_limits_names_the_way_out():
     rescaled = gym.wrappers.RescaleAction(Blind(), np.float32(0.0), np.float32(1.0))
     model = PPO("MlpPolicy", rescaled, device="cpu")
     with pytest.raises(ControllerError, match="train it within these, or give an environment with"):
-        fly(model, n_flights=1, max_steps=1)
+        fly(model, n_episodes=1, max_episode_steps=1)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +220,7 @@ class Counter:
 def test_the_state_of_a_controller_lasts_one_flight():
     counter = Counter()
     for n in (3, 2):
-        fly(counter, "target_tracking", n, max_steps=4)
+        fly(counter, "target_tracking", n, max_episode_steps=4)
     assert counter.given == [None, 1, 2, 3] * 2
 
 

@@ -394,9 +394,9 @@ def test_dict_observations_and_discrete_actions_are_refused():
         DAgger("MlpPolicy", "CartPole-v1")
 
 
-def recorded(path, n_flights=48):
+def recorded(path, n_episodes=48):
     """Write the expert's flights of a pendulum, 50 steps each, into a file."""
-    env = pendulum(n_flights)
+    env = pendulum(n_episodes)
     observation = env.reset()
     observations, actions = [], []
     for _ in range(50):

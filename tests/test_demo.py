@@ -20,7 +20,7 @@ from hovering import teach_to_hover
 from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from sb3_quad.agents.agent_settings import env_kwargs
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
@@ -254,7 +254,7 @@ def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path, monkeyp
     reads from the zip itself.
     """
     (spec,), flown = parse_controllers([name]), load_vehicle(vehicle)
-    model = PPO.load(pretrained(name), device="cpu")
+    model = PPO.load(pretrained_path(name), device="cpu")
     monkeypatch.setattr(page_module, "EXACT", 0 if how == "float16" else 10**6)
     agent = {"label": name, **describe(spec)}
     assert agent["bits"] == (16 if how == "float16" else 32)
@@ -274,7 +274,7 @@ def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path, monkeyp
         c, s = math.cos(turn.angle / 2), math.sin(turn.angle / 2)
         start["quaternion"] = [w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]
         start["body_rates"] = (turn.axes.T @ start["body_rates"]).tolist()
-    source = {"zip": str(pretrained(name))} if how == "zip" else {"agent": agent}
+    source = {"zip": str(pretrained_path(name))} if how == "zip" else {"agent": agent}
     path = in_node(
         tmp_path, vehicle=flown.model_dump(mode="json"), **source, start=start, steps=STEPS
     )
@@ -332,7 +332,7 @@ def previewing(tmp_path):
 def test_the_agents_follow_a_reference_as_in_python(name, how, tmp_path, monkeypatch):
     """A figure eight with a heading that turns: the frame of the observation turns with it."""
     monkeypatch.setattr(page_module, "EXACT", 10**6)
-    zip_file = previewing(tmp_path) if name == "previewing" else str(pretrained(name))
+    zip_file = previewing(tmp_path) if name == "previewing" else str(pretrained_path(name))
     (spec,) = parse_controllers([zip_file])
     model = PPO.load(zip_file, device="cpu")
     curve = {"curve": "figure_eight", "speed": 1.5, "heading": 0.3, "heading_rate": 0.4}
@@ -402,7 +402,7 @@ console.log(JSON.stringify(added.map((vehicle) => addVehicle(vehicles, vehicle))
 
 def test_a_vehicle_of_a_name_that_is_taken_gets_another(tmp_path):
     heavy = load_vehicle("itm").model_copy(update={"mass": 2.0})
-    model = PPO.load(pretrained("itm-recovery"), device="cpu")
+    model = PPO.load(pretrained_path("itm-recovery"), device="cpu")
     FlightSettings(vehicle=heavy).write_into(model)
     model.save(tmp_path / "heavy.zip")
     page, first, _ = make_page(
@@ -461,7 +461,7 @@ def test_the_page_reads_zips_of_any_algorithm(kind, tmp_path):
 def test_a_zip_that_does_not_fit_is_refused_in_one_line(tmp_path):
     import gymnasium
 
-    content = pretrained("itm-recovery").read_bytes()
+    content = pretrained_path("itm-recovery").read_bytes()
     PPO("MlpPolicy", gymnasium.make("Pendulum-v1"), device="cpu").save(tmp_path / "pendulum.zip")
     (tmp_path / "text.zip").write_text("no zip")
     rebuild = b"torch._utils\n_rebuild_tensor_v2"

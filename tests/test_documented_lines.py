@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.base.yaml_files import YamlFolder, parse_keys
 from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS
@@ -99,8 +99,8 @@ def folder(tmp_path_factory, trained_runs):
     place = tmp_path_factory.mktemp("documented")
     for name in ("agent.zip", "path/to/agent.zip", "mine.zip"):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(pretrained("thesis-recovery"), place / name)
-    shutil.copy(pretrained("itm-robust"), place / "itm-old.zip")
+        shutil.copy(pretrained_path("thesis-recovery"), place / name)
+    shutil.copy(pretrained_path("itm-robust"), place / "itm-old.zip")
     for algo, env in (("dagger", "Tracking"), ("dagger", "Recovery"), ("ppo_bc", "Recovery")):
         for number in (1, 2):
             source = trained_runs("ppo_bc" if algo == "ppo_bc" else "dagger")
@@ -108,8 +108,8 @@ def folder(tmp_path_factory, trained_runs):
             run = shutil.copytree(source, place / "logs" / algo / f"{env_id}_{number}")
             for path in [*run.glob("QuadStateRecovery-v0*")]:
                 path.rename(path.with_name(path.name.replace("QuadStateRecovery-v0", env_id)))
-            shutil.copy(pretrained("thesis-recovery"), run / "corrected_model.zip")
-            shutil.copy(pretrained("thesis-imitation"), run / "best_model.zip")
+            shutil.copy(pretrained_path("thesis-recovery"), run / "corrected_model.zip")
+            shutil.copy(pretrained_path("thesis-imitation"), run / "best_model.zip")
     for algo in ("ppo", "logs/ppo"):
         shutil.copytree(
             place / "logs/ppo_bc", place / algo / "ppo_bc" if algo == "ppo" else place / algo

@@ -16,7 +16,7 @@ import pytest
 import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.agents.zips import load_model, saved_algorithm
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
@@ -415,7 +415,7 @@ scenarios:
 def test_each_agent_flies_its_own_vehicle_unless_another_is_asked_for(here, capsys):
     (here / "small.yaml").write_text(RECOVERY)
     zipped = here / "mailed.zip"
-    zipped.write_bytes(pretrained("crazyflie-recovery").read_bytes())
+    zipped.write_bytes(pretrained_path("crazyflie-recovery").read_bytes())
     assert evaluate("mailed.zip", "itm-recovery", "pid") == 0
     results = load_results("out")
     for name in ("mailed", "itm-recovery"):

@@ -51,7 +51,7 @@ def same(a: Flights, b: Flights, tolerances=TOLERANCES) -> None:
 def test_pybullet_gives_the_same_flights(task, vehicle):
     expert = PIDExpert(vehicle)
     flights = [
-        fly(expert, task, 3, seed=11, vehicle=vehicle, backend=backend, max_steps=400)
+        fly(expert, task, 3, seed=11, vehicle=vehicle, backend=backend, max_episode_steps=400)
         for backend in BACKENDS
     ]
     same(*flights)
@@ -61,7 +61,12 @@ def test_pybullet_flies_what_each_row_has():
     rows = {"vehicle": ["crazyflie", "itm"], "noise": [0.1, 0.0]}
     rows["observation_std"] = np.outer([1.0, 2.0], np.ones(18))
     expert = load_pretrained("itm-recovery")
-    same(*(fly(expert, "state_recovery", 2, backend=b, max_steps=60, **rows) for b in BACKENDS))
+    same(
+        *(
+            fly(expert, "state_recovery", 2, backend=b, max_episode_steps=60, **rows)
+            for b in BACKENDS
+        )
+    )
 
 
 @settings(max_examples=settings().max_examples // 20)
@@ -69,7 +74,7 @@ def test_pybullet_flies_what_each_row_has():
 def test_rows_do_not_depend_on_their_number(seed, n):
     recovery = FlightSettings(task="state_recovery", max_episode_steps=150)
     alone = fly_settings(PIDExpert(), recovery, row_seeds(seed, n)[-1:])
-    among = fly(PIDExpert(), "state_recovery", n, seed, max_steps=150)
+    among = fly(PIDExpert(), "state_recovery", n, seed, max_episode_steps=150)
     last = {
         name: {key: times[-1:] for key, times in values.items()}
         if isinstance(values, dict)
@@ -87,7 +92,7 @@ def test_metrics_are_those_of_the_environment():
         _, _, dones, infos = env.step(expert.actions(env.true_state()))
         for row in np.flatnonzero(dones):
             ended.setdefault(int(row), infos[row])
-    flights = fly(expert, "state_recovery", 6, seed=3, max_steps=300)
+    flights = fly(expert, "state_recovery", 6, seed=3, max_episode_steps=300)
     for row, info in ended.items():
         assert (flights.success[row], flights.survival[row]) == (
             info["is_success"],
@@ -110,7 +115,12 @@ def test_a_fall_is_as_long_as_it_is_high():
 
 def test_hovering_covers_no_distance_and_time_zero_is_the_start():
     flights = fly(
-        hover, "target_tracking", 2, seed=0, max_steps=5, task_kwargs={"target_distance": 0.3}
+        hover,
+        "target_tracking",
+        2,
+        seed=0,
+        max_episode_steps=5,
+        task_kwargs={"target_distance": 0.3},
     )
     assert (flights.time_to[0.5] == 0.0).all()
     assert np.isnan(flights.time_to[0.2]).all()
@@ -145,7 +155,9 @@ def test_an_own_reward_is_summed_over_the_control_steps_of_each_flight():
     # Nobody asks about a flight that was lost before, and is below ground or far away now.
     lost = fly(fall, "state_recovery", 4, reward=Height(flights.length))
     assert np.isfinite(lost.own_reward).all()
-    assert (fly(fall, n_flights=2, max_steps=3, reward=Changes).own_reward == [1.0, 1.0]).all()
+    assert (
+        fly(fall, n_episodes=2, max_episode_steps=3, reward=Changes).own_reward == [1.0, 1.0]
+    ).all()
 
 
 class Height:
@@ -180,15 +192,15 @@ class Changes:
 )
 def test_an_own_reward_that_does_not_fit_is_named(reward, message):
     with pytest.raises(ControllerError, match=f"reward <lambda>: {message}"):
-        fly(hover, n_flights=3, max_steps=2, reward=reward)
+        fly(hover, n_episodes=3, max_episode_steps=2, reward=reward)
 
 
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"n_flights": 4.0}, "n_flights 4.0: must be a whole number from 1 to"),
-        ({"n_flights": 0}, "n_flights 0"),
-        ({"n_episodes": 4}, r"fly: unknown keyword 'n_episodes' \(valid: .*n_flights"),
+        ({"n_episodes": 4.0}, "n_episodes 4.0: must be a whole number from 1 to"),
+        ({"n_episodes": 0}, "n_episodes 0"),
+        ({"n_episodes": 4}, r"fly: unknown keyword 'n_episodes' \(valid: .*n_episodes"),
         ({"seed": -1}, "seed -1: must be a whole number from 0 to"),
         ({"seed": 0.5}, "seed 0.5"),
         ({"tolerances": "near"}, "tolerances 'near': must be numbers"),
@@ -203,8 +215,8 @@ def test_numbers_that_do_not_fit_are_named(keywords, message):
 
 
 def test_a_single_tolerance_and_the_name_of_the_environments_are_taken():
-    flights = fly("pid", n_flights=2, max_episode_steps=20, tolerances=0.5)
-    same(flights, fly("pid", n_flights=2, max_steps=20, tolerances=[0.5]), [0.5])
+    flights = fly("pid", n_episodes=2, max_episode_steps=20, tolerances=0.5)
+    same(flights, fly("pid", n_episodes=2, max_episode_steps=20, tolerances=[0.5]), [0.5])
     assert [*flights.time_to] == [0.5] and flights.length.max() == 20
 
 
@@ -236,8 +248,8 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
     distances = Distances()
     flights = fly(
         load_pretrained("itm-robust"),
-        n_flights=24,
-        max_steps=700,
+        n_episodes=24,
+        max_episode_steps=700,
         hooks=[distances],
         **env_kwargs("itm-robust"),
     )
@@ -255,7 +267,9 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
 
 @pytest.mark.parametrize("suite", ["thesis", "robustness", "trajectories"])
 def test_an_own_reward_stands_in_the_table_of_every_scenario(suite):
-    flights = fly(hover, n_flights=2, max_steps=2, reward=lambda state, actions: state.distance)
+    flights = fly(
+        hover, n_episodes=2, max_episode_steps=2, reward=lambda state, actions: state.distance
+    )
     cells = metric_cells(summarise(flights))
     for scenario in load_suite(suite).scenarios:
         assert "mean own reward" in [row.name for row in metric_rows(scenario, [cells])]
@@ -357,7 +371,7 @@ def test_a_recorded_flight_holds_what_was_seen_and_done(tmp_path):
         seen.append(observation.copy())
         return np.full((len(observation), 4), -1.5)  # beyond the range, which is clipped
 
-    flights = fly(pilot, n_flights=3, max_steps=400, record=tmp_path / "f.npz")
+    flights = fly(pilot, n_episodes=3, max_episode_steps=400, record=tmp_path / "f.npz")
     with np.load(tmp_path / "f.npz") as file:
         observations, actions = file["observations"], file["actions"]
     assert len(observations) == len(actions) == flights.length.sum() < 3 * 400

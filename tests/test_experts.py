@@ -63,7 +63,7 @@ def time_to(distances, tolerance):
 
 
 def test_pid_tracking_figures():
-    flights = fly(PIDExpert(), task="target_tracking", n_flights=2400, seed=11)
+    flights = fly(PIDExpert(), task="target_tracking", n_episodes=2400, seed=11)
     assert flights.success.all()
     for tolerance, seconds in ((0.1, 7.71), (0.2, 6.89), (0.5, 5.80), (1.0, 4.90)):
         assert np.mean(flights.time_to[tolerance]) == pytest.approx(seconds, rel=0.02)
@@ -72,7 +72,7 @@ def test_pid_tracking_figures():
 
 
 def test_pid_recovery_figure():
-    flights = fly(PIDExpert(), task="state_recovery", n_flights=4800, seed=12)
+    flights = fly(PIDExpert(), task="state_recovery", n_episodes=4800, seed=12)
     assert 100 * flights.survival.mean() == pytest.approx(31.9, abs=2.0)
 
 
@@ -323,7 +323,7 @@ def test_experts_follow(expert, reference, metres, degrees):
     itm = load_vehicle("itm")
     errors = Following()
     on_it = {"task_kwargs": {"target_distance": 0.0}, "reference": reference, "hooks": [errors]}
-    fly(resolve_expert(expert, itm), n_flights=2, max_steps=1200, **on_it)
+    fly(resolve_expert(expert, itm), n_episodes=2, max_episode_steps=1200, **on_it)
     assert np.sqrt(np.mean(np.square(errors.position))) <= metres
     if degrees is not None:
         assert np.degrees(np.abs(errors.heading).max()) <= degrees

@@ -118,7 +118,7 @@ def test_the_table_of_the_readme_shows_what_was_measured(page, heading, folder, 
 @pytest.mark.parametrize("folder", ["thesis", "figure_eight"])
 def test_the_agent_of_the_table_is_the_one_that_ships(folder):
     (agent,) = (c for c in results(folder)["controllers"] if c["label"] == "itm-robust")
-    content = sb3_quad.pretrained("itm-robust").read_bytes()
+    content = sb3_quad.pretrained_path("itm-robust").read_bytes()
     assert agent["content"] == hashlib.sha256(content).hexdigest()
 
 
@@ -137,7 +137,7 @@ def test_all_pages_give_the_pid_one_recovery_figure():
 
 
 def card(name):
-    return sb3_quad.pretrained(name).with_suffix(".md").read_text(encoding="utf-8")
+    return sb3_quad.pretrained_path(name).with_suffix(".md").read_text(encoding="utf-8")
 
 
 def measured(name):
@@ -172,7 +172,7 @@ def test_shares_on_a_card_are_of_its_episodes(name):
 @pytest.mark.parametrize("name", ["itm-robust", "crazyflie-recovery", "thesis-recovery"])
 def test_a_card_shows_the_flights_that_it_names(name):
     """Its targets 10 m away, by the episodes of ``examples/publish.py``."""
-    own = agent_settings(sb3_quad.pretrained(name))[0].in_any_task()
+    own = agent_settings(sb3_quad.pretrained_path(name))[0].in_any_task()
     own["vehicle"] = name.split("-")[0].replace("thesis", "itm")
     agent, seed = sb3_quad.load_pretrained(name), seed_for("card", 10_000)
     flights = fly(agent, "target_tracking", 960, seed, task_kwargs={"target_distance": 10.0}, **own)

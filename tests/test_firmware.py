@@ -104,7 +104,7 @@ def test_the_specific_force_is_what_accelerates_but_the_weight():
 def test_flights_are_judged_on_both_backends_and_shown():
     pid = PIDExpert("crazyflie")
     flown = {
-        backend: fly(pid, "state_recovery", 6, 3, "crazyflie", 0.0, backend, max_steps=150)
+        backend: fly(pid, "state_recovery", 6, 3, "crazyflie", 0.0, backend, max_episode_steps=150)
         for backend in ("batch", "pybullet")
     }
     batch, bullet = flown.values()
@@ -116,7 +116,7 @@ def test_flights_are_judged_on_both_backends_and_shown():
     assert texts["cut by the supervisor, %"].startswith("50")
     assert texts["longest time below 0.5 g, s"] == f"{batch.low_force_time.max():.2f}"
     # itm has no supervisor.
-    others = summarise(fly(PIDExpert(), "state_recovery", 2, 0, max_steps=10))
+    others = summarise(fly(PIDExpert(), "state_recovery", 2, 0, max_episode_steps=10))
     assert others.cut_by_supervisor is None and others.low_force_time is None
 
 
@@ -182,14 +182,14 @@ def test_a_battery_that_cannot_hover_is_refused():
 def test_flights_with_a_low_battery_are_those_of_pybullet(saturation):
     vehicle = CRAZYFLIE.model_copy(update={"saturation": saturation})
     pid = PIDExpert(vehicle)
-    kwargs = {"randomize": {"battery": [0.7, 0.9]}, "max_steps": 100}
+    kwargs = {"randomize": {"battery": [0.7, 0.9]}, "max_episode_steps": 100}
     batch, bullet = (
         fly(pid, "state_recovery", 4, 1, vehicle, 0.0, backend, **kwargs)
         for backend in ("batch", "pybullet")
     )
     np.testing.assert_allclose(batch.final_offset, bullet.final_offset, atol=1e-9)
     np.testing.assert_allclose(batch.path_length, bullet.path_length, atol=1e-9)
-    full = fly(pid, "state_recovery", 4, 1, vehicle, 0.0, max_steps=100)
+    full = fly(pid, "state_recovery", 4, 1, vehicle, 0.0, max_episode_steps=100)
     assert (abs(batch.final_error - full.final_error) > 1e-6).any()
 
 

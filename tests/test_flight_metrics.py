@@ -37,7 +37,7 @@ def test_flights_of_the_expert_are_measured_as_evaluation_does():
     metrics = FlightMetrics(tolerance=0.5)
     model.learn(1800, callback=metrics)
     # The model seeds its environments, from 0.
-    flights = fly("geometric", "target_tracking", 6, 0, max_steps=300)
+    flights = fly("geometric", "target_tracking", 6, 0, max_episode_steps=300)
     assert metrics.metrics() == {
         "rollout/reached_0.5m": 1.0,
         "rollout/collision_rate": 0.0,

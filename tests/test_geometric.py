@@ -111,8 +111,8 @@ def test_upside_down_it_turns_with_its_greatest_moment(seed: int) -> None:
 
 
 def test_it_recovers_from_nearly_every_start_and_is_quick_to_a_target() -> None:
-    recovery = fly(EXPERT, "state_recovery", 1920, 13, max_steps=600, noise=0.0)
-    tracking = fly(EXPERT, "target_tracking", 480, 13, max_steps=800, noise=0.0)
+    recovery = fly(EXPERT, "state_recovery", 1920, 13, max_episode_steps=600, noise=0.0)
+    tracking = fly(EXPERT, "target_tracking", 480, 13, max_episode_steps=800, noise=0.0)
     assert recovery.success.mean() >= 0.998
     assert tracking.success.all() and tracking.time_to[0.1].mean() < 2.6
     assert tracking.final_error.max() < 0.01
@@ -143,8 +143,12 @@ def test_derived_gains_fly_vehicles_unlike_those_of_the_search(
 ) -> None:
     vehicle = expert.vehicle
     assert expert.gains == derived_gains(vehicle)
-    tracking = fly(expert, "target_tracking", 32, 3, vehicle=vehicle, max_steps=900, noise=0.0)
-    recovery = fly(expert, "state_recovery", 150, 3, vehicle=vehicle, max_steps=400, noise=0.0)
+    tracking = fly(
+        expert, "target_tracking", 32, 3, vehicle=vehicle, max_episode_steps=900, noise=0.0
+    )
+    recovery = fly(
+        expert, "state_recovery", 150, 3, vehicle=vehicle, max_episode_steps=400, noise=0.0
+    )
     assert tracking.success.all() and tracking.final_error.max() < 0.02
     assert recovery.survival.mean() > 0.9
 
@@ -157,7 +161,7 @@ def test_privileged_derived_is_gentler_where_commands_act_late(name: str, late: 
     vehicle = load_vehicle(name)
     bold = GeometricExpert(vehicle, derived_gains(vehicle), privileged=True)
     gentle, plain = (
-        fly(expert, seed=3, n_flights=24, vehicle=vehicle, max_steps=900)
+        fly(expert, seed=3, n_episodes=24, vehicle=vehicle, max_episode_steps=900)
         for expert in (privileged_derived(name), bold)
     )
     assert gentle.success.all() and not np.isnan(gentle.settling_time[0.1]).any()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from test_export import compiled, load, physical_features
 
 import sb3_quad
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
@@ -116,7 +116,13 @@ def test_an_agent_flies_all_orders_alike():
     own |= {"task": "state_recovery", "noise": 0.0}
     shift = {"center_of_mass": [-0.003, 0.001]}
     flown = [
-        fly(agent, n_flights=24, vehicle=[in_order(order, 0.046, **shift)], max_steps=400, **own)
+        fly(
+            agent,
+            n_episodes=24,
+            vehicle=[in_order(order, 0.046, **shift)],
+            max_episode_steps=400,
+            **own,
+        )
         for order in MOTORS
     ]
     for flights in flown:
@@ -153,7 +159,7 @@ class File:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def assert_it_flies(agent, vehicle, file_format="torchscript"):
     exported = export_policy(
-        pretrained(agent), file_format, vehicle=vehicle, name="own", n_observations=1000
+        pretrained_path(agent), file_format, vehicle=vehicle, name="own", n_observations=1000
     )
     first = "0 at x {:.4g} m, y {:.4g} m, yaw moment {:+d}".format(
         *vehicle.rotor_positions[0], vehicle.rotor_directions[0]
@@ -161,7 +167,7 @@ def assert_it_flies(agent, vehicle, file_format="torchscript"):
     assert exported.metadata["rotors"].startswith(first[:-1])
     previews = len(sb3_quad.env_kwargs(agent)["preview"] or ())
     file = File(load(file_format, exported, "own"), vehicle, previews)
-    flights = fly(file, "state_recovery", 8, 3, vehicle, noise=0.0, max_steps=500)
+    flights = fly(file, "state_recovery", 8, 3, vehicle, noise=0.0, max_episode_steps=500)
     assert flights.survival.all() and flights.final_error.max() < 0.2
 
 
@@ -208,9 +214,12 @@ def test_a_model_flies_its_own_vehicle_in_another_layout():
             sb3_quad.load_pretrained(f"{name}-recovery"),
             resolve_expert("geometric", own, layout="itm"),
         )
-        assert fly(agent, "state_recovery", 24, vehicle=own, max_steps=500).success.mean() > 0.9
+        assert (
+            fly(agent, "state_recovery", 24, vehicle=own, max_episode_steps=500).success.mean()
+            > 0.9
+        )
         assert fly(
-            expert, "state_recovery", 24, vehicle=own, rotor_layout="itm", max_steps=500
+            expert, "state_recovery", 24, vehicle=own, rotor_layout="itm", max_episode_steps=500
         ).survival.all()
 
 
@@ -316,7 +325,7 @@ def test_an_expert_of_the_first_vehicle_is_warned_of_where_rows_have_others(expe
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         sb3_quad.DAgger("MlpPolicy", env, expert=expert, n_steps=1).learn(2)
-        fly(expert, n_flights=2, max_steps=1, vehicle=vehicles)
+        fly(expert, n_episodes=2, max_episode_steps=1, vehicle=vehicles)
     said = [
         "is made for the vehicle itm and flies crazyflie" in str(each.message) for each in caught
     ]

@@ -236,7 +236,7 @@ def test_the_offset_of_an_agent_that_crashes_cannot_be_measured():
         "MlpPolicy", QuadcopterVecEnv(4, seed=1), n_steps=8, batch_size=8, seed=0, device="cpu"
     )
     with pytest.raises(ConfigError, match="offset from the target cannot be measured"):
-        hover_offset(model, n_flights=8)
+        hover_offset(model, n_episodes=8)
 
 
 @pytest.mark.parametrize("scale", [-1.0, 0.0, np.nan, 0.5])
@@ -263,7 +263,7 @@ def test_a_correction_that_fails_leaves_the_agent_as_it_was(scale, monkeypatch):
 @pytest.mark.slow
 def test_the_correction_cancels_the_offset_of_a_trained_agent(monkeypatch):
     monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.fly", partial(fly, max_steps=700)
+        "sb3_quad.algorithms.offset_correction.fly", partial(fly, max_episode_steps=700)
     )  # 7 s are enough to arrive
     model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))

@@ -49,7 +49,7 @@ def observations(tmp_path_factory):
 def test_there_are_some_each_with_a_card_of_its_own():
     assert {"itm-recovery", "itm-imitation"} <= set(pretrained_names())
     for name in pretrained_names():
-        card = sb3_quad.pretrained(name).with_suffix(".md").read_text(encoding="utf-8")
+        card = sb3_quad.pretrained_path(name).with_suffix(".md").read_text(encoding="utf-8")
         assert card.startswith(f"# {name}\n")
         for part in (
             "state recovery |",
@@ -71,7 +71,7 @@ def test_there_are_some_each_with_a_card_of_its_own():
 )
 def test_each_flies_as_its_card_says(name):
     own = {
-        **agent_settings(sb3_quad.pretrained(name))[0].in_any_task(),
+        **agent_settings(sb3_quad.pretrained_path(name))[0].in_any_task(),
         "vehicle": vehicle_of(name),
     }
     flights = fly(sb3_quad.load_pretrained(name), "state_recovery", 480, 31_000_000, **own)
@@ -86,7 +86,9 @@ def vehicle_of(name):
 
 
 def survival_on_the_card(name):
-    lines = sb3_quad.pretrained(name).with_suffix(".md").read_text(encoding="utf-8").splitlines()
+    lines = (
+        sb3_quad.pretrained_path(name).with_suffix(".md").read_text(encoding="utf-8").splitlines()
+    )
     rows = [line.split("|") for line in lines if line.startswith("|")]
     heading, recovery = (
         next(row for row in rows if any(part in cell for cell in row))
@@ -118,7 +120,7 @@ def test_any_quadcopter_flies_vehicles_with_another_order_of_rotors(vehicle):
         "state_recovery",
         480,
         33_000_000,
-        max_steps=600,
+        max_episode_steps=600,
         **own,
     )
     assert (
@@ -149,7 +151,7 @@ class Names(pickle.Unpickler):
 @pytest.mark.parametrize("name", pretrained_names())
 def test_their_pickles_name_only_classes_of_all_versions(name):
     """SB3 2.4 and later load them (tried with 2.4.1 and 2.7.1)."""
-    with zipfile.ZipFile(sb3_quad.pretrained(name)) as file:
+    with zipfile.ZipFile(sb3_quad.pretrained_path(name)) as file:
         data = json.loads(file.read("data"))
     names = set()
     for value in data.values():
@@ -167,12 +169,12 @@ def test_their_pickles_name_only_classes_of_all_versions(name):
 def test_names_stand_where_zips_do(capsys):
     expert = resolve_expert("itm-recovery")
     assert isinstance(expert, PPO)
-    assert agent_path("itm-recovery") == str(sb3_quad.pretrained("itm-recovery"))
+    assert agent_path("itm-recovery") == str(sb3_quad.pretrained_path("itm-recovery"))
     assert agent_path("some/agent.zip") == "some/agent.zip"
     assert main(["enjoy", "itm-recovery", "--no-render", "-n", "50"]) == 0
     assert "itm-recovery" in capsys.readouterr().out
     with pytest.raises(ConfigError, match="did you mean 'itm-recovery'"):
-        sb3_quad.pretrained("itm-recovry")
+        sb3_quad.pretrained_path("itm-recovry")
     assert main(["enjoy", "itm-recovry", "--no-render"]) == 2
     assert "did you mean 'itm-recovery'" in capsys.readouterr().err
     any_quadcopter, recovery = parse_controllers(["any-quadcopter", "itm-recovery"])
@@ -182,7 +184,7 @@ def test_names_stand_where_zips_do(capsys):
     controllers = parse_controllers(["itm-recovery", "mine=itm-recovery"])
     labels = {controller.label: controller.spec for controller in controllers}
     assert labels == dict.fromkeys(
-        ("itm-recovery", "mine"), str(sb3_quad.pretrained("itm-recovery"))
+        ("itm-recovery", "mine"), str(sb3_quad.pretrained_path("itm-recovery"))
     )
 
 
@@ -293,8 +295,8 @@ def test_publish_says_what_an_upload_needs(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", pretrained_names())
 def test_each_says_how_it_flies(name):
-    settings, source = agent_settings(sb3_quad.pretrained(name))
-    assert source == sb3_quad.pretrained(name) and settings.vehicle.flies_as(
+    settings, source = agent_settings(sb3_quad.pretrained_path(name))
+    assert source == sb3_quad.pretrained_path(name) and settings.vehicle.flies_as(
         load_vehicle(vehicle_of(name))
     )
     imitates_pid = name in ("thesis-imitation", "thesis-printed-imitation")
@@ -330,14 +332,14 @@ def test_an_agent_of_rows_that_differ_flies_anywhere():
 
 def test_fly_warns_of_a_vehicle_that_an_agent_was_not_trained_on(recwarn):
     model = sb3_quad.load_pretrained("crazyflie-recovery")
-    fly(model, n_flights=1, max_steps=1, **sb3_quad.env_kwargs(model))
+    fly(model, n_episodes=1, max_episode_steps=1, **sb3_quad.env_kwargs(model))
     # Its own is the default.
-    fly(model, n_flights=1, max_steps=1)
+    fly(model, n_episodes=1, max_episode_steps=1)
     assert not recwarn.list
     with pytest.warns(UserWarning, match="vehicle crazyflie and flies itm; sb3_quad"):
-        fly(model, n_flights=1, max_steps=1, vehicle="itm")
+        fly(model, n_episodes=1, max_episode_steps=1, vehicle="itm")
     with pytest.raises(ControllerError, match=r"the environment's \(18,\); give \*\*env_kwargs"):
-        fly("itm-robust", n_flights=1, max_steps=1)
+        fly("itm-robust", n_episodes=1, max_episode_steps=1)
 
 
 @pytest.mark.slow

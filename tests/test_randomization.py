@@ -303,7 +303,7 @@ def test_wind_carries_away_what_has_drag_and_the_privileged_expert_holds_against
         (windy, privileged_geometric(), 0.0, 1e-3),
     ):
         errors = fly(
-            expert, "target_tracking", 48, seed=3, max_steps=900, randomize=randomize
+            expert, "target_tracking", 48, seed=3, max_episode_steps=900, randomize=randomize
         ).final_error
         assert least <= errors.min() and errors.max() < most
 
@@ -329,7 +329,9 @@ def test_the_privileged_expert_stays_where_the_other_is_pushed_away(task):
 
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
 def test_the_privileged_expert_flies_every_vehicle_of_a_distribution(task):
-    flights = fly(privileged_geometric(), task, 240, seed=11, max_steps=900, vehicles=RAPTOR)
+    flights = fly(
+        privileged_geometric(), task, 240, seed=11, max_episode_steps=900, vehicles=RAPTOR
+    )
     assert flights.survival.all() and np.median(flights.final_error) < 1e-3
 
 

@@ -97,9 +97,9 @@ def test_what_was_lost_or_rests_or_has_no_heading_has_no_such_errors():
     assert all(map(math.isnan, watched(table, flying=False).values()))
     assert all(map(math.isnan, watched(0.0 * table).values()))
     assert math.isnan(watched(table)["heading_error"])
-    resting = fly(GeometricExpert(), n_flights=2, max_steps=300)
+    resting = fly(GeometricExpert(), n_episodes=2, max_episode_steps=300)
     assert np.isfinite(resting.cross_track_error).all()
-    moving = fly(GeometricExpert(), n_flights=2, max_steps=300, reference="circle")
+    moving = fly(GeometricExpert(), n_episodes=2, max_episode_steps=300, reference="circle")
     assert np.isnan([resting.rms_error, moving.heading_error, moving.cross_track_error]).all()
     assert (moving.rms_error > 0).all()
 
@@ -414,7 +414,7 @@ def test_plots_show_the_path_of_the_reference(results):
 
 def test_comparisons_of_flights_that_follow():
     text = str(
-        compare({"law": "geometric"}, n_flights=2, reference="circle", max_episode_steps=300)
+        compare({"law": "geometric"}, n_episodes=2, reference="circle", max_episode_steps=300)
     )
     assert text.count("position error, rms") == 2 and "settling" not in text
 

@@ -62,7 +62,7 @@ def test_it_is_the_agent_of_the_zip(zips, tmp_path, kind):
 
 @pytest.mark.parametrize("name", ["itm-recovery", "any-quadcopter", "crazyflie-robust"])
 def test_shipped_agents_keep_all_that_their_zips_say(tmp_path, name):
-    old = sb3_quad.pretrained(name)
+    old = sb3_quad.pretrained_path(name)
     new = written(old, tmp_path)
     settings, source = agent_settings(new)
     assert settings == agent_settings(old)[0] and source == new

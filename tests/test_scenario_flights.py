@@ -130,7 +130,9 @@ def test_episodes_are_those_of_the_task():
         .model_copy(update={"episodes": 8, "duration": 2.0})
     )
     ours = fly_scenario(PIDExpert(), recovery)
-    plain = fly(PIDExpert(), "state_recovery", 8, seed_for("suite", recovery.seed), max_steps=200)
+    plain = fly(
+        PIDExpert(), "state_recovery", 8, seed_for("suite", recovery.seed), max_episode_steps=200
+    )
     for name in ("reward", "length", "path_length", "final_error", "start"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
 
@@ -264,10 +266,10 @@ def test_the_measured_offset_is_cancelled_and_the_way_is_quicker():
     policy = OnObservations((0.3, -0.2, 0.1))
     offset = hover_offset(policy, 8)
     np.testing.assert_allclose(offset, [0.3, -0.2, 0.1], atol=0.02)
-    adapted = AdaptiveScaling(policy, measure_mean(policy, n_flights=8))
+    adapted = AdaptiveScaling(policy, measure_mean(policy, n_episodes=8))
     assert np.linalg.norm(hover_offset(adapted, 8)) < 0.01
     plain, quick = (
-        fly(each, n_flights=8, max_steps=900, tolerances=(0.5,)).time_to[0.5].mean()
+        fly(each, n_episodes=8, max_episode_steps=900, tolerances=(0.5,)).time_to[0.5].mean()
         for each in (policy, adapted)
     )
     assert quick < plain

@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sb3_quad.base.seeds import LARGEST, PURPOSES, row_seeds, seed_for
-from sb3_quad.envs import QuadcopterVecEnv, QuadcopterVectorEnv
+from sb3_quad.envs import QuadcopterGymVectorEnv, QuadcopterVecEnv
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.environments import make_environments
@@ -30,7 +30,7 @@ def test_seeds_and_purposes_share_no_stream(one, other, n):
     assert all(0 <= seed < 2**53 for stream in streams for seed in stream)
 
 
-@pytest.mark.parametrize("kind", [QuadcopterVecEnv, QuadcopterVectorEnv])
+@pytest.mark.parametrize("kind", [QuadcopterVecEnv, QuadcopterGymVectorEnv])
 def test_rows_of_different_seeds_start_differently(kind):
     env = kind(480, task="state_recovery")
     starts = []

@@ -8,7 +8,7 @@ import torch as th
 import yaml
 from stable_baselines3 import SAC
 
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.agents.zips import load_model, load_zip, saved_algorithm
 from sb3_quad.algorithms import transfer
 from sb3_quad.algorithms.offset_correction import correct_offset, hover_offset
@@ -129,7 +129,7 @@ def clone(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(transfer, "CLONE_STEPS", 1000)
         patch.setattr(transfer, "CLONE_BATCH", 512)
-        transfer_policy(pretrained("itm-recovery"), model)
+        transfer_policy(pretrained_path("itm-recovery"), model)
     path = tmp_path_factory.mktemp("clone") / "sac.zip"
     FlightSettings().write_into(model)
     model.save(path)
@@ -140,7 +140,7 @@ def clone(tmp_path_factory):
 def test_an_agent_is_handed_over_to_sac_and_flies(clone):
     before, after = (
         fly(load_model(path), "state_recovery", 240, 3)
-        for path in (pretrained("itm-recovery"), clone)
+        for path in (pretrained_path("itm-recovery"), clone)
     )
     assert before.survival.mean() > 0.98 and after.survival.mean() > before.survival.mean() - 0.03
     assert fly(load_model(clone), "target_tracking", 48, 3).survival.all()

@@ -22,7 +22,7 @@ from sb3_quad.base.compiled import compile_notice
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.process import print_once
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
+from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.experts.pid import PIDExpert
@@ -543,7 +543,7 @@ def test_bad_settings_are_refused(method, arguments, says):
         getattr(QuadcopterVecEnv(2), method)(*arguments)
 
 
-@pytest.mark.parametrize("kind", [QuadcopterVecEnv, QuadcopterVectorEnv])
+@pytest.mark.parametrize("kind", [QuadcopterVecEnv, QuadcopterGymVectorEnv])
 def test_steps_wait_for_the_first_reset(kind):
     env, other = kind(2, seed=0), kind(2, seed=0)
     actions = np.zeros((2, 4), np.float32)

@@ -98,7 +98,7 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     observations = env.reset()
     np.save(tmp_path / "observations.npy", observations)
     files = ["observations.npy", *(f"{number}.zip" for number in range(len(models))), "sac.zip"]
-    shipped = [sb3_quad.pretrained(name) for name in pretrained_names()]
+    shipped = [sb3_quad.pretrained_path(name) for name in pretrained_names()]
     command = [sys.executable, "-W", "error", "-c", FLY, *files, *map(str, shipped)]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert result.returncode == 0, result.stderr
@@ -145,7 +145,7 @@ def save_extended(folder):
 @pytest.mark.parametrize("name", [*pretrained_names(), "extended"])
 def test_the_example_builds_the_observation_that_the_package_builds(name, tmp_path):
     """Both are compared in closed loop: the action for the example's observation flies."""
-    path = save_extended(tmp_path) if name == "extended" else sb3_quad.pretrained(name)
+    path = save_extended(tmp_path) if name == "extended" else sb3_quad.pretrained_path(name)
     model = PPO.load(path, device="cpu")
     settings = {**sb3_quad.env_kwargs(path), "noise": 0.0, "vehicles": None}
     env = QuadcopterVecEnv(
@@ -178,7 +178,7 @@ def test_the_example_builds_the_observation_that_the_package_builds(name, tmp_pa
 
 @pytest.mark.slow
 def test_the_example_flies_every_zip_where_sb3_quad_cannot_be_imported(tmp_path):
-    zips = [str(sb3_quad.pretrained(name)) for name in pretrained_names()]
+    zips = [str(sb3_quad.pretrained_path(name)) for name in pretrained_names()]
     command = [sys.executable, "-W", "error", "-c", RUN, str(EXAMPLE)]
     result = subprocess.run(
         [*command, *zips, str(save_extended(tmp_path))], capture_output=True, text=True, check=False

@@ -51,7 +51,14 @@ REINFORCEMENT = 3_000_000  # timesteps of PPO
 def recorded(controller, n=24, seed=7):
     """Trajectories of n recoveries."""
     recorder = Recorder(n)
-    fly(controller, "state_recovery", n_flights=n, seed=seed, max_steps=600, hooks=[recorder])
+    fly(
+        controller,
+        "state_recovery",
+        n_episodes=n,
+        seed=seed,
+        max_episode_steps=600,
+        hooks=[recorder],
+    )
     return recorder.arrays()
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained
+from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained_path
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.simulation.state import TARGET, QuadcopterState
@@ -77,7 +77,7 @@ class UnhurriedExpert(Expert):
 def recorded(controller, n=24, seed=7):
     """Trajectories of n flights to targets 10 m away."""
     recorder = Recorder(n)
-    fly(controller, "target_tracking", n_flights=n, seed=seed, hooks=[recorder])
+    fly(controller, "target_tracking", n_episodes=n, seed=seed, hooks=[recorder])
     return recorder.arrays()
 
 
@@ -208,7 +208,7 @@ calm = PPOBC(
     seed=0,
     device="cpu",
 )
-transfer_policy(pretrained("itm-imitation"), calm)  # policy and critic
+transfer_policy(pretrained_path("itm-imitation"), calm)  # policy and critic
 calm.learn(REINFORCEMENT)
 calm.save("calm")
 

@@ -83,16 +83,16 @@ class FlightTape:
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
         self._winds = np.zeros((n_steps, *batch.wind.shape))
 
-    def reset(self, carry_on: bool = False) -> Float32Array:
+    def reset(self, continue_flights: bool = False) -> Float32Array:
         """Begin a recording; return the observations, float32 (n, size).
 
-        :param carry_on: let the rows that still fly continue their episodes, unless these have
-            reached their time limit.
+        :param continue_flights: let the rows that still fly continue their episodes, unless
+            these have reached their time limit.
         """
         batch = self.batch
         # Rows that have not flown yet are in no episode.
         ended = (batch.streams[EPISODE] == 0) | (batch.streams[STEP] >= batch.limits)
-        observations = batch.reset(np.flatnonzero(ended) if carry_on else None)
+        observations = batch.reset(np.flatnonzero(ended) if continue_flights else None)
         # A rotor must not overshoot its commanded speed because the physics steps are long.
         vehicles = batch.vehicles
         gains = vehicles[[P.motor_gain_up, P.motor_gain_down]]

@@ -32,7 +32,7 @@ def resolve_expert(
 
     :param spec: a name of ``EXPERTS``, such as ``"pid"``; the path of an SB3 ``.zip`` model or of a
         safetensors file, or the name of a policy that comes with the package
-        (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)``
+        (:func:`sb3_quad.pretrained_path`); ``"package.module:factory"``, where ``factory(vehicle)``
         returns an expert; or an expert itself, returned as it is.
     :param vehicle: the vehicle that a named expert is designed for; of several, the first.
     :param kind: the word for it in messages.

@@ -40,7 +40,7 @@ _OURS = {
     "PPOBC": ("PPO", "bc_coef"),
     "DAgger": ("PPO", "beta"),
     "SACBC": ("SAC", "bc_coef"),
-    "APG": ("PPO", "carry_on"),
+    "APG": ("PPO", "continue_flights"),
 }
 # ``predict`` needs only these of an agent's pickles.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs", STATISTICS)

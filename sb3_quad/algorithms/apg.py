@@ -43,10 +43,11 @@ class Tape(Protocol):
     :meth:`begin`, then :meth:`backward` once for each step, the last one first.
     """
 
-    def reset(self, carry_on: bool) -> Float32Array:
+    def reset(self, continue_flights: bool) -> Float32Array:
         """Begin a recording; return the observations, (n, ...).
 
-        :param carry_on: whether to continue the flights of the last recording where possible.
+        :param continue_flights: whether to continue the flights of the last recording where
+            possible.
         """
 
     def step(self, actions: Float32Array) -> Float32Array:
@@ -105,9 +106,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         least all flights of an update.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. Learning whole flights from scratch works badly: clone an expert first
-        (DAgger), or fly short windows with ``carry_on``.
-    :param carry_on: Let each update continue the flights of the one before. A flight that crashed
-        or reached its time limit begins again.
+        (DAgger), or fly short windows with ``continue_flights``.
+    :param continue_flights: Let each update continue the flights of the one before. A flight that
+        crashed or reached its time limit begins again.
     :param cost: The cost of each control step, (steps, n), as a function of
         :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved: give it
         to ``load`` as well.
@@ -143,7 +144,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         *,
         initial_policy: BaseAlgorithm | StrPath | None = None,
         max_row_ratio: float | None = None,
-        carry_on: bool = False,
+        continue_flights: bool = False,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         body_rates_coef: float = 0.0,
         low_force_coef: float = 0.0,
@@ -173,7 +174,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             _init_setup_model=False,
         )
         self.max_row_ratio = max_row_ratio
-        self.carry_on = carry_on
+        self.continue_flights = continue_flights
         self.cost = cost
         self.own_cost = False
         self.body_rates_coef = body_rates_coef
@@ -264,7 +265,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         """Fly ``n_rollout_steps`` steps with the mean action of the policy, and record them."""
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
-        observations = self._tape.reset(self.carry_on)
+        observations = self._tape.reset(self.continue_flights)
         infos: list[StrDict] = [{} for _ in range(env.num_envs)]
         for step in range(n_rollout_steps):
             observations = self._tape.step(self._recorded_policy.forward(step, observations))

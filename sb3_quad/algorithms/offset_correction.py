@@ -79,7 +79,7 @@ def correct_offset(
 
 def hover_offset(
     controller: Any,
-    n_flights: int = N_OFFSETS,
+    n_episodes: int = N_OFFSETS,
     seed: int = 0,
     settings: FlightSettings | None = None,
 ) -> FloatArray:
@@ -91,7 +91,7 @@ def hover_offset(
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
     """
     own = {} if settings is None else settings.in_any_task()
-    flights = fly(controller, "target_tracking", n_flights, seed, **own)
+    flights = fly(controller, "target_tracking", n_episodes, seed, **own)
     crashed = 1.0 - float(flights.survival.mean())
     if crashed > 0.5:
         raise ConfigError(

@@ -103,7 +103,7 @@ def _print_stages(job: TrainingJob, agents: dict[str, str]) -> None:
     try:
         tables = compare(
             {"expert": job.for_evaluation().make_expert(), **agents},
-            n_flights=PIPELINE_EPISODES,
+            n_episodes=PIPELINE_EPISODES,
             seed=seed_for("table", job.seed),
             thesis_columns=("expert", "IL-agent", "RL-agent"),
         )

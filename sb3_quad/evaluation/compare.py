@@ -56,7 +56,7 @@ class Comparison(dict[str, dict[str, Metrics]]):
 def compare(
     controllers: StrMapping,
     tasks: Any = ("target_tracking", "state_recovery"),
-    n_flights: int = 240,
+    n_episodes: int = 240,
     seed: int | None = None,
     reward: OwnReward = None,
     thesis_columns: Sequence[str] = (),
@@ -71,7 +71,7 @@ def compare(
     fly another vehicle than they know.
 
     >>> from sb3_quad.evaluation.compare import compare
-    >>> result = compare({"PID": "pid", "agent": "itm-recovery"}, ["state_recovery"], n_flights=48)
+    >>> result = compare({"PID": "pid", "agent": "itm-recovery"}, ["state_recovery"], n_episodes=48)
     >>> result["agent"]["state_recovery"].survival.value
     1.0
     >>> print(result)  # doctest: +SKIP
@@ -86,7 +86,7 @@ def compare(
     :param tasks: names,
         :class:`~sb3_quad.envs.simulation.tasks.Task` or mixtures ``{name: weight}``, or
         only one of these.
-    :param n_flights: episodes of each task.
+    :param n_episodes: episodes of each task.
     :param seed: seed of the episodes, as for :func:`~sb3_quad.evaluation.flights.fly`; None: one
         that no training flies.
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) as
@@ -115,7 +115,7 @@ def compare(
             raise ConfigError(f"compare: several tasks are named {name}; name them differently")
     if seed is None:
         seed = seed_for("table")
-    seeds = episode_seeds(seed, n_flights)
+    seeds = episode_seeds(seed, n_episodes)
     suite = load_suite("thesis")
     published = [name for scenario in suite.scenarios for name in scenario.published]
     refuse_unknown("thesis column", thesis_columns, {*published})
@@ -141,7 +141,7 @@ def compare(
             metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
             comparison.setdefault(label, {})[name] = metrics[label]
         comparison.tables.append(
-            _task_table(name, metrics, settings, suite, thesis_columns, n_flights)
+            _task_table(name, metrics, settings, suite, thesis_columns, n_episodes)
         )
     return comparison
 
@@ -178,7 +178,7 @@ def _task_table(
     settings: Mapping[str, FlightSettings],
     suite: Suite,
     thesis_columns: Sequence[str],
-    n_flights: int,
+    n_episodes: int,
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task.
 
@@ -199,7 +199,7 @@ def _task_table(
     cells = [*map(metric_cells, metrics.values())]
     rows = metric_rows(scenario, cells, [scenario.published[name] for name in names])
 
-    title = f"{task}: {n_flights} fresh episodes, the same for all"
+    title = f"{task}: {n_episodes} fresh episodes, the same for all"
     if not any(np.hstack(levels(how.noise)).any() for how in settings.values()):
         title += ", true state"
     caption = CAPTION

@@ -164,22 +164,21 @@ class Hook:
 def fly(
     controller: Any,
     task: Any = "target_tracking",
-    n_flights: int = 240,
+    n_episodes: int = 240,
     seed: int = 0,
     vehicle: str | Vehicle | None = None,
     noise: float = 0.05,
     backend: str = "batch",
-    max_steps: int = MAX_EPISODE_STEPS,
     tolerances: Sequence[float] | float = TOLERANCES,
     hooks: Sequence[Hook] = (),
     reward: Reward | None = None,
     record: StrPath | None = None,
     **environment: Any,
 ) -> Flights:
-    """Fly ``n_flights`` episodes.
+    """Fly ``n_episodes`` episodes.
 
     Number k is the first episode of an environment that is reset with
-    ``row_seeds(seed, n_flights)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
+    ``row_seeds(seed, n_episodes)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
 
     :param controller: an expert or its name, such as ``"pid"``, asked by ``actions(state)`` for the
         true state; an SB3 model, its zip or the name of a shipped one, asked by
@@ -192,8 +191,6 @@ def fly(
     :param vehicle: None: the one that the agent was trained on, else ``itm``. The agent flies in
         the ``rotor_layout`` of its own, unless you give another.
     :param backend: ``batch``, or ``pybullet`` for the reference.
-    :param max_steps: control steps of an episode that nothing ends before. The environments call it
-        ``max_episode_steps``, which holds if you give both.
     :param tolerances: of arrival, |r - r_T|, m; one or several.
     :param hooks: are called along the way.
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
@@ -209,7 +206,7 @@ def fly(
     valid = {*inspect.signature(fly).parameters, *FlightSettings.model_fields} - {"environment"}
     for key in environment.keys() - valid:
         raise ConfigError(f"fly: {unknown('keyword', key, valid)}")
-    seeds = episode_seeds(seed, n_flights)
+    seeds = episode_seeds(seed, n_episodes)
     limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
     if min(limits, default=1.0) <= 0.0:
         raise ConfigError(f"tolerances {limits}: must be greater than 0 m")
@@ -226,7 +223,7 @@ def fly(
         # A model flies with its rotors where it knows them.
         if layout is None:
             environment["rotor_layout"] = own.layout
-    environment.setdefault("max_episode_steps", max_steps)
+    environment.setdefault("max_episode_steps", MAX_EPISODE_STEPS)
     settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
     refuse_several_limits(settings)
     warn_of_differences(name, controller, settings)
@@ -261,12 +258,12 @@ def warn_of_differences(name: str, controller: Any, settings: FlightSettings) ->
             warnings.warn(f"{notice}; sb3_quad.env_kwargs(agent) gives its own", stacklevel=3)
 
 
-def episode_seeds(seed: int, n_flights: int) -> list[int]:
+def episode_seeds(seed: int, n_episodes: int) -> list[int]:
     """Return the seed of each flight.
 
     :raises ConfigError: anything but whole numbers, a seed below 0, or no flights.
     """
-    n = whole_number("n_flights", n_flights, 1, MAX_ROWS)
+    n = whole_number("n_episodes", n_episodes, 1, MAX_ROWS)
     return row_seeds(whole_number("seed", seed, 0, LARGEST_SEED), n)
 
 

@@ -23,7 +23,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.agents.unpickle import unpickle
 from sb3_quad.agents.zips import load_model, load_zip
 from sb3_quad.algorithms.dagger import DAgger
@@ -32,7 +32,7 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 MARK = Path("foreign_code_ran")
-AGENT = pretrained("itm-imitation")
+AGENT = pretrained_path("itm-imitation")
 COMMAND = f"echo > {MARK}"
 
 

@@ -29,7 +29,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_quad.agents import unpickle as own
-from sb3_quad.agents.pretrained import pretrained
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.base.errors import ConfigError
 
 COUNT = int(os.environ.get("SB3_QUAD_PICKLES", "100"))
@@ -52,7 +52,7 @@ def text(value: str) -> bytes:
 
 
 def real_pickles() -> list[bytes]:
-    with zipfile.ZipFile(pretrained("itm-imitation")) as archive:
+    with zipfile.ZipFile(pretrained_path("itm-imitation")) as archive:
         entries = json.loads(archive.read("data")).values()
     saved = [
         base64.b64decode(entry[":serialized:"])

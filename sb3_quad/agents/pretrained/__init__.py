@@ -24,11 +24,11 @@ def pretrained_names() -> list[str]:
     return sorted(path.stem for path in FOLDER.glob("*.zip"))
 
 
-def pretrained(name: str) -> Path:
+def pretrained_path(name: str) -> Path:
     """Return the zip of a policy that comes with the package, for Stable-Baselines3's ``PPO.load``.
 
     >>> import sb3_quad
-    >>> sb3_quad.pretrained("itm-recovery").name
+    >>> sb3_quad.pretrained_path("itm-recovery").name
     'itm-recovery.zip'
 
     :raises ConfigError: an unknown name.
@@ -49,7 +49,7 @@ def load_pretrained(name: str, **kwargs: Any) -> "PPO":
     from stable_baselines3 import PPO
 
     kwargs.setdefault("device", "cpu")
-    return PPO.load(pretrained(name), **kwargs)
+    return PPO.load(pretrained_path(name), **kwargs)
 
 
 def agent_path(text: str) -> str:
@@ -59,7 +59,7 @@ def agent_path(text: str) -> str:
         returned as it is.
     """
     if text in pretrained_names():
-        return str(pretrained(text))
+        return str(pretrained_path(text))
     configs = sorted(Path(text).glob("*/config.yml"))
     if len(configs) == 1:
         return str(run_agent(Path(text), configs[0].parent.name))

@@ -83,7 +83,7 @@ def run(options: Namespace) -> int:
         console().print(
             compare(
                 controllers,
-                n_flights=options.episodes,
+                n_episodes=options.episodes,
                 seed=seed_for("expert", options.seed),
                 vehicle=vehicle,
                 noise=0.0,
