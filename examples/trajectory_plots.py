@@ -55,7 +55,8 @@ class TrajectoryPlots(EveryTimesteps):
     ) -> None:
         super().__init__(every, verbose)
         self._seeds = row_seeds(seed, n_episodes)
-        self._settings = FlightSettings().with_changes(**environment, max_episode_steps=max_episode_steps)
+        environment["max_episode_steps"] = max_episode_steps
+        self._settings = FlightSettings().with_changes(**environment)
 
     def _on_event(self) -> bool:
         recorder = Recorder(len(self._seeds))
