@@ -12,9 +12,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_quad import PPOBC, DAgger
-from sb3_quad.agents.controller import Controller
 from sb3_quad.algorithms import dagger, ppo_bc
-from sb3_quad.algorithms.networks.losses import CLONING_LOSSES
+from sb3_quad.algorithms.controller import Controller
+from sb3_quad.algorithms.losses import CLONING_LOSSES
 from sb3_quad.base.errors import ConfigError, ExpertError
 
 BOXES = {"torque": (-0.002, 0.002), "PWM": (1000.0, 2000.0), "rpm": (0.0, 21702.0)}

@@ -14,10 +14,10 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor
 
 from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv, fly, load_pretrained
 from sb3_quad.agents.zips import load_model, saved_algorithm
-from sb3_quad.algorithms.flight_cost import flight_cost
-from sb3_quad.algorithms.networks.gradients import RecordedPolicy
 from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.envs.flight_cost import flight_cost
 from sb3_quad.envs.simulation.random import STEP
+from sb3_quad.fast.policy import RecordedPolicy
 
 TASKS = {"state_recovery": 0.5, "target_tracking": 0.5}
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples/gradient_of_your_environment.py"

@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_quad import PPOBC, SACBC, DAgger
-from sb3_quad.agents.controller import Controller
+from sb3_quad.algorithms.controller import Controller
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError
 from sb3_quad.envs.simulation.state import STATE_SIZE, QuadcopterState
 from sb3_quad.envs.vec_env import QuadcopterVecEnv

@@ -14,8 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad.algorithms.dagger import DAgger
-from sb3_quad.algorithms.networks.gradients import mean_actions
-from sb3_quad.algorithms.networks.losses import (
+from sb3_quad.algorithms.losses import (
     CLONING_LOSSES,
     cloning_errors,
     gaussian_entropy,
@@ -23,6 +22,7 @@ from sb3_quad.algorithms.networks.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
+from sb3_quad.fast.policy import mean_actions
 
 SMALL = {
     "n_steps": 32,

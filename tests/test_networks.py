@@ -15,12 +15,12 @@ from torch.nn.utils import parameters_to_vector
 
 from sb3_quad import APG, PPOBC, DAgger, GeometricExpert
 from sb3_quad.algorithms import dagger, ppo_bc
+from sb3_quad.algorithms.losses import Loss
 from sb3_quad.algorithms.networks import gradients as networks
 from sb3_quad.algorithms.networks import losses
-from sb3_quad.algorithms.networks.gradients import Perceptrons
-from sb3_quad.algorithms.networks.losses import Loss
-from sb3_quad.algorithms.networks.perceptron import Batch, Perceptron, one_torch_thread
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.fast.perceptron import Batch, Perceptron, one_torch_thread
+from sb3_quad.fast.policy import Perceptrons
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
 

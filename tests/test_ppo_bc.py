@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNorma
 from sb3_quad import load_pretrained
 from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.algorithms import PPOBC, SACBC, DAgger, offset_correction
-from sb3_quad.algorithms.networks.losses import CLONING_LOSSES
+from sb3_quad.algorithms.losses import CLONING_LOSSES
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.envs import QuadcopterVecEnv

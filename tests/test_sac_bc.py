@@ -15,8 +15,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad import SACBC, PIDExpert
+from sb3_quad.agents.transfer import clone_policy, transfer_policy
 from sb3_quad.algorithms import transfer
-from sb3_quad.algorithms.transfer import clone_policy, transfer_policy
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.envs import QuadcopterVecEnv
 

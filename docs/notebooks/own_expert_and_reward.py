@@ -24,7 +24,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained_path
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.simulation.state import TARGET, QuadcopterState
 from sb3_quad.evaluation.flightlog import Recorder

@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_quad.agents.statistics import statistics_of
+from sb3_quad.algorithms.statistics import statistics_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import FloatArray
