@@ -106,6 +106,11 @@ class ExpertMixin(BaseAlgorithm):
         self._note_flight_settings()
 
     def _check_arguments(self) -> None:
+        if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
+            raise ConfigError(
+                f"policy {self.policy_class.__name__}: {type(self).__name__} does not support it;"
+                " give an agent of another algorithm as expert=... to a new model"
+            )
         # SB3 would pickle NumPy numbers into the zip, and does not accept all of them.
         for name, value in [*vars(self).items()]:
             if isinstance(value, np.generic):
@@ -114,11 +119,6 @@ class ExpertMixin(BaseAlgorithm):
         check_arguments(type(self), given)
         if hasattr(self, "bc_coef"):
             self.bc_coef = FloatSchedule(self.bc_coef)
-        if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
-            raise ConfigError(
-                f"policy {self.policy_class.__name__}: {type(self).__name__} does not support it;"
-                " give an agent of another algorithm as expert=... to a new model"
-            )
         is_for_parts = issubclass(self.policy_class, self.policy_aliases["MultiInputPolicy"])
         if is_for_parts and not isinstance(self.observation_space, spaces.Dict):
             raise ConfigError("policy MultiInputPolicy: needs Dict observations; give MlpPolicy")
