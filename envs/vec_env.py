@@ -2,10 +2,13 @@
 
 import secrets
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from typing_extensions import Unpack
@@ -15,6 +18,12 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import IntArray, StrDict
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.batch_vec_env import BatchVecEnv, refuse_options
+from sb3_quad.envs.flight_cost import (
+    FlownStates,
+    cost_and_gradients,
+    flight_cost,
+    whole_cost,
+)
 from sb3_quad.envs.simulation.tape import FlightTape
 from sb3_quad.envs.simulation.tasks import TaskSpec
 
@@ -144,13 +153,23 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
                 "out_of_range": out_of_range,
             }
 
-    def record(self, n_steps: int, substeps: int | None = None) -> FlightTape:
+    def record(
+        self,
+        n_steps: int,
+        substeps: int | None = None,
+        cost: Callable[[FlownStates], th.Tensor] = flight_cost,
+        body_rates_coef: float = 0.0,
+    ) -> FlightTape:
         """Return a tape that records flights of this environment and differentiates them.
 
         :param n_steps: control steps of a recording.
         :param substeps: physics steps in a control step of a recording; None: as in :meth:`step`.
+        :param cost: the cost of each control step, in PyTorch.
+        :param body_rates_coef: weight of :func:`~sb3_quad.envs.flight_cost.body_rates_cost`, which
+            is added.
         """
-        return FlightTape(self.batch, n_steps, substeps)
+        differentiated = partial(cost_and_gradients, whole_cost(cost, body_rates_coef))
+        return FlightTape(self.batch, n_steps, substeps, differentiated)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the given rows, one value per row."""

@@ -17,7 +17,6 @@ import numpy.typing as npt
 from matplotlib.colors import to_hex, to_rgb
 
 from sb3_quad.agents.resolve import resolve_expert
-from sb3_quad.algorithms.offset_correction import N_OFFSETS, ROUNDS, hover_offset
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.seeds import seed_for
@@ -29,6 +28,7 @@ from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.offset_correction import N_OFFSETS, ROUNDS, hover_offset
 from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table

@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad import PPOBC, DAgger, QuadcopterVecEnv, fly
+from sb3_quad.evaluation.offset_correction import correct_offset
 from sb3_quad.experts.protocol import Expert
 
 ENERGY_COST = 0.003  # per control step in hover, as much as a distance of 1 m
@@ -137,14 +138,14 @@ agent = PPOBC(
     expert=expert,
     initial_policy=imitation,
     bc_coef=5.0,
-    bc_loss="huber",
+    bc_loss="huber_mse",
     bc_filter="none",
     seed=seed,
     device="cpu",
 )
 agent.learn(arguments.timesteps)
 if arguments.timesteps > 100_000:
-    agent.correct_offset()
+    correct_offset(agent)
 
 for name, controller in (("LQR", expert), ("DAgger", imitation), ("PPOBC", agent)):
     reward, survival = mean_reward(controller)

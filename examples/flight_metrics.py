@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import DAgger, GeometricExpert
-from sb3_quad.agents.controller import true_state_of
+from sb3_quad.algorithms.labelling import true_state_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly

@@ -62,8 +62,8 @@ class CartTape:
         n = self.env.num_envs
         return -costs.detach().numpy(), np.full(n, self.n_steps), np.zeros(n, dtype=bool)
 
-    def begin(self, cost):
-        """Begin the backward pass; return the mean cost. The environment has its own cost."""
+    def begin(self):
+        """Begin the backward pass; return the mean cost."""
         self.grad_state = th.zeros(self.env.num_envs, 2)
         return float(th.stack([cost for *_, cost in self.steps]).detach().mean())
 

@@ -13,6 +13,7 @@ from stop_on_signal import StopOnSignal
 
 from sb3_quad import PPOBC, QuadcopterVecEnv, fly
 from sb3_quad.callbacks import BestModel
+from sb3_quad.evaluation.offset_correction import correct_offset
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -52,7 +53,7 @@ best = BestModel(
 model.learn(arguments.timesteps, callback=[best, StopOnSignal(arguments.output)])
 # An agent that still crashes has no offset.
 if arguments.timesteps > every:
-    model.correct_offset()
+    correct_offset(model)
 model.save(arguments.output)
 for task in ("state_recovery", "target_tracking"):
     flights = fly(model, task, n_episodes=480, seed=1_000_000)

@@ -22,6 +22,7 @@ os.environ["MPLBACKEND"] = "Agg"
 # costs most where pytest's workers and other programs want the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -48,8 +49,16 @@ TINY = [
 HYPERPARAMS = {
     "dagger": ["n_steps:50", "gradient_steps:2", "batch_size:64"],
     "ppo_bc": ["n_steps:50", "n_epochs:2", "batch_size:400", "critic_warmup:0"],
-    "sac_bc": ["learning_starts:100", "buffer_size:2000", "batch_size:64", "gradient_steps:2"],
 }
+
+
+def unit_pendulum():
+    """Return Pendulum-v1 with actions in [-1, 1], as cloning asks for."""
+    pendulum = gymnasium.make("Pendulum-v1").unwrapped
+    return gymnasium.wrappers.RescaleAction(pendulum, np.float32(-1.0), np.float32(1.0))
+
+
+gymnasium.register("UnitPendulum-v0", unit_pendulum, max_episode_steps=200)
 
 
 class WithoutPyBullet(importlib.abc.MetaPathFinder):

@@ -16,10 +16,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 from sb3_quad.algorithms.apg import APG
-from sb3_quad.algorithms.flight_cost import FlownStates, flight_cost
-from sb3_quad.algorithms.networks.gradients import Perceptrons, RecordedPolicy, network_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.envs.flight_cost import FlownStates, flight_cost
 from sb3_quad.envs.simulation.adjoint import MOVING
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.observation import FEATURE_SIZES
@@ -27,6 +26,7 @@ from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
 from sb3_quad.envs.simulation.tape import FlightTape
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
+from sb3_quad.fast.policy import Perceptrons, RecordedPolicy, network_of
 
 # What each quantity of the state varies by, so that the parts of a cost weigh about the same.
 SCALE = np.concatenate([np.ones(13), np.full(4, 100.0)])

@@ -14,9 +14,9 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor
 
 from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv, fly, load_pretrained
 from sb3_quad.agents.zips import load_model, saved_algorithm
-from sb3_quad.algorithms.flight_cost import flight_cost
-from sb3_quad.algorithms.networks.gradients import RecordedPolicy
+from sb3_quad.algorithms.networks import network_of
 from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.envs.flight_cost import flight_cost
 from sb3_quad.envs.simulation.random import STEP
 
 TASKS = {"state_recovery": 0.5, "target_tracking": 0.5}
@@ -132,7 +132,15 @@ def test_a_cost_of_ones_own_is_what_is_minimised():
         return float(np.mean(2.0 * (x**2 + y**2)))
 
     env = QuadcopterVecEnv(64, task="target_tracking", seed=0)
-    agent = APG("MlpPolicy", env, initial_policy="itm-recovery", n_steps=60, cost=level, seed=0)
+    agent = APG(
+        "MlpPolicy",
+        env,
+        initial_policy="itm-recovery",
+        n_steps=60,
+        cost=level,
+        seed=0,
+        learning_rate=4e-3,
+    )
     before = tilt(agent)
     agent.learn(30 * 64 * 60)
     assert tilt(agent) < 0.7 * before
@@ -154,9 +162,6 @@ def test_the_log_has_all_flights_of_an_update(n_envs):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"substeps": 1.5}, "substeps 1.5: must be a whole number"),
-        ({"n_steps": 20.0}, "n_steps 20.0: must be a whole number"),
-        ({"cost": None}, "cost None: must be a function"),
         ({"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, "SOAP takes betas"),
         ({"policy_kwargs": {"net_arch": "64,64"}}, "net_arch '64,64': must be a list"),
         ({"policy": "MultiInputPolicy"}, "MultiInputPolicy: needs Dict observations"),
@@ -184,8 +189,6 @@ def test_what_cannot_be_differentiated_is_refused():
     fast = QuadcopterVecEnv(2, randomize={"motor_gain": [10.0, 10.0]}, seed=0)
     with pytest.raises(ConfigError, match="substeps 1: too few for motors"):
         APG("MlpPolicy", fast, n_steps=5, substeps=1).learn(10)
-    with pytest.raises(ConfigError, match="learning_rate"):
-        APG("MlpPolicy", env, learning_rate=-1.0)
 
 
 def test_a_gradient_that_is_not_finite_leaves_the_weights_alone():
@@ -233,7 +236,7 @@ def test_a_tape_may_reuse_its_array_and_gets_gradients_of_its_shape(activation_f
     results = []
     for reused in (False, True):
         array = flown[0].copy()
-        recorded = RecordedPolicy(policy, n_steps=3, n=5)
+        recorded = network_of(policy).recorded(3, 5)
         for step in range(3):
             if not reused:
                 array = array.copy()

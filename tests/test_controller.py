@@ -8,8 +8,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from sb3_quad import PPOBC, SACBC, DAgger
-from sb3_quad.agents.controller import Controller
+from sb3_quad import PPOBC, DAgger
+from sb3_quad.algorithms.labelling import Labeller, labeller_for
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError
 from sb3_quad.envs.simulation.state import STATE_SIZE, QuadcopterState
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
@@ -47,8 +47,8 @@ class FromState:
 
 def test_the_true_state_is_collected_from_single_environments():
     env = VecMonitor(DummyVecEnv([lambda n=n: Stateful(n) for n in (0.25, 0.75)]))
-    labeller = Controller.for_env(FromState(), env)
-    assert labeller._true_state is not None
+    labeller = Labeller(FromState(), env)
+    assert labeller._controller._true_state is not None
     np.testing.assert_array_equal(
         labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1)
     )
@@ -59,17 +59,14 @@ def test_the_true_state_is_collected_from_single_environments():
     [
         (DAgger, {"n_steps": 8}),
         (PPOBC, {"n_steps": 8, "batch_size": 16, "bc_coef": 1.0}),
-        (SACBC, {"bc_coef": 1.0}),
     ],
 )
 def test_an_expert_by_name_is_made_for_the_vehicle_of_the_environments(algorithm, settings):
     env = VecMonitor(QuadcopterVecEnv(2, vehicle="crazyflie", seed=0))
     model = algorithm("MlpPolicy", env, expert="pid", device="cpu", **settings).learn(16)
-    labeller = Controller.for_env(model.expert, env, model._labeller)
+    labeller = labeller_for(model.expert, env, model._labeller)
     assert labeller is model._labeller  # made once
-    assert isinstance(labeller.source, PIDExpert) and labeller.source.vehicle == load_vehicle(
-        "crazyflie"
-    )
+    assert labeller._controller.source.vehicle == load_vehicle("crazyflie")
     with pytest.raises(ConfigError, match="unknown expert 'pidd': did you mean 'pid'"):
         algorithm("MlpPolicy", env, expert="pidd", device="cpu", **settings).learn(16)
 
@@ -80,7 +77,7 @@ def test_an_expert_by_name_is_made_for_the_vehicle_of_the_environments(algorithm
 def test_the_true_state_of_the_batched_environment(wrap):
     env = wrap(QuadcopterVecEnv(5, seed=0))
     observation = env.reset()
-    labeller = Controller.for_env(PIDExpert(), env)
+    labeller = Labeller(PIDExpert(), env)
     state = env.unwrapped.true_state()
     np.testing.assert_array_equal(labeller.labels(observation), PIDExpert().actions(state))
     before = state.copy()
@@ -92,8 +89,8 @@ def test_the_true_state_of_the_batched_environment(wrap):
 
 
 def test_without_a_true_state_predict_is_asked():
-    labeller = Controller.for_env(FromState(), make_vec_env(lambda: Blind(), 3))
-    assert labeller._true_state is None
+    labeller = Labeller(FromState(), make_vec_env(lambda: Blind(), 3))
+    assert labeller._controller._true_state is None
     np.testing.assert_array_equal(labeller.labels(np.zeros((3, 18))), np.full((3, 4), -0.5))
 
 
@@ -108,27 +105,25 @@ class Blind(gym.Env):
 
 
 def test_an_sb3_model_and_its_policy():
-    env = make_vec_env("Pendulum-v1", 3, seed=0)
+    env = make_vec_env("UnitPendulum-v0", 3, seed=0)
     observation = env.reset()
     model = PPO("MlpPolicy", env, device="cpu", seed=0)
     expected = model.predict(observation, deterministic=True)[0]
     for expert in (model, model.policy):
-        np.testing.assert_array_equal(Controller.for_env(expert, env).labels(observation), expected)
+        np.testing.assert_array_equal(Labeller(expert, env).labels(observation), expected)
 
 
 def test_labels_are_clipped_to_the_action_space():
-    env = make_vec_env("Pendulum-v1", 2, seed=0)
-    labels = Controller.for_env(lambda observation: np.array([[9.0], [-9.0]]), env).labels(
-        env.reset()
-    )
-    np.testing.assert_array_equal(labels, [[2.0], [-2.0]])
+    env = make_vec_env("UnitPendulum-v0", 2, seed=0)
+    labels = Labeller(lambda observation: np.array([[9.0], [-9.0]]), env).labels(env.reset())
+    np.testing.assert_array_equal(labels, [[1.0], [-1.0]])
     assert labels.dtype == np.float32
 
 
 def test_actions_in_another_unit_are_warned_of_once(recwarn):
-    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    env = make_vec_env("UnitPendulum-v0", 2, seed=0)
     observation = env.reset()
-    labeller = Controller.for_env(lambda observation: np.array([[9.0], [-2.5]]), env)
+    labeller = Labeller(lambda observation: np.array([[9.0], [-1.2]]), env)
     with pytest.warns(UserWarning, match="such as 9, which are clipped; are they newtons"):
         labeller.labels(observation)
     labeller.labels(observation)
@@ -144,14 +139,14 @@ def test_actions_in_another_unit_are_warned_of_once(recwarn):
 def test_an_expert_of_another_vehicle_is_warned_of(recwarn):
     env = QuadcopterVecEnv(2, vehicle="crazyflie", seed=0)
     with pytest.warns(UserWarning, match="made for the vehicle itm and flies crazyflie"):
-        Controller.for_env(PIDExpert(), env)
+        Labeller(PIDExpert(), env)
     with pytest.warns(UserWarning, match="made for the vehicle itm and flies crazyflie"):
         fly(PIDExpert(), n_episodes=2, vehicle="crazyflie", max_episode_steps=2)
     # These know the vehicle, or fly another one on purpose.
     nominal = QuadcopterVecEnv(2, randomize={"mass": [0.8, 1.2]}, seed=0)
-    Controller.for_env("pid", env)
-    Controller.for_env(privileged_geometric(), env)
-    Controller.for_env(PIDExpert(), nominal)
+    Labeller("pid", env)
+    Labeller(privileged_geometric(), env)
+    Labeller(PIDExpert(), nominal)
     assert not recwarn.list
 
 
@@ -174,9 +169,9 @@ def test_a_model_of_other_limits_names_the_way_out():
     ],
 )
 def test_unfit_labels_raise_and_name_the_row(expert, message):
-    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    env = make_vec_env("UnitPendulum-v0", 2, seed=0)
     with pytest.raises(ExpertError, match=message):
-        Controller.for_env(expert, env).labels(env.reset())
+        Labeller(expert, env).labels(env.reset())
 
 
 class OnlyState:
@@ -195,14 +190,14 @@ class OnlyState:
 )
 def test_unfit_experts_raise_at_once(expert, message):
     with pytest.raises(ExpertError, match=message):
-        Controller.for_env(expert, make_vec_env("Pendulum-v1", 1))
+        Labeller(expert, make_vec_env("UnitPendulum-v0", 1))
 
 
 def test_a_model_of_another_environment_raises():
     with pytest.raises(
         ExpertError, match=r"observation space has shape \(3,\), the environment's \(18,\)"
     ):
-        Controller.for_env(PPO("MlpPolicy", "Pendulum-v1", device="cpu"), QuadcopterVecEnv(2))
+        Labeller(PPO("MlpPolicy", "UnitPendulum-v0", device="cpu"), QuadcopterVecEnv(2))
 
 
 class Counter:
@@ -227,12 +222,12 @@ def test_the_state_of_a_controller_lasts_one_flight():
 def test_the_state_of_an_expert_lasts_in_its_environment():
     counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
     labeller, observation, starts = (
-        Controller.for_env(counter, env),
+        Labeller(counter, env),
         env.reset(),
         np.array([True, False]),
     )
     labeller.labels(observation, np.ones(2, dtype=bool))
-    Controller.for_env(counter, env, labeller).labels(observation, starts)
-    Controller.for_env(counter, QuadcopterVecEnv(2, seed=0), labeller).labels(observation, starts)
+    labeller_for(counter, env, labeller).labels(observation, starts)
+    labeller_for(counter, QuadcopterVecEnv(2, seed=0), labeller).labels(observation, starts)
     assert counter.given == [None, 1, None]
     np.testing.assert_array_equal(counter.starts[1], starts)

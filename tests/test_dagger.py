@@ -1,7 +1,6 @@
 """DAgger: who flies, what is labelled, what is learnt, and what survives an interruption."""
 
-import math
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -9,19 +8,19 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad.algorithms.dagger import DAgger
-from sb3_quad.algorithms.networks.gradients import mean_actions
-from sb3_quad.algorithms.networks.losses import (
-    CLONING_LOSSES,
+from sb3_quad.algorithms.losses import (
+    CloningLoss,
     cloning_errors,
     gaussian_entropy,
     gaussian_nll,
     max_clipped_value_loss,
 )
+from sb3_quad.algorithms.networks import Network
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 
 SMALL = {
@@ -43,7 +42,7 @@ def turn_back(observation):
 
 
 def pendulum(n_envs=N_ENVS, seed=1):
-    return make_vec_env("Pendulum-v1", n_envs, seed=seed)
+    return make_vec_env("UnitPendulum-v0", n_envs, seed=seed)
 
 
 def build(env=None, expert=turn_back, **kwargs):
@@ -87,13 +86,13 @@ class Recorder(BaseCallback):
 def test_the_agent_becomes_the_expert():
     model = build(n_epochs=20, learning_rate=1e-2).learn(ROLLOUT * 12)
     observations, labels = map(th.from_numpy, model.dataset.pairs.values())
-    error = np.square(mean_actions(model.policy, observations.numpy()) - labels.numpy()).mean()
+    error = np.square(Network(model.policy).means(observations.numpy()) - labels.numpy()).mean()
     assert error < 0.02 * float(labels.square().mean())
 
 
-@pytest.mark.parametrize("bc_loss", CLONING_LOSSES)
+@pytest.mark.parametrize("bc_loss", get_args(CloningLoss))
 def test_an_sb3_model_teaches(bc_loss):
-    teacher = PPO("MlpPolicy", "Pendulum-v1", seed=5, device="cpu")
+    teacher = PPO("MlpPolicy", "UnitPendulum-v0", seed=5, device="cpu")
     model = build(expert=teacher, bc_loss=bc_loss).learn(ROLLOUT)
     observations, labels = map(th.from_numpy, model.dataset.pairs.values())
     np.testing.assert_allclose(
@@ -101,20 +100,19 @@ def test_an_sb3_model_teaches(bc_loss):
     )
 
 
-@pytest.mark.parametrize("kind", ["huber", "huber_mse"])
-def test_how_errors_count(kind):
+def test_how_errors_count():
     """Zero where the actions agree, convex, as steep as promised: linear far out, and with a
     squared part steeper still.
     """
     error = th.linspace(-2.0, 2.0, 801, dtype=th.float64)
     loss = cloning_errors(
-        kind, error[:, None].repeat(1, 3), th.zeros(3), th.zeros(801, 3, dtype=th.float64)
+        "huber_mse", error[:, None].repeat(1, 3), th.zeros(3), th.zeros(801, 3, dtype=th.float64)
     )
     assert loss.argmin() == 400 and loss.min() < 1e-12
     th.testing.assert_close(loss, loss.flip(0))
     slope = loss.diff() / error.diff()
     assert (slope.diff() > -1e-9).all()
-    assert slope[-1] == pytest.approx(1.0 + (6.0 * 1.9975 if kind == "huber_mse" else 0.0))
+    assert slope[-1] == pytest.approx(1.0 + 6.0 * 1.9975)
 
 
 def test_without_a_value_term_only_the_actor_moves():
@@ -138,11 +136,10 @@ def test_the_critic_does_not_disturb_the_actor():
 
 
 def test_the_deviation_stops_at_its_floor():
-    model = build(bc_loss="nll", log_std_min=-1.98, learning_rate=1e-2, n_epochs=20).learn(
-        ROLLOUT * 4
-    )
-    # It is meant for actions in [-1, 1], and Pendulum's torque has limits of 2.
-    assert model.policy.log_std.min().item() == pytest.approx(-1.98 + math.log(2.0))
+    model = build(
+        bc_loss="nll", policy_kwargs={"log_std_init": -2.98}, learning_rate=1e-2, n_epochs=20
+    ).learn(ROLLOUT * 4)
+    assert model.policy.log_std.min().item() == pytest.approx(-3.0)
 
 
 # --- Loss terms
@@ -295,28 +292,6 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
 # -------------------------------------------------------------------------------------
 
 
-def test_callbacks_progress_bar_and_tensorboard(tmp_path):
-    model = build(tensorboard_log=str(tmp_path / "tb"))
-    evaluation = EvalCallback(
-        pendulum(1), n_eval_episodes=1, eval_freq=32, log_path=str(tmp_path), verbose=0
-    )
-    model.learn(ROLLOUT * 8, callback=[evaluation], progress_bar=True)
-    assert (tmp_path / "evaluations.npz").is_file()
-    assert list((tmp_path / "tb" / "DAgger_1").iterdir())
-    names = set(model.logger.name_to_value)
-    train = (
-        "bc_loss",
-        "value_loss",
-        "entropy_loss",
-        "std",
-        "explained_variance",
-        "learning_rate",
-        "loss",
-    )
-    assert {f"train/{name}" for name in train} <= names
-    assert len(model.ep_info_buffer) == N_ENVS  # an episode of Pendulum-v1 has 200 steps
-
-
 def test_a_loaded_model_predicts_without_environment_or_expert(tmp_path):
     model = build(policy_kwargs={"net_arch": [16]}).learn(ROLLOUT)
     model.save(tmp_path / "model")
@@ -361,22 +336,6 @@ def test_a_loss_that_is_not_finite_stops_training_and_spares_the_parameters():
     with pytest.raises(TrainingError, match="lower learning_rate"):
         model.learn(ROLLOUT * 4)
     assert th.equal(parameters(good), parameters(model))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"beta": 1.5}, "beta 1.5"),
-        ({"beta": 0.1}, "beta_final"),
-        ({"bc_loss": "mae"}, "did you mean"),
-        ({"dataset_capacity": 10}, "dataset_capacity"),
-        ({"beta_decay": -1.0}, "beta_decay"),
-        ({"gradient_steps": 0}, "gradient_steps"),
-    ],
-)
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(ConfigError, match=message):
-        build(**arguments)
 
 
 class Nothing(gym.Env):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-import sb3_quad.algorithms.offset_correction
+import sb3_quad.evaluation.offset_correction
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.cli import main
 from sb3_quad.evaluation.flights import fly
@@ -86,7 +86,7 @@ def shorten_trainings(monkeypatch, rollouts=1):
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
     monkeypatch.setattr(
-        sb3_quad.algorithms.offset_correction, "correct_offset", lambda *arguments: None
+        sb3_quad.evaluation.offset_correction, "correct_offset", lambda *arguments: None
     )  # which needs an agent that flies
     return trained
 

@@ -173,7 +173,7 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
         FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN))
     )
     monkeypatch.setattr("sb3_quad.show.film.HOLD", 0.1)
-    monkeypatch.setattr("sb3_quad.algorithms.transfer.CLONE_STEPS", 100)
+    monkeypatch.setattr("sb3_quad.agents.transfer.CLONE_STEPS", 100)
     monkeypatch.setattr(pipeline, "is_pipeline_run", lambda path: False)
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.chdir(folder)

@@ -42,7 +42,7 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
     monkeypatch.setattr(FlightSettings, "longest_episode", 100)
     # An offset can be corrected only if the agent flies; after one rollout it does not.
     monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.correct_offset", lambda *arguments: None
+        "sb3_quad.evaluation.offset_correction.correct_offset", lambda *arguments: None
     )
     with plt.rc_context():
         exec(compile(shortened(text), str(NOTEBOOKS[name]), "exec"), {"__name__": name})

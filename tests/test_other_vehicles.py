@@ -51,7 +51,7 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     # Agents that have hardly learnt crash on the way.
     monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.hover_offset", lambda *_, **__: np.zeros(3)
+        "sb3_quad.evaluation.offset_correction.hover_offset", lambda *_, **__: np.zeros(3)
     )
     return folder
 

@@ -14,13 +14,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.agents.pretrained import load_pretrained
-from sb3_quad.algorithms.offset_correction import (
-    Correction,
-    correct_offset,
-    hover_offset,
-    scale_position,
-    shift_position,
-)
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
@@ -29,6 +22,13 @@ from sb3_quad.cli import main
 from sb3_quad.cli.parser import PAIRS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.offset_correction import (
+    Correction,
+    correct_offset,
+    hover_offset,
+    scale_position,
+    shift_position,
+)
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import (
     load_pipeline,
@@ -220,7 +220,7 @@ def test_the_correction_counts_the_scale_of_vec_normalize(monkeypatch, variance)
     model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
     offsets = iter([np.array([0.3, -0.2, 0.5]), *np.zeros((3, 3))])
     monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.hover_offset", lambda *_, **__: next(offsets)
+        "sb3_quad.evaluation.offset_correction.hover_offset", lambda *_, **__: next(offsets)
     )
     raw = env.venv.reset()
     moved = raw.copy()
@@ -250,7 +250,7 @@ def test_a_correction_that_fails_leaves_the_agent_as_it_was(scale, monkeypatch):
         except StopIteration:
             raise ConfigError("the agent crashes") from None
 
-    monkeypatch.setattr("sb3_quad.algorithms.offset_correction.hover_offset", fail_the_second_time)
+    monkeypatch.setattr("sb3_quad.evaluation.offset_correction.hover_offset", fail_the_second_time)
     before = {name: values.clone() for name, values in model.policy.state_dict().items()}
     with pytest.raises(
         ConfigError, match="the agent crashes" if scale > 0.0 else "^scale .*above 0"
@@ -263,7 +263,7 @@ def test_a_correction_that_fails_leaves_the_agent_as_it_was(scale, monkeypatch):
 @pytest.mark.slow
 def test_the_correction_cancels_the_offset_of_a_trained_agent(monkeypatch):
     monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.fly", partial(fly, max_episode_steps=700)
+        "sb3_quad.evaluation.offset_correction.fly", partial(fly, max_episode_steps=700)
     )  # 7 s are enough to arrive
     model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))

@@ -6,14 +6,14 @@ import copy
 import csv
 import inspect
 import math
+from typing import get_args
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.wrappers import TransformObservation
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -21,10 +21,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
-from sb3_quad import load_pretrained
+from sb3_quad import PPOBC, DAgger, load_pretrained
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.algorithms import PPOBC, SACBC, DAgger, offset_correction
-from sb3_quad.algorithms.networks.losses import CLONING_LOSSES
+from sb3_quad.algorithms.losses import CloningLoss
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.envs import QuadcopterVecEnv
@@ -39,7 +38,7 @@ STOCK = {
     if parameter.default is not inspect.Parameter.empty
 }
 # PPO's own values where the recommended defaults of PPOBC differ
-PLAIN = {name: STOCK[name] for name in ("learning_rate", "gamma", "gae_lambda")} | {
+PLAIN = {name: STOCK[name] for name in ("learning_rate", "gamma", "gae_lambda", "ent_coef")} | {
     "policy_kwargs": {"log_std_init": 0.0},
     "bc_loss": "nll",
     "bc_filter": "none",
@@ -65,13 +64,13 @@ def part(model, name):
 @pytest.mark.parametrize(
     ("env", "settings"),
     [
-        ("Pendulum-v1", {}),
-        ("Pendulum-v1", {"clip_range_vf": 0.2, "ent_coef": 0.01, "normalize_advantage": False}),
+        ("UnitPendulum-v0", {}),
+        ("UnitPendulum-v0", {"ent_coef": 0.01, "normalize_advantage": False}),
         (
-            "Pendulum-v1",
+            "UnitPendulum-v0",
             {"target_kl": 1e-3, "batch_size": 48},
         ),  # stops early; the last mini-batch is a smaller one
-        ("Pendulum-v1", {"use_sde": True}),
+        ("UnitPendulum-v0", {"use_sde": True}),
         ("CartPole-v1", {"ent_coef": 0.01}),
     ],
 )
@@ -80,7 +79,7 @@ def test_without_additions_it_is_ppo_bit_for_bit(monkeypatch, env, settings):
     """By our own loop: stock PPO's is out of reach while ours learns."""
     settings = {**SIZES, **settings}
     stock = PPO("MlpPolicy", env, **settings).learn(256)
-    ours = PPOBC("MlpPolicy", env, bc_coef=0.0, max_clipped_value=False, **{**PLAIN, **settings})
+    ours = PPOBC("MlpPolicy", env, bc_coef=0.0, **{**PLAIN, **settings})
     monkeypatch.delattr(PPO, "train")
     ours.learn(256)
     assert th.equal(parameters(stock), parameters(ours))
@@ -90,19 +89,21 @@ def test_without_additions_it_is_ppo_bit_for_bit(monkeypatch, env, settings):
             assert ours.logger.name_to_value[name] == pytest.approx(value, rel=1e-5, abs=1e-6), name
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"clip_range_vf": 0.2, "max_clipped_value": False}, {"target_kl": 1e-3}]
-)
+@pytest.mark.parametrize("settings", [{}, {"target_kl": 1e-3}])
 def test_with_a_vanishing_addition_it_is_ppo_to_rounding(settings):
     """The faster update computes what PPO's does: with a weight of 1e-12 on an addition, only
     rounding is left of it.
     """
-    for_ppo = {key: value for key, value in settings.items() if key != "max_clipped_value"}
-    stock = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SIZES).learn(128)
+    stock = PPO("MlpPolicy", "UnitPendulum-v0", ent_coef=0.01, **settings, **SIZES).learn(128)
     ours = PPOBC(
-        "MlpPolicy", "Pendulum-v1", ent_coef=0.01, l2_coef=1e-12, bc_coef=0.0, **settings, **SMALL
+        "MlpPolicy",
+        "UnitPendulum-v0",
+        l2_coef=1e-12,
+        bc_coef=0.0,
+        **settings,
+        **{**SMALL, "ent_coef": 0.01},
     ).learn(128)
-    start = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SIZES)
+    start = PPO("MlpPolicy", "UnitPendulum-v0", ent_coef=0.01, **settings, **SIZES)
     assert (parameters(stock) - parameters(start)).abs().max() > 1e-3
     th.testing.assert_close(parameters(ours), parameters(stock), rtol=1e-3, atol=1e-5)
     assert ours._n_updates == stock._n_updates
@@ -110,19 +111,19 @@ def test_with_a_vanishing_addition_it_is_ppo_to_rounding(settings):
 
 def test_labelling_alone_changes_nothing():
     """An expert whose weight is zero is not asked, and takes no random numbers from training."""
-    stock = PPO("MlpPolicy", "Pendulum-v1", **SIZES).learn(256)
-    ours = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=0.0, **SMALL).learn(256)
+    stock = PPO("MlpPolicy", "UnitPendulum-v0", **SIZES).learn(256)
+    ours = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=0.0, **SMALL).learn(256)
     assert th.equal(parameters(stock), parameters(ours))
 
 
 def error(**settings):
     """Mean squared difference of actions from the expert's, after a short training."""
     changes = {**SMALL, "learning_rate": 3e-3, **settings}
-    model = PPOBC("MlpPolicy", "Pendulum-v1", **changes).learn(512)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", **changes).learn(512)
     observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
     return np.square(
         model.predict(observations, deterministic=True)[0]
-        - np.clip(swing_back(observations), -2, 2)
+        - np.clip(swing_back(observations), -1, 1)
     ).mean()
 
 
@@ -131,13 +132,13 @@ def error_without_cloning():
     return error(bc_coef=0.0)
 
 
-@pytest.mark.parametrize("bc_loss", CLONING_LOSSES)
+@pytest.mark.parametrize("bc_loss", get_args(CloningLoss))
 def test_cloning_pulls_towards_the_expert(bc_loss, error_without_cloning):
     assert error(expert=swing_back, bc_coef=5.0, bc_loss=bc_loss) < 0.5 * error_without_cloning
 
 
 def test_labels_belong_to_the_state_before_the_step():
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **SMALL)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=1.0, **SMALL)
     seen = []
     original = model.rollout_buffer.add
 
@@ -151,7 +152,7 @@ def test_labels_belong_to_the_state_before_the_step():
     model.learn(64)
     assert len(seen) == 64
     for observation, label in seen:
-        np.testing.assert_allclose(label, np.clip(swing_back(observation), -2, 2), rtol=1e-6)
+        np.testing.assert_allclose(label, np.clip(swing_back(observation), -1, 1), rtol=1e-6)
 
 
 class Swing:
@@ -173,13 +174,13 @@ def test_a_callback_that_calls_the_policy_leaves_the_labels_alone():
         def _on_rollout_end(self):
             self._on_step()
 
-    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    env = make_vec_env("UnitPendulum-v0", 2, seed=0)
     env.true_state = lambda: np.array([pendulum.unwrapped.state for pendulum in env.envs])
     model = PPOBC("MlpPolicy", env, expert=Swing(), bc_coef=1.0, **SMALL)
     seen = []
     model.train = lambda: seen.append(model.rollout_buffer)
     model.learn(128, callback=Calls())
-    expected = np.clip(swing_back(seen[0].observations.reshape(-1, 3)), -2, 2)
+    expected = np.clip(swing_back(seen[0].observations.reshape(-1, 3)), -1, 1)
     np.testing.assert_allclose(seen[0].expert_actions.reshape(-1, 1), expected, atol=1e-6)
 
 
@@ -193,7 +194,7 @@ def test_a_callback_may_copy_and_save_the_policy(tmp_path):
                 th.save(self.model.policy, tmp_path / "policy.pt")
             return True
 
-    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    env = make_vec_env("UnitPendulum-v0", 2, seed=0)
     observation = env.reset()
     model = PPOBC("MlpPolicy", env, expert=swing_back, bc_coef=1.0, **SMALL)
     before, _ = model.predict(observation, deterministic=True)
@@ -211,16 +212,13 @@ def test_schedules_may_give_any_number_and_stand_where_there_are_some():
         "learning_rate": lambda left: np.float32(1e-3) * left,
         "clip_range": lambda left: th.tensor(0.2),
     }
-    PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, **{**SMALL, **rate}).learn(64)
-    for name in ("l2_coef", "vf_coef"):
-        with pytest.raises(ConfigError, match=f"{name} .*must be a number"):
-            PPOBC("MlpPolicy", "Pendulum-v1", **{**SMALL, name: LinearSchedule(1.0, 0.0, 1.0)})
-    with pytest.raises(ConfigError, match=r"gamma 1\.5: must be a number from 0 to 1"):
-        PPOBC("MlpPolicy", "Pendulum-v1", **{**SMALL, "gamma": 1.5})
+    PPOBC("MlpPolicy", "UnitPendulum-v0", bc_coef=0.0, **{**SMALL, **rate}).learn(64)
+    with pytest.raises(ConfigError, match="l2_coef"):
+        PPOBC("MlpPolicy", "UnitPendulum-v0", l2_coef=LinearSchedule(1.0, 0.0, 1.0), **SMALL)
 
 
 def test_the_cloning_weight_is_not_negative_where_the_last_rollout_ends_late():
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=lambda p: p, **SMALL)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=lambda p: p, **SMALL)
     model.learn(100)
     assert model.rollout_buffer.bc_coef == 0.0
 
@@ -235,11 +233,11 @@ class Raised(BaseFeaturesExtractor):
         return 2.0 * observations + 1.0
 
 
-@pytest.mark.parametrize(("teacher", "algorithm"), [(PPO, PPOBC), (PPO, DAgger), (SAC, SACBC)])
+@pytest.mark.parametrize(("teacher", "algorithm"), [(PPO, PPOBC), (PPO, DAgger)])
 def test_an_initial_policy_hands_on_how_its_networks_compute(teacher, algorithm):
     settings = {"net_arch": [8], "features_extractor_class": Raised}
-    agent = teacher("MlpPolicy", "Pendulum-v1", policy_kwargs=settings, seed=0, device="cpu")
-    model = algorithm("MlpPolicy", "Pendulum-v1", initial_policy=agent, seed=1, device="cpu")
+    agent = teacher("MlpPolicy", "UnitPendulum-v0", policy_kwargs=settings, seed=0, device="cpu")
+    model = algorithm("MlpPolicy", "UnitPendulum-v0", initial_policy=agent, seed=1, device="cpu")
     observations = np.random.default_rng(0).normal(size=(64, 3)).astype(np.float32)
     np.testing.assert_array_equal(
         model.predict(observations, deterministic=True)[0],
@@ -247,7 +245,7 @@ def test_an_initial_policy_hands_on_how_its_networks_compute(teacher, algorithm)
     )
     other = {"features_extractor_class": FlattenExtractor}
     with pytest.raises(ConfigError, match="its weights give other actions here"):
-        algorithm("MlpPolicy", "Pendulum-v1", initial_policy=agent, policy_kwargs=other)
+        algorithm("MlpPolicy", "UnitPendulum-v0", initial_policy=agent, policy_kwargs=other)
 
 
 def test_weight_decay_leaves_the_deviation_of_state_dependent_exploration_alone():
@@ -255,14 +253,14 @@ def test_weight_decay_leaves_the_deviation_of_state_dependent_exploration_alone(
     changes = {**SMALL, **once, "policy_kwargs": {"log_std_init": -1.0}, "use_sde": True}
     gradients = []
     for l2_coef in (0.0, 5.0):
-        model = PPOBC("MlpPolicy", "Pendulum-v1", l2_coef=l2_coef, bc_coef=0.0, **changes)
+        model = PPOBC("MlpPolicy", "UnitPendulum-v0", l2_coef=l2_coef, bc_coef=0.0, **changes)
         gradients.append(model.learn(64).policy.log_std.grad.clone())
     th.testing.assert_close(*gradients)
 
 
 def test_critic_warmup_moves_the_critic_only():
     changes = {**SMALL, "critic_warmup": 1}
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **changes)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=1.0, **changes)
     before = {
         name: part(model, name) for name in ("policy_net", "action_net", "log_std", "value_net")
     }
@@ -278,7 +276,7 @@ def test_critic_warmup_moves_the_critic_only():
 
 def test_evaluations_say_while_only_the_critic_has_learnt(tmp_path):
     changes = {**SMALL, "critic_warmup": 2}
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **changes)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=1.0, **changes)
     before = part(model, "log_std")["log_std"]
     reported, unchanged = [], []
 
@@ -287,7 +285,7 @@ def test_evaluations_say_while_only_the_critic_has_learnt(tmp_path):
         unchanged.append(th.equal(before, part(model, "log_std")["log_std"]))
 
     files = tmp_path / "best_model.zip", tmp_path / "evaluations.npz"
-    best = BestModel(make_vec_env("Pendulum-v1", 1), 64, 1, 0, *files, report=report)
+    best = BestModel(make_vec_env("UnitPendulum-v0", 1), 64, 1, 0, *files, report=report)
     model.learn(256, callback=best)
     assert reported == unchanged == [True, True, True, False]
 
@@ -295,7 +293,7 @@ def test_evaluations_say_while_only_the_critic_has_learnt(tmp_path):
 def test_schedule_of_the_cloning_weight_follows_progress(tmp_path):
     model = PPOBC(
         "MlpPolicy",
-        "Pendulum-v1",
+        "UnitPendulum-v0",
         expert=swing_back,
         bc_coef=LinearSchedule(0.4, 0.0, 0.5),
         **SMALL,
@@ -316,7 +314,7 @@ def test_a_rollout_is_labelled_exactly_if_its_update_clones(start, weight):
     """Also where a schedule changes between the rollout's beginning and its end."""
     model = PPOBC(
         "MlpPolicy",
-        "Pendulum-v1",
+        "UnitPendulum-v0",
         expert=swing_back,
         bc_coef=lambda p: start if p > 0.75 else weight,
         **SMALL,
@@ -336,7 +334,10 @@ def test_a_rollout_is_labelled_exactly_if_its_update_clones(start, weight):
 
 def test_a_missing_expert_is_noticed_at_the_latest_when_it_is_to_be_cloned():
     model = PPOBC(
-        "MlpPolicy", "Pendulum-v1", bc_coef=lambda progress: float(progress == 1.0 - 3 / 7), **SMALL
+        "MlpPolicy",
+        "UnitPendulum-v0",
+        bc_coef=lambda progress: float(progress == 1.0 - 3 / 7),
+        **SMALL,
     )
     with pytest.raises(ExpertError, match="set_expert"):
         model.learn(64 * 7)
@@ -344,7 +345,7 @@ def test_a_missing_expert_is_noticed_at_the_latest_when_it_is_to_be_cloned():
 
 
 def test_an_expert_is_asked_for_when_learning_starts(tmp_path):
-    model = PPOBC("MlpPolicy", "Pendulum-v1", **SMALL)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", **SMALL)
     with pytest.raises(ExpertError, match="set_expert"):
         model.learn(64)
     model.set_expert(swing_back)
@@ -362,7 +363,7 @@ def test_an_expert_is_asked_for_when_learning_starts(tmp_path):
 @pytest.mark.parametrize("l2_coef", [0.0, 1e-3])
 @pytest.mark.parametrize("spoilt", ["advantages", "returns"])
 def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_coef, spoilt):
-    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, l2_coef=l2_coef, **SMALL)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", bc_coef=0.0, l2_coef=l2_coef, **SMALL)
     before = parameters(model)
     original = model.train
 
@@ -377,24 +378,18 @@ def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_co
 
 
 def test_a_policy_that_diverges_stops_training_whatever_computes_its_gradients():
-    changes = {**SMALL, "policy_kwargs": {"activation_fn": th.nn.ELU}, "learning_rate": 1e30}
+    changes = {
+        **SMALL,
+        "policy_kwargs": {"activation_fn": th.nn.ELU},
+        "learning_rate": lambda _: 1e30,
+    }
     with pytest.raises(TrainingError, match="not finite"):
-        PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, **changes).learn(640)
+        PPOBC("MlpPolicy", "UnitPendulum-v0", bc_coef=0.0, **changes).learn(640)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"bc_filter": "advantage"},
-        {"expert": swing_back, "use_sde": True},
-        {"rollout_buffer_class": DictRolloutBuffer},
-        {"bc_coef": -1.0},
-        {"critic_warmup": -5},
-    ],
-)
-def test_bad_arguments_are_named(arguments):
-    with pytest.raises(ConfigError, match=[*arguments][-1]):
-        PPOBC("MlpPolicy", "Pendulum-v1", **{**SMALL, **arguments})
+def test_state_dependent_exploration_has_no_likelihood_to_clone_by():
+    with pytest.raises(ConfigError, match="use_sde"):
+        PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, use_sde=True, **SMALL)
 
 
 def test_state_dependent_exploration_clones_by_the_mean():
@@ -405,7 +400,7 @@ def test_state_dependent_exploration_clones_by_the_mean():
     for bc_coef in (1e-9, 5.0):
         model = PPOBC(
             "MlpPolicy",
-            "Pendulum-v1",
+            "UnitPendulum-v0",
             expert=swing_back,
             bc_coef=bc_coef,
             use_sde=True,
@@ -417,7 +412,7 @@ def test_state_dependent_exploration_clones_by_the_mean():
     data = next(model.rollout_buffer.get())
     with th.no_grad():
         mean = model.policy.get_distribution(data.observations).mode()
-    expected = 5.0 * 2.0 * (mean - data.expert_actions).mean(dim=0) / 2.0  # scaled to [-1, 1]
+    expected = 5.0 * 2.0 * (mean - data.expert_actions).mean(dim=0)
     assert expected.abs() > 0.05
     th.testing.assert_close(by_mean[1] - by_mean[0], expected, rtol=1e-3, atol=1e-4)
     th.testing.assert_close(*by_deviation)
@@ -432,15 +427,25 @@ def test_the_signature_is_ppos_and_what_is_added_after_it_by_keyword():
         "bc_loss",
         "bc_filter",
         "l2_coef",
-        "max_clipped_value",
         "critic_warmup",
         "shuffle",
     ]
-    stock = [name for name in inspect.signature(PPO).parameters if name != "_init_setup_model"]
+    theirs = ("_init_setup_model", "rollout_buffer_class", "rollout_buffer_kwargs")
+    stock = [name for name in inspect.signature(PPO).parameters if name not in theirs]
     assert [*ours] == [*stock, *added, "_init_setup_model"]
     assert {ours[name].kind for name in added} == {inspect.Parameter.KEYWORD_ONLY}
-    recommended = {"learning_rate", "n_steps", "batch_size", "gamma", "gae_lambda"}
-    assert {name for name in STOCK if ours[name].default != STOCK[name]} == recommended
+    recommended = {
+        "learning_rate",
+        "n_steps",
+        "batch_size",
+        "n_epochs",
+        "gamma",
+        "gae_lambda",
+        "ent_coef",
+    }
+    assert {
+        name for name in STOCK if name in ours and ours[name].default != STOCK[name]
+    } == recommended
 
 
 @pytest.mark.parametrize(
@@ -453,10 +458,10 @@ def test_by_default_a_rollout_is_16_mini_batches_or_fewer_of_64_rows(n_envs, n_s
 
 @pytest.mark.parametrize(
     ("algorithm", "given"),
-    [(PPOBC, {"expert": swing_back}), (DAgger, {"expert": swing_back}), (SACBC, {})],
+    [(PPOBC, {"expert": swing_back}), (DAgger, {"expert": swing_back})],
 )
 def test_learn_takes_sb3s_arguments_by_position(algorithm, given, tmp_path):
-    model = algorithm("MlpPolicy", "Pendulum-v1", tensorboard_log=str(tmp_path), **given)
+    model = algorithm("MlpPolicy", "UnitPendulum-v0", tensorboard_log=str(tmp_path), **given)
     seen = []
 
     def callback(local, _):
@@ -465,8 +470,7 @@ def test_learn_takes_sb3s_arguments_by_position(algorithm, given, tmp_path):
 
     assert model.learn(200, callback, 4, "run", True, False) is model
     assert len(seen) == 3 and [path.name for path in tmp_path.iterdir()] == ["run_1"]
-    stock = {PPOBC: PPO, DAgger: PPO, SACBC: SAC}[algorithm]
-    theirs, ours = (inspect.signature(each.learn).parameters for each in (stock, algorithm))
+    theirs, ours = (inspect.signature(each.learn).parameters for each in (PPO, algorithm))
     assert [*theirs] == [*ours]
     for name, parameter in theirs.items():
         assert ours[name].kind == parameter.kind
@@ -496,11 +500,10 @@ def test_settings_of_the_thesis_take_no_recommended_default():
         for env in ENVIRONMENTS:
             config = load_config(algo, env, file)
             assert {name: config.hyperparams[name] for name in values} == values
-            if algo == "ppo_bc":  # the deviation of stage one, or SB3's
-                assert config.policy_kwargs["log_std_init"] is None
-    env = QuadcopterVecEnv(2)
-    arguments = {"log_std_init": None, "net_arch": [8]}
-    assert "log_std_init" not in PPOBC("MlpPolicy", env, policy_kwargs=arguments).policy_kwargs
+            if file == "thesis/ppo_bc.yml":  # the deviation of stage one
+                assert "log_std_init" not in config.policy_kwargs
+            if file == "thesis/reference.yml":  # SB3's
+                assert config.policy_kwargs["log_std_init"] == 0.0
 
 
 @pytest.mark.parametrize("kind", ["model", "zip", "name"])
@@ -521,32 +524,28 @@ def test_an_initial_policy_is_a_model_a_zip_or_a_name(kind, tmp_path):
         policy.mlp_extractor.policy_net[1]
     )
     for name, tensor in theirs.items():
-        assert th.equal(tensor, ours[name]) or name == "log_std"
-    assert ours["log_std"].tolist() == pytest.approx([-0.9] * 4)
-    kept = PPOBC(
-        "MlpPolicy", env, initial_policy=source, policy_kwargs={"log_std_init": None}, expert="pid"
-    )
-    assert th.equal(kept.policy.log_std, policy.log_std)
-    model.save(tmp_path / "model.zip")
-    assert PPO.load(tmp_path / "model.zip").policy_kwargs["log_std_init"] == -0.9
+        assert th.equal(tensor, ours[name])
+    explores = {"log_std_init": -0.5}
+    again = PPOBC("MlpPolicy", env, initial_policy=source, policy_kwargs=explores, expert="pid")
+    assert again.policy.log_std.tolist() == [-0.5] * 4
     if kind == "model":
         with pytest.raises(ConfigError, match="policy_kwargs must be the same"):
             PPOBC("MlpPolicy", env, initial_policy=source, policy_kwargs={"net_arch": [8]})
 
 
 def test_an_initial_policy_of_no_use_is_refused():
-    source = PPO("MlpPolicy", "Pendulum-v1")
+    source = PPO("MlpPolicy", "UnitPendulum-v0")
     with pytest.raises(ConfigError, match="must be a model, the path of a zip, or a name"):
-        PPOBC("MlpPolicy", "Pendulum-v1", initial_policy=source.policy)
+        PPOBC("MlpPolicy", "UnitPendulum-v0", initial_policy=source.policy)
     th.nn.init.constant_(source.policy.action_net.bias, math.nan)
     with pytest.raises(
         ConfigError, match="the policy of PPO: holds parameters that are not finite"
     ):
-        PPOBC("MlpPolicy", "Pendulum-v1", initial_policy=source)
+        PPOBC("MlpPolicy", "UnitPendulum-v0", initial_policy=source)
 
 
 def test_a_cloning_weight_needs_an_expert_and_actions_of_a_box():
-    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", bc_coef=0)
     with pytest.raises(ExpertError, match=r"PPOBC\(\.\.\., expert='geometric'\), .* bc_coef=0"):
         model.set_bc_coef(0.1)
     assert not model.will_clone()
@@ -597,12 +596,12 @@ def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tm
     assert flights_of(DAgger("MlpPolicy", single))["vehicle"]["name"] == settings.vehicle.name
 
     plain = QuadcopterVecEnv(2)
-    assert flights_of(SACBC("MlpPolicy", plain))["observation_mean"] is None
+    assert flights_of(PPOBC("MlpPolicy", plain))["observation_mean"] is None
     for stacked in (VecFrameStack(plain, 2), VecNormalize(VecFrameStack(plain, 2))):
         assert flights_of(PPOBC("MlpPolicy", stacked)) is None
     normalised = PPOBC("MlpPolicy", VecNormalize(plain))
     assert flights_of(normalised) is not None and normalised.vec_normalize is normalised.env
-    assert flights_of(PPOBC("MlpPolicy", "Pendulum-v1")) is None
+    assert flights_of(PPOBC("MlpPolicy", "UnitPendulum-v0")) is None
 
     def turned():
         box = gym.spaces.Box(-np.inf, np.inf, (18,), np.float32)
@@ -613,21 +612,8 @@ def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tm
     assert flights_of(normalised) is None
 
 
-def test_an_offset_is_corrected_by_the_settings_of_the_own_environment(monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        offset_correction, "correct_offset", lambda *arguments: asked.append(arguments)
-    )
-    env = QuadcopterVecEnv(2, vehicle="crazyflie", noise=0.01)
-    model = PPOBC("MlpPolicy", VecMonitor(env), expert="pid")
-    model.correct_offset(seed=3, scale=0.7)
-    assert asked == [(model, 3, env.flight_settings, 0.7)]
-    with pytest.raises(ConfigError, match=r"correct_offset: .*set_env"):
-        PPOBC("MlpPolicy", "Pendulum-v1").correct_offset()
-
-
 def test_a_callback_finds_the_rollout_buffer_that_sb3_has(tmp_path):
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **SMALL)
+    model = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=1.0, **SMALL)
     rows = []
 
     class Look(BaseCallback):
@@ -641,7 +627,7 @@ def test_a_callback_finds_the_rollout_buffer_that_sb3_has(tmp_path):
                 )
                 th.testing.assert_close(values.flatten(), data.old_values)
                 th.testing.assert_close(log_prob, data.old_log_prob, rtol=1e-4, atol=1e-5)
-                expected = np.clip(swing_back(data.observations.numpy()), -2, 2)
+                expected = np.clip(swing_back(data.observations.numpy()), -1, 1)
                 np.testing.assert_allclose(data.expert_actions, expected, rtol=1e-6)
                 assert data.advantages.shape == data.returns.shape == (len(values),)
                 rows.append(len(values))
@@ -653,7 +639,7 @@ def test_a_callback_finds_the_rollout_buffer_that_sb3_has(tmp_path):
 def test_in_order_mini_batches_follow_each_other_in_time():
     model = PPOBC(
         "MlpPolicy",
-        make_vec_env("Pendulum-v1", n_envs=3),
+        make_vec_env("UnitPendulum-v0", n_envs=3),
         n_steps=4,
         batch_size=6,
         shuffle=False,

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from adaptive_scaling import AdaptiveScaling, adaptive_factor, measure_mean
 
-from sb3_quad.algorithms.offset_correction import hover_offset
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import seed_for
@@ -16,6 +15,7 @@ from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.offset_correction import hover_offset
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario

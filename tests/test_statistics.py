@@ -15,11 +15,10 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNorma
 
 from sb3_quad import DAgger
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.agents.controller import Controller
 from sb3_quad.agents.resolve import resolve_expert
+from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.agents.zips import load_model
-from sb3_quad.algorithms.networks.gradients import Perceptrons
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.algorithms.controller import Controller
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.callbacks import BestModel
@@ -28,6 +27,7 @@ from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.export.policy import export_policy
+from sb3_quad.fast.policy import Perceptrons
 from sb3_quad.show.demo import page
 from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.environments import make_environments

@@ -9,15 +9,15 @@ import yaml
 from stable_baselines3 import SAC
 
 from sb3_quad.agents.pretrained import pretrained_path
+from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.agents.zips import load_model, load_zip, saved_algorithm
 from sb3_quad.algorithms import transfer
-from sb3_quad.algorithms.offset_correction import correct_offset, hover_offset
-from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.offset_correction import correct_offset, hover_offset
 from sb3_quad.training.config import TrainingJob, build_config, describe, load_config
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import resume, train

@@ -23,11 +23,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import PPOBC, DAgger, PIDExpert, load_pretrained
-from sb3_quad.algorithms.offset_correction import correct_offset
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.offset_correction import correct_offset
 from sb3_quad.evaluation.results import COLOURS, colours_of
 from sb3_quad.report.plots import STYLE
 

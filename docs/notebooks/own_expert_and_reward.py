@@ -24,7 +24,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained_path
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.simulation.state import TARGET, QuadcopterState
 from sb3_quad.evaluation.flightlog import Recorder
@@ -195,7 +195,7 @@ calm = PPOBC(
     make_env(240, seed=0),
     expert=GeometricExpert(),
     bc_coef=5.0,
-    bc_loss="huber",
+    bc_loss="huber_mse",
     bc_filter="none",
     n_steps=125,
     batch_size=5000,

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.plugins import FLIGHT_SETTINGS
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
@@ -28,7 +29,7 @@ AsList = BeforeValidator(
 )
 Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
 # The attribute of a model, and so the key of the JSON in its zip
-KEY = "flight_settings"
+KEY = FLIGHT_SETTINGS
 Level = Annotated[float, BeforeValidator(a_number), Field(ge=0, le=100)]
 
 

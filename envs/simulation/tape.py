@@ -51,8 +51,8 @@ and that with respect to the actions.
 class FlightTape:
     """The flights of a batch for some control steps, and the backward pass through these steps.
 
-    Record with :meth:`reset` and a :meth:`step` for each control step. Then :meth:`begin` takes the
-    cost, and :meth:`backward` is called for each step, the last one first.
+    Record with :meth:`reset` and a :meth:`step` for each control step. Then call :meth:`begin`, and
+    :meth:`backward` for each step, the last one first.
 
     A row that crashes or leaves the range costs nothing from there on and has no gradient.
 
@@ -60,9 +60,16 @@ class FlightTape:
     :param n_steps: control steps of a recording.
     :param substeps: physics steps in a control step; None: those of the batch. Two take half the
         time of four, and differ little.
+    :param cost: the cost that :meth:`begin` takes unless it is given another.
     """
 
-    def __init__(self, batch: QuadcopterBatch, n_steps: int, substeps: int | None = None) -> None:
+    def __init__(
+        self,
+        batch: QuadcopterBatch,
+        n_steps: int,
+        substeps: int | None = None,
+        cost: FlightCost | None = None,
+    ) -> None:
         if FEATURE_SIZES.keys() != DIFFERENTIATED:
             names = ", ".join(FEATURE_SIZES.keys() - DIFFERENTIATED)
             raise ConfigError(f"features {names}: have no gradient yet; see features_vjp")
@@ -72,6 +79,7 @@ class FlightTape:
         self.physics_step = self.control_step / self.substeps
         self.batch = batch
         self.n_steps = n_steps
+        self._cost = cost
         # The states before each control step and after the last one
         self.states = np.zeros((n_steps + 1, STATE_SIZE, n))
         self.actions = np.zeros((n_steps, n, 4), np.float32)
@@ -144,8 +152,10 @@ class FlightTape:
         flown = np.arange(self.n_steps)[:, None] < self.lengths
         return (self.rewards * flown).sum(axis=0), self.lengths, self.lost
 
-    def begin(self, cost: FlightCost) -> float:
+    def begin(self, cost: FlightCost | None = None) -> float:
         """Begin the backward pass; return the mean cost of a control step."""
+        cost = cost or self._cost
+        assert cost is not None
         value, grad_states, grad_actions = cost(self.states[1:], self.actions, self.counts)
         batch = self.batch
         self._grad_states = grad_states

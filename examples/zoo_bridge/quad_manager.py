@@ -16,7 +16,7 @@ from rl_zoo3 import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.envs.registration import ENVIRONMENTS

@@ -8,6 +8,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import refuse_settings, saved_data
+from sb3_quad.algorithms.labelling import name_beside
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import print_once
@@ -62,11 +63,6 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
         return ""
     flies = name_beside(trained, flown)
     return f"{label}: was trained on the vehicle {trained.name} and flies {flies}"
-
-
-def name_beside(known: Vehicle, flown: Vehicle) -> str:
-    """Return the name of a vehicle that a controller flies and does not know."""
-    return flown.name + " with other parameters" * (known.name == flown.name)
 
 
 def warn_of_observation(name: str, agent: Any, here: Any) -> None:

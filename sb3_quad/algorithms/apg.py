@@ -2,43 +2,36 @@
 
 from collections import deque
 from collections.abc import Callable
-from functools import partial
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from pydantic import Field
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import ExpertMixin, policy_arguments
-from sb3_quad.algorithms.flight_cost import (
-    FlownStates,
-    body_rates_cost,
-    cost_and_gradients,
-    flight_cost,
-    low_force_cost,
-)
-from sb3_quad.algorithms.networks.gradients import RecordedPolicy
+from sb3_quad.algorithms.common import ExpertMixin, RateOrSchedule, model_of, policy_arguments
+from sb3_quad.algorithms.networks import network_of
 from sb3_quad.algorithms.soap import SOAP
-from sb3_quad.algorithms.transfer import model_of
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
-from sb3_quad.envs.simulation.tape import FlightCost
+from sb3_quad.base.validate import Count, Weight
 
 
 class Tape(Protocol):
     """Records flights of n environments, and carries gradients back through their steps.
 
     An environment that ``APG`` can train on has ``record(n_steps, substeps)``, which returns one.
+    Where ``APG`` is given a ``cost`` or a ``body_rates_coef``, ``record`` gets it by that keyword.
     To record, call :meth:`reset`, then :meth:`step` once for each step. For the backward pass, call
     :meth:`begin`, then :meth:`backward` once for each step, the last one first.
     """
@@ -56,11 +49,8 @@ class Tape(Protocol):
     def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return each flight's sum of rewards, its length, and whether it was lost, (n,) each."""
 
-    def begin(self, cost: FlightCost) -> float:
-        """Begin the backward pass; return the mean cost of a step.
-
-        :param cost: the cost of a quadcopter's states; an environment with its own cost ignores it.
-        """
+    def begin(self) -> float:
+        """Begin the backward pass; return the mean cost of a step."""
 
     def backward(self, step: int, grad_observation: Float32Array) -> FloatArray:
         """Return the gradient of the mean cost with respect to the actions of a step, (n, a).
@@ -109,15 +99,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         (DAgger), or fly short windows with ``continue_flights``.
     :param continue_flights: Let each update continue the flights of the one before. A flight that
         crashed or reached its time limit begins again.
-    :param cost: The cost of each control step, (steps, n), as a function of
-        :class:`~sb3_quad.algorithms.flight_cost.FlownStates`, in PyTorch. It is not saved: give it
-        to ``load`` as well.
-    :param body_rates_coef: Weight of :func:`~sb3_quad.algorithms.flight_cost.body_rates_cost`,
-        which is added to the cost: for agents that swing around the target because motors are slow
-        or delays are long.
-    :param low_force_coef: Weight of :func:`~sb3_quad.algorithms.flight_cost.low_force_cost`, which
-        is added to the cost: for vehicles whose firmware interprets persistently low thrust as a
-        crash.
+    :param cost: The cost of each control step, (steps, n), as a function of what the environment
+        records, in PyTorch; in ours, of :class:`~sb3_quad.envs.flight_cost.FlownStates`. It is not
+        saved: give it to ``load`` as well. None: the environment's own, which is
+        :func:`~sb3_quad.envs.flight_cost.flight_cost` in ours.
+    :param body_rates_coef: Weight of :func:`~sb3_quad.envs.flight_cost.body_rates_cost`, which is
+        added to the cost: for agents that swing around the target because motors are slow or delays
+        are long.
     :param substeps: Physics steps per control step during training; None: the vehicle's.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a non-finite gradient, even in a single environment.
@@ -132,10 +120,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = LinearSchedule(4e-3, 8e-5, 1.0),  # noqa: B008
-        n_steps: int = 300,
-        max_grad_norm: float = 1.0,
-        stats_window_size: int = 100,
+        learning_rate: RateOrSchedule = LinearSchedule(2e-4, 4e-6, 1.0),  # noqa: B008
+        n_steps: Count = 300,
+        max_grad_norm: Weight = 1.0,
+        stats_window_size: Count = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: StrDict | None = None,
         verbose: int = 0,
@@ -143,12 +131,11 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         device: th.device | str = "auto",
         *,
         initial_policy: BaseAlgorithm | StrPath | None = None,
-        max_row_ratio: float | None = None,
+        max_row_ratio: Annotated[float, Field(ge=1.0)] | None = None,
         continue_flights: bool = False,
-        cost: Callable[[FlownStates], th.Tensor] = flight_cost,
-        body_rates_coef: float = 0.0,
-        low_force_coef: float = 0.0,
-        substeps: int | None = 2,
+        cost: Callable[[Any], th.Tensor] | None = None,
+        body_rates_coef: Weight = 0.0,
+        substeps: Count | None = 2,
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -166,7 +153,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             sde_sample_freq=-1,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0),
+            policy_kwargs=policy_arguments(policy_kwargs, initial, -2.0),
             verbose=verbose,
             seed=seed,
             device=device,
@@ -178,19 +165,18 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.cost = cost
         self.own_cost = False
         self.body_rates_coef = body_rates_coef
-        self.low_force_coef = low_force_coef
         self.substeps = substeps
 
         if _init_setup_model:
             self._set_up(initial)
 
     def _setup_model(self) -> None:
-        if not callable(self.cost):
+        if self.cost is not None and not callable(self.cost):
             raise ConfigError(
                 f"cost {self.cost!r}: must be a function; leave it out for the default"
             )
         # A zip may have set this already, for a cost that it does not contain.
-        self.own_cost |= self.cost is not flight_cost
+        self.own_cost |= self.cost is not None
         super()._setup_model()
         # SOAP stays out of policy_kwargs, so that a zip loads where this package is missing.
         if "optimizer_class" not in self.policy_kwargs:
@@ -237,20 +223,23 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 f"{type(env).__name__}: APG differentiates flights, and this environment has no"
                 " record(n_steps, substeps); use QuadcopterVecEnv, or see docs/apg.md"
             )
-        if self.own_cost and self.cost is flight_cost:
+        if self.own_cost and self.cost is None:
             raise ConfigError(
                 "cost: this agent was trained with a cost of your own, which no zip holds; give it"
                 " to APG.load(..., cost=...), or own_cost=False for the default"
             )
-        self.own_cost = self.cost is not flight_cost
-        self._tape = env.record(self.n_steps, self.substeps)
-        is_quadcopter = hasattr(self._tape, "control_step")
-        if (self.body_rates_coef or self.low_force_coef) and not is_quadcopter:
-            raise ConfigError(
-                f"{type(env).__name__}: body_rates_coef and low_force_coef are costs of"
-                " quadcopters; remove them"
-            )
-        self._recorded_policy = RecordedPolicy(self.policy, self.n_steps, self.n_envs)
+        self.own_cost = self.cost is not None
+        options: StrDict = {}
+        if self.cost is not None:
+            options["cost"] = self.cost
+        if self.body_rates_coef:
+            options["body_rates_coef"] = self.body_rates_coef
+        # The user's own environment may know neither.
+        unfit = f"{type(env).__name__}: does not record with {[*options]}"
+        with raised_as(ConfigError, unfit):
+            self._tape = env.record(self.n_steps, self.substeps, **options)
+        network = network_of(self.policy)
+        self._recorded_policy = network.recorded(self.n_steps, self.n_envs)
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
@@ -298,7 +287,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         # Layers such as dropout must act as they did in the recorded flight.
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
-        cost = self._tape.begin(partial(cost_and_gradients, self._whole_cost))
+        cost = self._tape.begin()
 
         # Autograd adds to gradients that the critic or an earlier update has left.
         self.policy.optimizer.zero_grad()
@@ -318,15 +307,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self._n_updates += 1
 
         self._log_update({"cost": [cost], "gradient_norm": [float(norm)]})
-
-    def _whole_cost(self, flown: FlownStates) -> th.Tensor:
-        cost = self.cost(flown)
-        if self.body_rates_coef:
-            cost = cost + self.body_rates_coef * body_rates_cost(flown)
-        if self.low_force_coef:
-            tape: Any = self._tape
-            cost = cost + self.low_force_coef * low_force_cost(flown, tape.control_step)
-        return cost
 
     def _limited(self, gradients: FloatArray) -> FloatArray:
         """Return gradients (n, a), their norms limited to ``max_row_ratio`` times the median."""

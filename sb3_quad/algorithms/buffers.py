@@ -10,10 +10,32 @@ import numpy.typing as npt
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_quad.algorithms.networks.perceptron import Batch
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_arrays, write_arrays
 from sb3_quad.base.types import AnyArray, Arrays, Float32Array, IntArray, StrDict, StrPath
+
+
+class Batch(NamedTuple):
+    """A mini-batch as rows of arrays of length m, which are not copied.
+
+    :param rows: (b,).
+    :param observations: (m, ...).
+    :param targets: (m, columns): of an actor's row, for the terms that the loss has, the expert's
+        action (a), the action flown (a), its log-probability then and its advantage; of a critic's
+        row, V at the time of the rollout and the return.
+    """
+
+    rows: IntArray
+    observations: AnyArray
+    targets: Float32Array
+
+    def tensors(self, device: th.device) -> tuple[th.Tensor, th.Tensor]:
+        """Return the observations (b, ...) and targets (b, columns)."""
+        # PyTorch gathers in a third of the time that NumPy's indexing and a copy take.
+        rows = th.from_numpy(self.rows)
+        observations = th.from_numpy(self.observations).index_select(0, rows)
+        targets = th.from_numpy(self.targets).index_select(0, rows)
+        return observations.to(device), targets.to(device)
 
 
 class ExpertRolloutSamples(NamedTuple):
@@ -78,7 +100,7 @@ class ExpertRolloutBuffer(RolloutBuffer):
         return ExpertRolloutSamples(*stock, self.to_torch(self.expert_actions[rows]))
 
     def batches(self, rows: IntArray) -> tuple[Batch, Batch]:
-        """Return a mini-batch as compiled code takes it: for the actor and for the critic."""
+        """Return a mini-batch as an accelerator takes it: for the actor and for the critic."""
         if self._targets is None:
             for_actor = [self.actions, self.log_probs, self.advantages]
             if self.bc_coef != 0.0:

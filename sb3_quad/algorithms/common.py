@@ -1,8 +1,7 @@
 """The parts that all algorithms with an expert share."""
 
-import math
-from collections.abc import Callable
-from functools import wraps
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -11,60 +10,27 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_quad.agents.controller import Controller, limits_of
-from sb3_quad.agents.expert_like import ExpertLike
-from sb3_quad.agents.statistics import STATISTICS, share_statistics
-from sb3_quad.algorithms import offset_correction
-from sb3_quad.algorithms.networks.gradients import Terms, network_of
-from sb3_quad.algorithms.networks.perceptron import one_torch_thread
-from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, raised_as
+from sb3_quad.algorithms.labelling import ExpertLike, Labeller, labeller_for
+from sb3_quad.algorithms.networks import Terms, network_of
+from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
+from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
-from sb3_quad.base.types import Float32Array, StrDict
-from sb3_quad.envs.simulation.settings import KEY, FlightSettings
+from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
+from sb3_quad.base.types import Float32Array, StrDict, StrPath
+from sb3_quad.base.validate import Share, Weight, check_arguments
 
-_MOST = 2**40
-# Arguments that are whole numbers
-_COUNTS = (
-    "n_steps",
-    "batch_size",
-    "n_epochs",
-    "stats_window_size",
-    "buffer_size",
-    "train_freq",
-    "target_update_interval",
-    "substeps",
-)
-_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "bc_coef")
-_SHARES = ("learning_rate", "gamma", "gae_lambda", "tau", "beta", "beta_final")
-_WEIGHTS = (
-    "max_grad_norm",
-    "clip_range",
-    "clip_range_vf",
-    "target_kl",
-    "critic_warmup",
-    "bc_coef",
-    "l2_coef",
-    "vf_coef",
-    "beta_decay",
-    "body_rates_coef",
-    "low_force_coef",
-)
-LIMITS = {
-    **dict.fromkeys((*_COUNTS, "max_row_ratio"), (1, _MOST)),
-    **dict.fromkeys(_SHARES, (0, 1)),
-    **dict.fromkeys(_WEIGHTS, (0, _MOST)),
-}
-"""Valid range of each argument of the algorithms; for weights and counts, the greatest
-holds for settings files alone."""
+RateOrSchedule = Share | Schedule
+WeightOrSchedule = Weight | Schedule
 History = dict[str, list[float]]
 """The value of each term of the loss in every mini-batch of an update, by logged name."""
+# Attributes that have the name of an argument, but are not what the user gave, or may be anything
+_OBJECTS = ("policy", "env", "expert", "cost", "device")
 # Arguments that SB3 would store in a loaded model without using them
 _OF_NEW_MODELS = {
     "initial_policy": "a zip holds its policy; give the other one to a new model",
@@ -81,31 +47,9 @@ _OF_NETWORKS = (
     "squash_output",
     "use_expln",
     "full_std",
-    "n_critics",
 )
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
-# A limit further than this from the middle of the range counts as unbounded.
-_UNLIMITED = 1e9
-
-
-def with_unit_actions(train: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Rescale actions to [-1, 1] during an update, and back after it.
-
-    The losses assume that scale. So do Adam's steps, which move every weight by about the same
-    amount: negligible for outputs of 1,000 to 2,000, far too much for ±0.002. In a Box of [-1, 1]
-    nothing changes.
-    """
-
-    @wraps(train)
-    def scaled(self: Any) -> None:
-        self._scale_actions()
-        try:
-            train(self)
-        finally:
-            self._scale_actions(inverse=True)
-
-    return scaled
 
 
 class ExpertMixin(BaseAlgorithm):
@@ -120,7 +64,7 @@ class ExpertMixin(BaseAlgorithm):
     bc_coef: Any
     expert: ExpertLike | None = None
     # Queries the expert, and keeps a recurrent expert's state.
-    _labeller: Controller | None = None
+    _labeller: Labeller | None = None
     # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
 
@@ -130,7 +74,7 @@ class ExpertMixin(BaseAlgorithm):
         :raises ExpertError: an expert that does not fit the environment.
         """
         if expert is not None and self.env is not None:
-            self._labeller = Controller.for_env(expert, self.env, self._labeller)
+            self._labeller = labeller_for(expert, self.env, self._labeller)
         self.expert = expert
 
     def _check_expert(self) -> None:
@@ -161,63 +105,20 @@ class ExpertMixin(BaseAlgorithm):
         super().set_env(env, force_reset)
         self._note_flight_settings()
 
-    def correct_offset(self, seed: int = 0, scale: float = 1.0) -> offset_correction.Correction:
-        """Cancel the steady offset at which the agent hovers next to its targets.
-
-        It changes the agent's own first layer, so the zip stays an ordinary SB3 zip (thesis 4.3.1).
-        See :func:`~sb3_quad.algorithms.offset_correction.correct_offset`.
-
-        :param seed: seed of the flights that measure the offset, with the settings of the model's
-            environment.
-        :param scale: α of Eq. 4.10; below 1, the agent is quicker near its target.
-        :return: the offset before and after, m.
-        :raises ConfigError: no quadcopter environment; an agent that crashes on the way to targets,
-            or whose first layer does not read the 18 features. The agent is left unchanged.
-        """
-        settings = flight_settings_of(self.env)
-        if settings is None:
-            raise ConfigError(
-                "correct_offset: the model has no quadcopter environment to measure the offset in;"
-                " give it one by model.set_env(...)"
-            )
-        return offset_correction.correct_offset(self, seed, settings, scale)
-
     def _check_arguments(self) -> None:
-        # SB3 would pickle NumPy numbers into the zip, and does not accept all of them.
-        for name, value in [*vars(self).items()]:
-            if isinstance(value, np.generic):
-                setattr(self, name, value.item())
-        for name, (least, _) in LIMITS.items():
-            value = getattr(self, name, None)
-            if callable(value) and name in _SCHEDULES:
-                value = float(value(1.0))  # at its start
-            # Some arguments can be None, and train_freq a tuple.
-            if value is None or isinstance(value, tuple):
-                continue
-            valid, most = f"a number and at least {least}", math.inf
-            if name in _SHARES and name not in _SCHEDULES:
-                valid, most = "a number from 0 to 1", 1.0
-            if not isinstance(value, (int, float)) or not least <= value <= most:
-                raise ConfigError(f"{name} {value!r}: must be {valid}")
-            if name in _COUNTS and not isinstance(value, int):
-                raise ConfigError(f"{name} {value!r}: must be a whole number")
-        # PPO cannot load the None that DAgger allows.
-        if getattr(self, "max_grad_norm", 0.0) is None:
-            self.max_grad_norm = math.inf
-        # Rows are sampled all at once.
-        capacity = getattr(self, "dataset_capacity", 0) or getattr(self, "buffer_size", 0)
-        if 0 < capacity < getattr(self, "batch_size", 0):
-            raise ConfigError(
-                f"batch_size {self.batch_size}: more than the {capacity} rows of dataset_capacity"
-                " or buffer_size"
-            )
-        if hasattr(self, "bc_coef"):
-            self.bc_coef = FloatSchedule(self.bc_coef)
         if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
             raise ConfigError(
                 f"policy {self.policy_class.__name__}: {type(self).__name__} does not support it;"
                 " give an agent of another algorithm as expert=... to a new model"
             )
+        # SB3 would pickle NumPy numbers into the zip, and does not accept all of them.
+        for name, value in [*vars(self).items()]:
+            if isinstance(value, np.generic):
+                setattr(self, name, value.item())
+        given = {name: value for name, value in vars(self).items() if name not in _OBJECTS}
+        check_arguments(type(self), given)
+        if hasattr(self, "bc_coef"):
+            self.bc_coef = FloatSchedule(self.bc_coef)
         is_for_parts = issubclass(self.policy_class, self.policy_aliases["MultiInputPolicy"])
         if is_for_parts and not isinstance(self.observation_space, spaces.Dict):
             raise ConfigError("policy MultiInputPolicy: needs Dict observations; give MlpPolicy")
@@ -229,12 +130,12 @@ class ExpertMixin(BaseAlgorithm):
         """Set the model up, with the policy of the agent that it starts from."""
         self._setup_model()
         if initial is not None:
-            transfer_policy(initial, self)
+            copy_policy(initial, self)
 
     def _setup_model(self) -> None:
         self._check_arguments()
         # The orthogonal weights of a new network depend on the number of threads that make them.
-        with one_torch_thread(compiled=True):
+        with _one_thread():
             super()._setup_model()  # type: ignore[safe-super]
         if self.env is not None:
             # The statistics of a zip, which are read before this, continue in the environment.
@@ -263,51 +164,23 @@ class ExpertMixin(BaseAlgorithm):
         except RuntimeError as error:
             raise RuntimeError(f"set_parameters: {one_line(error)}") from None
 
-    def _scale_actions(self, inverse: bool = False) -> None:
-        """Rescale actions to [-1, 1] for an update, or back; see :func:`with_unit_actions`.
-
-        :param inverse: scale them back.
-        :raises ConfigError: an action space without usable limits, or an actor without a plain last
-            layer.
-        """
-        factor, offset = unit_action_transform(self.action_space, inverse)
-        if (factor == 1.0).all() and not offset.any():
-            return
-        policy = self.policy
-        buffer = self.rollout_buffer
-        buffer.expert_actions = buffer.expert_actions * factor + offset
-        if policy.squash_output:  # its actions are in [-1, 1] already
-            return
-        buffer.actions = buffer.actions * factor + offset
-        buffer.log_probs = buffer.log_probs - np.log(factor).sum()
-        scale = th.as_tensor(factor, device=policy.device)
-        unfit = f"action space {self.action_space}: wrap it in RescaleAction(env, -1, 1)"
-        with raised_as(ConfigError, unfit), th.no_grad():
-            if getattr(policy.action_dist, "use_expln", False):
-                raise ValueError("use_expln: log_std is not the log of a standard deviation")
-            policy.action_net.weight *= scale[:, None]
-            policy.action_net.bias.mul_(scale).add_(th.as_tensor(offset, device=policy.device))
-            policy.log_std += scale.log()
-
     def _note_flight_settings(self) -> None:
         settings = flight_settings_of(self.env)
         if settings is not None:
             settings.write_into(self)
-        elif hasattr(self, KEY):
-            delattr(self, KEY)  # left by an earlier environment
+        elif hasattr(self, FLIGHT_SETTINGS):
+            delattr(self, FLIGHT_SETTINGS)  # left by an earlier environment
         # BaseAlgorithm keeps them as ``_vec_normalize_env``, which is not saved.
         setattr(self, STATISTICS, self._vec_normalize_env)
 
     def learn(self, *arguments: Any, **keywords: Any) -> Self:
-        """Learn as SB3 does. While compiled networks learn, PyTorch has one thread.
+        """Learn as SB3 does. While an accelerator learns, PyTorch has one thread.
 
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
         if self.env is not None and self.will_clone():
-            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
-        policy = self.policy
-        compiled = isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy
-        with one_torch_thread(compiled):
+            self._labeller = labeller_for(self.expert, self.env, self._labeller)
+        with network_of(self.policy).learning():
             return super().learn(*arguments, **keywords)  # type: ignore[safe-super]
 
     def _labels(self, env: VecEnv) -> Float32Array:
@@ -315,9 +188,8 @@ class ExpertMixin(BaseAlgorithm):
 
         Call it before the step.
         """
-        self._labeller = Controller.for_env(self.expert, env, self._labeller)
-        with th.enable_grad():  # SB3's loops disable gradients, which an expert may need
-            return self._labeller.labels(self._last_obs, self._last_episode_starts)
+        self._labeller = labeller_for(self.expert, env, self._labeller)
+        return self._labeller.labels(self._last_obs, self._last_episode_starts)
 
     def _refuse_dict_observations(self) -> None:
         space = self.observation_space
@@ -356,33 +228,89 @@ class ExpertMixin(BaseAlgorithm):
         return [*super()._excluded_save_params(), *own, *self._not_saved]
 
 
-def unit_action_transform(
-    space: spaces.Box, inverse: bool = False
-) -> tuple[Float32Array, Float32Array]:
-    """Return factors and offsets, (a,) each, that map actions of a space to [-1, 1].
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Give PyTorch one thread for the duration of the block."""
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(threads)
 
-    :param inverse: return those that map [-1, 1] back to the space.
-    :raises ConfigError: limits so far apart that they count as unbounded.
+
+def model_of(source: BaseAlgorithm | StrPath | None) -> Any:
+    """Return the model that ``initial_policy`` is or names; None for None."""
+    if source is None or isinstance(source, BaseAlgorithm):
+        return source
+    return plugin("agent")(source)
+
+
+def copy_policy(teacher: Any, model: BaseAlgorithm, name: str = "") -> None:
+    """Give ``model`` the policy and critic of another with the same spaces and networks.
+
+    ``log_std`` is the teacher's, unless the model's ``policy_kwargs`` have a ``log_std_init``. The
+    optimiser is left as it is, so a new model starts with a new one. Statistics of VecNormalize go
+    into the model's environment.
+
+    If both say what they observe, a warning names the settings that differ.
+
+    :param teacher: a model of any algorithm.
+    :param name: what messages call the teacher.
+    :raises ConfigError: parameters that are not finite; layers that differ, which the message
+        names; or a policy that computes something else with the same layers.
     """
-    low, high = limits_of(space)
-    half = 0.5 * high - 0.5 * low
-    middle = low + half
-    if not (half < _UNLIMITED).all():
-        raise ConfigError(f"action space {space}: give it the limits of the actuators")
-    half[half == 0.0] = 1.0  # an action that cannot change
-    if inverse:
-        return half, middle
-    return 1.0 / half, -middle / half
+    name = name or f"the policy of {type(teacher).__name__}"
+    record = getattr(model, FLIGHT_SETTINGS, {})
+    if record and hasattr(teacher, FLIGHT_SETTINGS):
+        plugin("observation")(name, teacher, record)
+    theirs = dict(teacher.policy.state_dict())
+    ours = model.policy.state_dict()
+    if teacher.action_space != model.action_space:
+        raise ConfigError(
+            f"{name}: its actions are of {teacher.action_space}, here they are of"
+            f" {model.action_space}"
+        )
+    share_statistics(statistics_of(teacher), model.get_env(), training=True)
+    if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
+        raise ConfigError(f"{name}: holds parameters that are not finite")
+    # The weights of a preview that the agent did not have are zero.
+    added = 3 * len(record.get("preview") or ())
+    for key, weights in theirs.items():
+        if key in ours and weights.ndim == 2 and ours[key].shape[1] == weights.shape[1] + added:
+            theirs[key] = th.nn.functional.pad(weights, (0, added))
+    if "log_std_init" in model.policy_kwargs and "log_std" in ours:
+        theirs["log_std"] = ours["log_std"]
+    try:
+        model.policy.load_state_dict(theirs)
+    except RuntimeError as error:
+        difference = one_line(error).partition(": ")[2]
+        raise ConfigError(
+            f"{name}: environment spaces and policy_kwargs must be the same ({difference});"
+            " train takes them from it unless --conf-file is given"
+        ) from None
+    # Networks that compute something else may have parameters of the same names and shapes.
+    if teacher.observation_space != model.observation_space:
+        return
+    for _ in range(8):
+        observation = model.observation_space.sample()
+        wanted, _ = teacher.policy.predict(observation, deterministic=True)
+        actions, _ = model.policy.predict(observation, deterministic=True)
+        if not np.allclose(actions, wanted, 0.01, 0.01 * np.abs(wanted).max(), equal_nan=True):
+            raise ConfigError(
+                f"{name}: its weights give other actions here; give the policy and policy_kwargs"
+                " that it has, such as activation_fn or features_extractor_class"
+            )
 
 
-def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
-    """Return the flight settings of an environment, or None if they would not describe its agents.
+def flight_settings_of(env: VecEnv | None) -> Any:
+    """Return how an environment says that it flies, or None if that would not describe its agents.
 
     Wrappers may change rewards, and VecNormalize may be among them, since its statistics are in a
-    model's zips. None: the environment is not one of this package, or a wrapper changes
-    observations or actions, so that its agent would fly differently without the wrapper.
+    model's zips. None: the environment says nothing, or a wrapper changes observations or actions,
+    so that its agent would fly differently without the wrapper.
     """
-    if env is None or not env.has_attr(KEY):
+    if env is None or not env.has_attr(FLIGHT_SETTINGS):
         return None
     changing = (
         gymnasium.ObservationWrapper,
@@ -391,34 +319,29 @@ def flight_settings_of(env: VecEnv | None) -> FlightSettings | None:
     )
     if any(any(env.env_is_wrapped(wrapper)) for wrapper in changing):
         return None
-    settings: FlightSettings = env.get_attr(KEY, [0])[0]
-    return settings if env.observation_space.shape == (settings.observation.size,) else None
+    settings = env.get_attr(FLIGHT_SETTINGS, [0])[0]
+    if env.observation_space.shape != (settings.observation.size,):
+        return None
+    return settings
 
 
-def policy_arguments(
-    given: StrDict | None,
-    initial: BaseAlgorithm | None,
-    family: type[BaseAlgorithm],
-    log_std_init: float | None = None,
-) -> StrDict:
+def policy_arguments(given: StrDict | None, initial: Any, log_std_init: float) -> StrDict:
     """Return the ``policy_kwargs`` of a new model.
 
-    :param given: the user's arguments, which take precedence. ``log_std_init=None``: use no
-        default.
-    :param initial: the agent that the model starts from. If it belongs to the same ``family``, the
-        arguments that define what its networks compute are taken from it, such as ``net_arch`` and
-        the features extractor.
-    :param log_std_init: the default.
+    :param given: the user's arguments, which take precedence.
+    :param initial: the agent that the model starts from, or None. Of an on-policy agent, those
+        arguments are taken that define what its networks compute, such as ``net_arch`` and the
+        features extractor, and its log_std stays.
+    :param log_std_init: the default of a model that starts from scratch.
     """
     arguments: StrDict = {}
-    if isinstance(initial, family):
+    if isinstance(initial, OnPolicyAlgorithm):
         for name in _OF_NETWORKS:
             if name in initial.policy_kwargs:
                 arguments[name] = initial.policy_kwargs[name]
-    arguments |= {"log_std_init": log_std_init} | (given or {})
-    if arguments["log_std_init"] is None:
-        del arguments["log_std_init"]
-    return arguments
+    else:
+        arguments["log_std_init"] = log_std_init
+    return arguments | (given or {})
 
 
 def actor_and_critic_parameters(policy: Any) -> tuple[list[Any], list[Any]]:

@@ -14,45 +14,46 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.agents.controller import limits_of
-from sb3_quad.agents.expert_like import ExpertLike
-from sb3_quad.agents.statistics import statistics_of
-from sb3_quad.algorithms.buffers import AggregatedDataset, ExpertRolloutBuffer, sample_rows
+from sb3_quad.algorithms.buffers import (
+    AggregatedDataset,
+    Batch,
+    ExpertRolloutBuffer,
+    sample_rows,
+)
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
+    RateOrSchedule,
+    WeightOrSchedule,
     actor_and_critic_parameters,
+    model_of,
     policy_arguments,
-    unit_action_transform,
-    with_unit_actions,
 )
-from sb3_quad.algorithms.networks.gradients import (
-    Perceptrons,
-    mean_actions,
-    network_of,
-    state_values,
-)
-from sb3_quad.algorithms.networks.losses import (
-    CLONING_LOSSES,
+from sb3_quad.algorithms.controller import limits_of
+from sb3_quad.algorithms.labelling import ExpertLike, refuse_wide_actions
+from sb3_quad.algorithms.losses import (
     CloningLoss,
     Loss,
     cloning_errors,
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.algorithms.networks.perceptron import Batch
-from sb3_quad.algorithms.transfer import model_of
-from sb3_quad.base.errors import ConfigError, ExpertError, refuse_unknown
+from sb3_quad.algorithms.networks import network_of
+from sb3_quad.algorithms.statistics import statistics_of
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.validate import Count, Natural, Share, Weight, check
 
 # Observations that the critic evaluates at once after a rollout
 _VALUE_CHUNK = 16384
+# log_std never falls below this; with bc_loss="nll" alone it would collapse.
+LOG_STD_MIN = -3.0
 
 
 class DAgger(ExpertMixin, OnPolicyAlgorithm):
@@ -69,8 +70,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
     with Σw² over the weight matrices of both networks, without biases and log_std.
 
-    For any environment with a Box action space and observations that are not a Dict. Action errors
-    and log_std refer to actions scaled to [-1, 1]. Papers: https://arxiv.org/abs/1011.0686
+    For any environment with actions in a Box within [-1, 1] and observations that are not a Dict;
+    wrap others in ``gymnasium.wrappers.RescaleAction``. Papers: https://arxiv.org/abs/1011.0686
     (DAgger); the study thesis STUD-512 (this variant).
 
     A run is determined by its ``seed``: the choice of who flies, the agent's samples and the
@@ -82,10 +83,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     mean in :class:`stable_baselines3.PPO`. ``learning_rate`` and ``clip_range_vf`` can be functions
     of the remaining progress (from 1 to 0).
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). ``log_std`` begins at -2
-        unless ``policy_kwargs`` has a ``log_std_init``: the agent flies sampled actions, which
-        SB3's default of 0 would spread over the whole action space. ``log_std_init=None``: SB3's
-        default, or the initial policy's ``log_std``
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). ``log_std`` begins at -2,
+        or at the initial policy's, unless ``policy_kwargs`` has a ``log_std_init``: the agent flies
+        sampled actions, which SB3's default of 0 would spread over the whole action space
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param batch_size: Minibatch size, in pairs of the dataset; the whole dataset while it is
         smaller
@@ -94,10 +94,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     :param clip_range_vf: ε of the clipped value loss (Eq. 3.8). None: plain mean squared error
     :param ent_coef: Entropy coefficient c_H
     :param max_grad_norm: The maximum norm of the gradient, clipped separately for actor and critic,
-        so that a large error of the critic does not slow down the actor. None: no clipping
+        so that a large error of the critic does not slow down the actor
     :param expert: What labels the states: an object with ``actions(state)`` such as
         ``GeometricExpert``, another SB3 model, or a function from observations to actions;
-        :class:`~sb3_quad.agents.controller.Controller` says what each of them sees. Or a name,
+        :class:`~sb3_quad.algorithms.controller.Controller` says what each of them sees. Or a name,
         as in YAML, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
         :meth:`set_expert`, before learning continues
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
@@ -112,9 +112,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     :param beta_final: Where β stops falling
     :param bc_loss: ``"nll"`` (Eq. 3.12) also learns the standard deviation. The others compare mean
         actions only, and leave the deviation to ``log_std_init`` and ``ent_coef``: ``"mse"``, the
-        squared error; ``"huber"``, quadratic up to 0.05 and linear beyond, which is more exact
-        where the expert is smooth; ``"huber_mse"``, the same plus three times the squared error
-    :param log_std_min: log_std never falls below this; with ``"nll"`` alone it would collapse
+        squared error; ``"huber_mse"``, three times that, plus an error that is quadratic up to 0.05
+        and linear beyond, which is more exact where the expert is smooth
     :param l2_coef: c_L2
     :param dataset_capacity: Maximum number of pairs; the oldest are dropped first. 0: the current
         rollout only, as the thesis trains
@@ -134,17 +133,17 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = LinearSchedule(4e-3, 2e-4, 1.0),  # noqa: B008
-        n_steps: int = 250,
-        batch_size: int = 4096,
-        n_epochs: int = 2,
-        gamma: float = 0.998,
-        gae_lambda: float = 0.95,
-        clip_range_vf: float | Schedule | None = None,
+        learning_rate: RateOrSchedule = LinearSchedule(4e-3, 2e-4, 1.0),  # noqa: B008
+        n_steps: Count = 250,
+        batch_size: Count = 4096,
+        n_epochs: Count = 2,
+        gamma: Share = 0.998,
+        gae_lambda: Share = 0.95,
+        clip_range_vf: WeightOrSchedule | None = None,
         ent_coef: float = 0.0,
-        vf_coef: float = 0.5,
-        max_grad_norm: float | None = 0.5,
-        stats_window_size: int = 100,
+        vf_coef: Weight = 0.5,
+        max_grad_norm: Weight = 0.5,
+        stats_window_size: Count = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: StrDict | None = None,
         verbose: int = 0,
@@ -153,14 +152,13 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         *,
         expert: ExpertLike | None = None,
         initial_policy: BaseAlgorithm | StrPath | None = None,
-        gradient_steps: int | None = 60,
-        beta: float = 0.5,
-        beta_decay: float = 0.001,
-        beta_final: float = 0.3,
+        gradient_steps: Count | None = 60,
+        beta: Share = 0.5,
+        beta_decay: Weight = 0.001,
+        beta_final: Share = 0.3,
         bc_loss: CloningLoss = "mse",
-        log_std_min: float = -3.0,
-        l2_coef: float = 0.0,
-        dataset_capacity: int = 500_000,
+        l2_coef: Weight = 0.0,
+        dataset_capacity: Natural = 500_000,
         shuffle: bool = True,
         demonstrations: StrPath | None = None,
         _init_setup_model: bool = True,
@@ -175,12 +173,12 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             gae_lambda=gae_lambda,
             ent_coef=ent_coef,
             vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            max_grad_norm=max_grad_norm,
             use_sde=False,
             sde_sample_freq=-1,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -2.0),
+            policy_kwargs=policy_arguments(policy_kwargs, initial, -2.0),
             verbose=verbose,
             seed=seed,
             device=device,
@@ -196,7 +194,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.beta_decay = beta_decay
         self.beta_final = beta_final
         self.bc_loss = bc_loss
-        self.log_std_min = log_std_min
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
@@ -219,28 +216,25 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._refuse_dict_observations()
+        refuse_wide_actions(self.action_space)
         # A zip of PPO names PPO's buffer class.
         self.rollout_buffer_class = ExpertRolloutBuffer
         super()._setup_model()
         if self.beta == 0.0:
             self.beta_final = 0.0
-        if not self.beta_final <= self.beta <= 1.0:
-            raise ConfigError(f"beta {self.beta}: must be from beta_final, {self.beta_final}, to 1")
-        refuse_unknown("bc_loss", [self.bc_loss], CLONING_LOSSES)
+        if self.beta < self.beta_final:
+            raise ConfigError(f"beta {self.beta}: must be at least beta_final, {self.beta_final}")
         rollout = self.n_steps * self.n_envs
-        if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
+        least = max(rollout, self.batch_size)
+        if 0 < self.dataset_capacity < least:
             raise ConfigError(
-                f"dataset_capacity {self.dataset_capacity}: must be 0 or at least"
-                f" n_steps * n_envs = {rollout}"
+                f"dataset_capacity {self.dataset_capacity}: must be 0 or at least {least}, which is"
+                " n_steps * n_envs or batch_size"
             )
-        if self.gradient_steps is not None and self.gradient_steps < 1:
-            raise ConfigError(f"gradient_steps {self.gradient_steps}: must be at least 1, or None")
         if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
             raise ConfigError(
                 f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy"
             )
-        # A new actor acts in [-1, 1]; bring it to the units of the action space.
-        self._scale_actions(inverse=True)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         dtype = self.rollout_buffer.observations.dtype
@@ -270,9 +264,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         :raises ConfigError: a number below 0 or above 1
         """
-        if not 0.0 <= beta <= 1.0:
-            raise ConfigError(f"beta {beta}: a probability, from 0 to 1")
-        self.beta = self.beta_final = float(beta)
+        check(Share, beta, "beta")
+        self.beta = float(beta)
+        self.beta_final = self.beta
 
     def learn(
         self,
@@ -348,7 +342,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             observations = self._last_obs
             if normalize:
                 raw[step] = normalize.get_original_obs()
-            means = mean_actions(network, observations)
+            means = network.means(observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta
             actions = np.where(by_expert[step, :, None], labels, sampled)
@@ -369,7 +363,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
                 if last is not None and infos[row].get("TimeLimit.truncated"):
                     # It is as the environment returned it, perhaps an int or a tuple.
                     last = np.asarray(last, observations.dtype)[None]
-                    rewards[row] += self.gamma * state_values(network, last)[0]
+                    rewards[row] += self.gamma * network.values(last)[0]
 
             buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)
             self._last_obs = new_obs
@@ -378,9 +372,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         # + The critic does not change during a rollout, so it can evaluate many states at once.
         flown = buffer.observations.reshape(-1, *buffer.obs_shape)
         parts = np.array_split(flown, math.ceil(len(flown) / _VALUE_CHUNK))
-        values = np.concatenate([state_values(network, part) for part in parts])
+        values = np.concatenate([network.values(part) for part in parts])
         buffer.values = values.reshape(buffer.values.shape)
-        last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
+        last_values = th.from_numpy(network.values(new_obs))  # type: ignore[arg-type]
         buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
         # + Add the labels to the dataset. Without an expert, it keeps the loaded flights.
@@ -398,7 +392,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    @with_unit_actions
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
 
@@ -414,11 +407,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if callable(self.clip_range_vf):
             clip_range_vf = self.clip_range_vf(self._current_progress_remaining)
 
-        # + Compiled code computes the same gradients in less time, to rounding.
+        # + An accelerator computes the same gradients in less time, to rounding.
         network = network_of(self.policy)
-        compiled_loss = Loss(
+        whole_loss = Loss(
             bc_coef=1.0,
-            bc_loss=CLONING_LOSSES.index(self.bc_loss),
+            bc_loss=self.bc_loss,
             vf_coef=self.vf_coef,
             clip_range_vf=math.inf if clip_range_vf is None else clip_range_vf,
             ent_coef=self.ent_coef,
@@ -426,9 +419,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         )
         actor_parameters, critic_parameters = actor_and_critic_parameters(self.policy)
 
-        # + Labels in [-1, 1] and normalised observations, and rows of the dataset for the actor
-        factor, offset = unit_action_transform(self.action_space)
-        labels = self.dataset.filled["actions"] * factor + offset
+        # + Normalised observations, and rows of the dataset for the actor
         seen = self.dataset.filled["observations"]
         normalize = statistics_of(self)
         if normalize:
@@ -450,15 +441,14 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         history: History = {}
 
         for i, rows in enumerate(actor_rows.reshape(n_batches, batch_size)):
-            actor_batch = self.dataset.batch(rows)._replace(observations=seen, targets=labels)
+            actor_batch = self.dataset.batch(rows)._replace(observations=seen)
             critic_batch = None
             # Spread the critic's steps evenly.
             if (i + 1) * n_critic // n_batches > i * n_critic // n_batches:
                 critic_batch = Batch(next(critic_batches), flown, targets)
 
-            if isinstance(network, Perceptrons):  # +
-                terms = network.gradients(compiled_loss, actor_batch, critic_batch)
-            else:
+            terms = network.gradients(whole_loss, actor_batch, critic_batch)  # +
+            if terms is None:  # by PyTorch
                 observations, experts = actor_batch.tensors(self.device)
                 try:
                     entropy: Any = self.policy.get_distribution(observations).entropy()
@@ -505,7 +495,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             if not np.isfinite([*terms.values(), float(norm), float(critic_norm)]).all():  # +
                 raise self._diverged(terms)
             self.policy.optimizer.step()
-            self.policy.log_std.data.clamp_(min=self.log_std_min)  # +
+            self.policy.log_std.data.clamp_(min=LOG_STD_MIN)  # +
             self._n_updates += 1
             for name, term in terms.items():
                 history.setdefault(name, []).append(term)

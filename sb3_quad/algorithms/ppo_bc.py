@@ -1,8 +1,7 @@
 """PPO with behavioural cloning towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
 
 import math
-from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch as th
@@ -11,27 +10,25 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.agents.expert_like import ExpertLike
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
+    RateOrSchedule,
+    WeightOrSchedule,
     actor_and_critic_parameters,
+    model_of,
     policy_arguments,
-    with_unit_actions,
 )
-from sb3_quad.algorithms.networks.gradients import Perceptrons, act, network_of
-from sb3_quad.algorithms.networks.losses import (
-    BC_FILTERS,
-    CLONING_LOSSES,
+from sb3_quad.algorithms.labelling import ExpertLike, LabellingVecEnv, refuse_wide_actions
+from sb3_quad.algorithms.losses import (
     CloningFilter,
     CloningLoss,
     Loss,
@@ -40,46 +37,15 @@ from sb3_quad.algorithms.networks.losses import (
     l2_loss,
     max_clipped_value_loss,
 )
-from sb3_quad.algorithms.transfer import model_of
-from sb3_quad.base.errors import ConfigError, refuse_unknown
+from sb3_quad.algorithms.networks import Network, network_of
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.validate import Count, Natural, Share, Weight, check
 
 # By default a rollout is split into this many mini-batches, but none gets fewer than this many
 # rows.
 N_MINIBATCHES = 16
 LEAST_ROWS = 64
-
-
-class _LabellingForward:
-    """SB3's rollout loop calls the policy's ``forward`` once before each ``env.step``. This
-    replacement also labels the state there.
-    """
-
-    def __init__(self, model: "PPOBC", env: VecEnv, buffer: ExpertRolloutBuffer) -> None:
-        self._model = model
-        self._env = env
-        self._buffer = buffer
-        self._labelled = -1
-        self._stock: Any = model.policy.forward
-        self._sample = self._stock
-        network = network_of(model.policy)
-        if isinstance(network, Perceptrons):
-            self._sample = partial(act, network)
-
-    def __call__(self, observations: th.Tensor, deterministic: bool = False) -> Any:
-        buffer = self._buffer
-        # Callbacks may call the policy, too, even after the step.
-        if deterministic or buffer.full or buffer.pos == self._labelled:
-            return self._stock(observations, deterministic)
-        self._labelled = buffer.pos
-        actions, values, log_prob = self._sample(observations)
-        # Label the state before the step.
-        buffer.expert_actions[buffer.pos] = self._model._labels(self._env)
-        return actions.reshape(-1, *self._model.action_space.shape), values, log_prob
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        # If a callback copies or saves the policy, the copy has the stock forward pass.
-        return self._stock.__reduce_ex__(protocol)
 
 
 class PPOBC(ExpertMixin, PPO):
@@ -91,22 +57,25 @@ class PPOBC(ExpertMixin, PPO):
     exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is
     encouraged.
 
-    All arguments of :class:`stable_baselines3.PPO` keep their meaning. The defaults are those that
-    we recommend for hundreds of quadcopters at once and an expert that is good near its target but
-    not everywhere, such as the PID. Table A.3 of the thesis is ``zoo_configs/thesis/ppo_bc.yml``.
-    With few environments, give ``n_steps`` and ``learning_rate`` as for PPO (SB3's are 2048 and
-    3e-4).
+    The arguments of :class:`stable_baselines3.PPO` keep their meaning, but for the rollout buffer,
+    which is ours, and ``clip_range_vf``. The defaults are those that we recommend for hundreds of
+    quadcopters at once and an expert that is good near its target but not everywhere, such as the
+    PID. Table A.3 of the thesis is ``zoo_configs/thesis/ppo_bc.yml``. With few environments, give
+    ``n_steps`` and ``learning_rate`` as for PPO (SB3's are 2048 and 3e-4).
 
-    An update that adds nothing (a cloning weight and an ``l2_coef`` of 0, no ``critic_warmup``, and
-    either no ``clip_range_vf`` or ``max_clipped_value=False``) is PPO's, bit for bit. Any other
-    equals PPO's to rounding, plus the additions, and is computed faster (docs/ppo_bc.md). A saved
-    model loads with ``PPO.load``, even where this package is not installed.
+    An update that adds nothing (a cloning weight and an ``l2_coef`` of 0, no ``critic_warmup``, no
+    ``clip_range_vf``) is PPO's, bit for bit. Any other equals PPO's to rounding, plus the
+    additions, and is computed faster (docs/ppo_bc.md). A saved model loads with ``PPO.load``, even
+    where this package is not installed.
 
-    If a model clones or has cloned, action errors and log_std refer to actions scaled to [-1, 1].
+    To clone, the actions must lie within [-1, 1]: wrap other environments in
+    ``gymnasium.wrappers.RescaleAction``.
 
     :param batch_size: rows of a mini-batch. None: a 16th of the rollout, at least 64.
-    :param policy_kwargs: ``log_std_init`` is -0.9 unless it is given here. ``log_std_init=None``:
-        SB3's default, or the initial policy's ``log_std``.
+    :param clip_range_vf: ε of the clipped value loss (Eq. 3.8), the larger of the clipped and the
+        unclipped error. None: no clipping.
+    :param policy_kwargs: ``log_std_init`` is -0.916, ln 0.4, unless it is given here. With an
+        initial policy it is that policy's; give -0.916 to let it explore again.
     :param expert: what labels the visited states: an object with ``actions(state)`` on the true
         state of our environments, an SB3 model, or a callable from observations to actions; or a
         name, as in YAML, such as ``"pid"``. Needed when learning starts with a cloning weight.
@@ -117,16 +86,14 @@ class PPOBC(ExpertMixin, PPO):
         progress (SB3's ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum
         over the action's dimensions; ``"mse"``, the squared error of the policy's mean action,
-        which leaves the deviation alone; ``"huber"``, quadratic up to 0.05 and linear beyond; or
-        ``"huber_mse"``, the same plus three times the squared error.
+        which leaves the deviation alone; ``"huber_mse"``, three times that, plus an error that is
+        quadratic up to 0.05 and linear beyond.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"agreement"``, where expert and
         policy differ by less than 0.3 (root mean square over the action). An expert for small
         angles, such as the PID, then guides the agent on its way to the target, but not where the
         agent has learnt to recover and the expert would crash.
     :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std``
         are excluded.
-    :param max_clipped_value: whether the value loss is that of Eq. 3.8, the larger of the clipped
-        and the unclipped error, where ``clip_range_vf`` is given. False: PPO's clipped error.
     :param critic_warmup: for this many rollouts only the critic learns. A critic that comes from
         another task, or from another policy, would otherwise spoil the actor with its first
         advantages.
@@ -144,24 +111,22 @@ class PPOBC(ExpertMixin, PPO):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = LinearSchedule(1e-3, 5e-5, 1.0),  # noqa: B008
-        n_steps: int = 125,
-        batch_size: int | None = None,
-        n_epochs: int = 10,
-        gamma: float = 0.995,
-        gae_lambda: float = 0.98,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
+        learning_rate: RateOrSchedule = LinearSchedule(5e-4, 1e-5, 1.0),  # noqa: B008
+        n_steps: Count = 125,
+        batch_size: Count | None = None,
+        n_epochs: Count = 6,
+        gamma: Share = 0.995,
+        gae_lambda: Share = 0.98,
+        clip_range: WeightOrSchedule = 0.2,
+        clip_range_vf: WeightOrSchedule | None = None,
         normalize_advantage: bool = True,
-        ent_coef: float = 0.0,
-        vf_coef: float = 0.5,
-        max_grad_norm: float = 0.5,
+        ent_coef: float = 0.0001,
+        vf_coef: Weight = 0.5,
+        max_grad_norm: Weight = 0.5,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
-        rollout_buffer_class: type[RolloutBuffer] | None = None,
-        rollout_buffer_kwargs: StrDict | None = None,
-        target_kl: float | None = None,
-        stats_window_size: int = 100,
+        target_kl: Weight | None = None,
+        stats_window_size: Count = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: StrDict | None = None,
         verbose: int = 0,
@@ -170,12 +135,11 @@ class PPOBC(ExpertMixin, PPO):
         *,
         expert: ExpertLike | None = None,
         initial_policy: BaseAlgorithm | StrPath | None = None,
-        bc_coef: float | Schedule = 0.1,
+        bc_coef: WeightOrSchedule = 0.1,
         bc_loss: CloningLoss = "mse",
         bc_filter: CloningFilter = "agreement",
-        l2_coef: float = 0.0,
-        max_clipped_value: bool = True,
-        critic_warmup: int = 2,
+        l2_coef: Weight = 0.0,
+        critic_warmup: Natural = 4,
         shuffle: bool = True,
         _init_setup_model: bool = True,
     ):
@@ -198,12 +162,10 @@ class PPOBC(ExpertMixin, PPO):
             max_grad_norm=max_grad_norm,
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class,
-            rollout_buffer_kwargs=rollout_buffer_kwargs,
             target_kl=target_kl,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_arguments(policy_kwargs, initial, OnPolicyAlgorithm, -0.9),
+            policy_kwargs=policy_arguments(policy_kwargs, initial, -0.916),
             verbose=verbose,
             seed=seed,
             device=device,
@@ -215,27 +177,17 @@ class PPOBC(ExpertMixin, PPO):
         self.bc_loss = bc_loss
         self.bc_filter = bc_filter
         self.l2_coef = l2_coef
-        self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
         self.shuffle = shuffle
         self._n_rollouts_trained = 0
-        self._has_cloned = False
 
         if _init_setup_model:
             self._set_up(initial)
 
     def _setup_model(self) -> None:
-        refuse_unknown("bc_loss", [self.bc_loss], CLONING_LOSSES)
-        filters = [name for name in BC_FILTERS if name != "q"]
-        refuse_unknown("bc_filter", [self.bc_filter], filters)
         self._refuse_dict_observations()
         # SB3's own buffer, which a zip of PPO names, has no labels.
-        if self.rollout_buffer_class in (None, RolloutBuffer):
-            self.rollout_buffer_class = ExpertRolloutBuffer
-        if not issubclass(self.rollout_buffer_class, ExpertRolloutBuffer):
-            raise ConfigError(
-                f"rollout_buffer_class {self.rollout_buffer_class}: must be an ExpertRolloutBuffer"
-            )
+        self.rollout_buffer_class = ExpertRolloutBuffer
         if self.batch_size is None:
             n_rows = self.n_steps * self.n_envs
             n_minibatches = min(N_MINIBATCHES, max(n_rows // LEAST_ROWS, 1))
@@ -246,8 +198,6 @@ class PPOBC(ExpertMixin, PPO):
                 "PPOBC clones into a Box action space only, this environment has"
                 f" {self.action_space}"
             )
-        # A new actor acts in [-1, 1]; bring it to the units of the action space.
-        self._scale_actions(inverse=True)
         if self.expert is not None and self.will_clone():
             self._check_cloning()
 
@@ -265,22 +215,14 @@ class PPOBC(ExpertMixin, PPO):
         :raises ConfigError: a weight that is negative or not finite.
         :raises ExpertError: a weight above 0 without an expert.
         """
-        if not 0.0 <= bc_coef < math.inf:
-            raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
+        check(Weight, bc_coef, "bc_coef")
         if bc_coef > 0.0:
             self._check_cloning()
         self.bc_coef = FloatSchedule(float(bc_coef))
 
-    def _scale_actions(self, inverse: bool = False) -> None:
-        # Without a cloning term this is PPO, which does not rescale actions. A model that has
-        # cloned keeps the units in which its optimiser has stepped.
-        if self.will_clone() or self.rollout_buffer.bc_coef:
-            self._has_cloned = True
-        if isinstance(self.action_space, spaces.Box) and self._has_cloned:
-            super()._scale_actions(inverse)
-
     def _check_cloning(self) -> None:
         self._check_expert()
+        refuse_wide_actions(self.action_space)
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError(
                 "use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for"
@@ -324,13 +266,14 @@ class PPOBC(ExpertMixin, PPO):
             self._labeller = None
             return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
 
-        self.policy.forward = _LabellingForward(self, env, buffer)
-        try:
-            return super().collect_rollouts(env, callback, buffer, n_rollout_steps)
-        finally:
-            del self.policy.forward
+        def label() -> None:
+            # SB3 adds the step to the buffer after it.
+            buffer.expert_actions[buffer.pos] = self._labels(env)
 
-    @with_unit_actions  # +
+        labelling = LabellingVecEnv(env, label)
+        with network_of(self.policy).acting():
+            return super().collect_rollouts(labelling, callback, buffer, n_rollout_steps)
+
     def train(self) -> None:
         """Update the policy on the rollout just flown, as PPO does. Additions are marked ``+``.
 
@@ -353,21 +296,19 @@ class PPOBC(ExpertMixin, PPO):
             ent_coef = l2_coef = 0.0
         actor_parameters, _ = actor_and_critic_parameters(self.policy)
 
-        # + Compiled code computes the same gradients faster, to rounding. Without additions PyTorch
-        # computes them, so that the update is PPO's bit for bit.
-        own_value_loss = clip_range_vf is not None and self.max_clipped_value
-        adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
-        network: Any = network_of(self.policy) if adds else self.policy
-        compiled_loss = Loss(
+        # + An accelerator computes the same gradients faster, to rounding. Without additions
+        # PyTorch computes them, so that the update is PPO's bit for bit.
+        adds = bc_coef != 0.0 or self.l2_coef > 0.0 or clip_range_vf is not None or warming_up
+        network = network_of(self.policy) if adds else Network(self.policy)
+        whole_loss = Loss(
             policy_coef=1.0,
             clip_range=clip_range,
             normalize_advantage=self.normalize_advantage,
             bc_coef=bc_coef,
-            bc_loss=CLONING_LOSSES.index(self.bc_loss),
-            bc_filter=BC_FILTERS.index(self.bc_filter),
+            bc_loss=self.bc_loss,
+            bc_filter=self.bc_filter,
             vf_coef=self.vf_coef,
             clip_range_vf=math.inf if clip_range_vf is None else clip_range_vf,
-            max_clipped_value=self.max_clipped_value,
             ent_coef=ent_coef,
             l2_coef=l2_coef,
         )
@@ -381,9 +322,8 @@ class PPOBC(ExpertMixin, PPO):
             approx_kl_divs = []
             # Do a complete pass on the rollout buffer
             for rows in buffer.minibatches(self.batch_size, self.shuffle):  # +
-                if isinstance(network, Perceptrons):  # +
-                    terms = network.gradients(compiled_loss, *buffer.batches(rows))
-                else:
+                terms = network.gradients(whole_loss, *buffer.batches(rows))  # +
+                if terms is None:  # by PyTorch
                     rollout_data = buffer.samples(rows)
                     actions = rollout_data.actions
                     if isinstance(self.action_space, spaces.Discrete):
@@ -417,17 +357,10 @@ class PPOBC(ExpertMixin, PPO):
                     if clip_range_vf is None:
                         # No clipping
                         value_loss = F.mse_loss(returns, values)
-                    elif self.max_clipped_value:  # + Eq. 3.8
+                    else:  # + Eq. 3.8
                         value_loss = max_clipped_value_loss(
                             values, rollout_data.old_values, returns, clip_range_vf
                         )
-                    else:
-                        # Clip the difference between old and new value
-                        # NOTE: this depends on the reward scaling
-                        values_pred = rollout_data.old_values + th.clamp(
-                            values - rollout_data.old_values, -clip_range_vf, clip_range_vf
-                        )
-                        value_loss = F.mse_loss(returns, values_pred)
 
                     # Entropy loss favor exploration
                     if entropy is None:
@@ -500,7 +433,7 @@ class PPOBC(ExpertMixin, PPO):
         self._n_rollouts_trained += 1  # +
         # Logs
         history["approx_kl"] = approx_kl_divs
-        history["loss"] = [terms["loss"]]
+        history["loss"] = history["loss"][-1:]
         self._log_update(history)
         self._log_rollout(buffer, clip_range_vf)
         self.logger.record("train/clip_range", clip_range)

@@ -1,19 +1,32 @@
 """Validated data: one base class for records and settings, and one-line errors."""
 
 import json
+import math
 import re
 import typing
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PydanticUserError, TypeAdapter, ValidationError
 
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrMapping
 
 Model = TypeVar("Model", bound=BaseModel)
+# The kinds of arguments that a constructor's annotations name
+Count = Annotated[int, Field(ge=1)]
+Natural = Annotated[int, Field(ge=0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Weight = Annotated[float, Field(ge=0.0)]
+_EXPECTED = {
+    "callable": "a number or lin_<number>",
+    "float": "a number",
+    "int": "a whole number",
+}
+"""What a value must be, by the kind of pydantic's error; the first that applies."""
+_CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 class Frozen(BaseModel):
@@ -49,6 +62,51 @@ def _kind(error: ValidationError) -> type[ConfigError]:
     if not kinds and issubclass(kind, ConfigError):
         return kind
     return ConfigError
+
+
+def check_arguments(owner: type, given: StrMapping) -> None:
+    """Check arguments by the annotations of a constructor.
+
+    :param owner: the class. Names that its ``__init__`` does not have are left alone.
+    :raises ConfigError: one line names the argument, its value and what it must be.
+    """
+    for name, kind in typing.get_type_hints(owner.__init__, include_extras=True).items():  # type: ignore[misc]
+        # Infinity is no limit, as PyTorch understands it.
+        if name in given and not _is_infinite(given[name]):
+            check(kind, given[name], name, strict=True)
+
+
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, float) and value == math.inf
+
+
+def check(kind: Any, value: Any, where: str, strict: bool = False) -> Any:
+    """Return ``value`` as the type ``kind``, by pydantic.
+
+    :param strict: whether to refuse what would have to be converted, such as a number in quotes.
+    :raises ConfigError: it is of another type or out of range; the message says what it must be.
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} is {value}, must be finite")
+    try:
+        # True is not 1.
+        return TypeAdapter(kind, config=_CHECKS).validate_python(
+            value, strict=strict or isinstance(value, bool)
+        )
+    except PydanticUserError:
+        # A type that pydantic cannot check.
+        return value
+    except ValidationError as error:
+        # A union has one error for each of its types: by "int", "float", "callable", …
+        messages = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}
+    # rl_zoo3 imports classes by their names, so a string may stand for a class.
+    if isinstance(value, str) and "is" in messages:
+        return value
+    ranges = [messages[kind] for kind in ("greater", "less") if kind in messages]
+    known = [text for kind, text in _EXPECTED.items() if kind in messages]
+    # Pydantic's own messages are good enough for the others.
+    expected = [*ranges, *known, *messages.values()][0].removeprefix("Input should be ")
+    raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 
 def read_record(path: Path, model: type[Model]) -> Model:

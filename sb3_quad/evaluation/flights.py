@@ -21,8 +21,9 @@ from sb3_quad.agents.agent_settings import (
     unlike_trained,
     warn_of_observation,
 )
-from sb3_quad.agents.controller import Controller, warn_of_vehicle
 from sb3_quad.agents.resolve import resolve_expert
+from sb3_quad.algorithms.controller import Controller
+from sb3_quad.algorithms.labelling import warn_of_vehicle
 from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown, unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds

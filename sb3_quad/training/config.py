@@ -26,12 +26,11 @@ from sb3_quad.agents.pretrained import agent_path, pretrained_names
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.agents.tensors import AGENTS
 from sb3_quad.agents.zips import load_model
-from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen, check, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.simulation.settings import FlightSettings
@@ -40,7 +39,6 @@ from sb3_quad.envs.vehicles.layout import Turn, find_turn
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, first_vehicle
 from sb3_quad.training.algorithms import (
     as_list,
-    check,
     constructor_parameters,
     convert,
     get_algorithm,
@@ -398,9 +396,7 @@ def build_config(
     hyperparams = {}
     for key, value in settings.items():
         if key in parameters:
-            hyperparams[key] = convert(
-                value, parameters[key], f"{source(key)}: {key}", *LIMITS.get(key, ())
-            )
+            hyperparams[key] = convert(value, parameters[key], f"{source(key)}: {key}")
         elif key not in JOB_KEYS:
             message = unknown(f"key of {algo}", key, [*JOB_KEYS, *parameters])
             raise ConfigError(f"{source(key)}: {message}")

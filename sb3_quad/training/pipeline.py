@@ -15,7 +15,6 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, field_va
 
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import load_zip
-from sb3_quad.algorithms.offset_correction import correct_offset
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.process import StopSignals
@@ -24,6 +23,7 @@ from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.evaluation.learning_curves import read_curve
+from sb3_quad.evaluation.offset_correction import correct_offset
 from sb3_quad.training.config import (
     SETTINGS,
     TrainingConfig,

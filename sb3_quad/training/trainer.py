@@ -25,11 +25,11 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.agents.controller import Controller
-from sb3_quad.agents.statistics import STATISTICS
+from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import flight_settings_of
-from sb3_quad.algorithms.transfer import transfer_policy
+from sb3_quad.algorithms.labelling import Labeller
+from sb3_quad.algorithms.statistics import STATISTICS
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
 from sb3_quad.base.process import StopSignals
@@ -39,7 +39,7 @@ from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import instance
+from sb3_quad.training.algorithms import instance, takes_expert
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
@@ -190,16 +190,19 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
+    takes_agent = takes_expert(config.algorithm) or config.algo == "apg"
+    if job.trained_agent and takes_agent:
+        keywords["initial_policy"] = job.trained_agent
     model = _construct(config, env, keywords)
     # Query the expert once, so that it fails before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
-        Controller.for_env(keywords.get("expert"), env).labels(env.reset())
+        Labeller(keywords.get("expert"), env).labels(env.reset())
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):
         n_updates = -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
         rate.end = rate.start / n_updates
-    if job.trained_agent:
+    if job.trained_agent and not takes_agent:
         transfer_policy(job.trained_agent, model)
     # SB3 has seeded the environments with the seed of the policy.
     env.seed(seed_for("training", job.seed))

@@ -23,9 +23,9 @@ import torch
 import yaml
 from stable_baselines3.common.save_util import load_from_zip_file
 
-import sb3_quad.algorithms.offset_correction
 import sb3_quad.cli.closing
 import sb3_quad.evaluation.evaluate
+import sb3_quad.evaluation.offset_correction
 import sb3_quad.report.results_page
 import sb3_quad.sweep.run
 import sb3_quad.training.snapshots
@@ -244,7 +244,7 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
         (sb3_quad.cli.closing, "PIPELINE_EPISODES", 4),
         (sb3_quad.training.snapshots, "PAUSE", 0.1),
         # Agents that have hardly learnt crash on the way.
-        (sb3_quad.algorithms.offset_correction, "hover_offset", lambda *_, **__: np.zeros(3)),
+        (sb3_quad.evaluation.offset_correction, "hover_offset", lambda *_, **__: np.zeros(3)),
     ):
         assert hasattr(module, name)
         setattr(module, name, value)

@@ -81,7 +81,7 @@ CONF_FILE: Flags = {
 }
 SETTINGS_FLAGS: Flags = {
     "--algo": (
-        f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, sac_bc, apg, ppo, sac or td3"
+        f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, apg, ppo, sac or td3"
     ),
     "--env": (
         f"environment id ({DEFAULT_ENV}); "
@@ -153,8 +153,8 @@ def prepare(options: Namespace) -> None:
     """
     import torch
 
-    from sb3_quad.algorithms.networks.perceptron import use_one_torch_thread
     from sb3_quad.base.imports import import_packages
+    from sb3_quad.fast.perceptron import use_one_torch_thread
 
     # Environments must be registered before the settings are checked.
     import_packages(options.gym_packages, "--gym-packages")

@@ -95,6 +95,15 @@ def cost_and_gradients(
     return mean.item(), gradients[0].numpy(), gradients[1].numpy()
 
 
+def whole_cost(
+    cost: Callable[[FlownStates], th.Tensor], body_rates_coef: float
+) -> Callable[[FlownStates], th.Tensor]:
+    """Return a cost with ``body_rates_coef`` times :func:`body_rates_cost` added."""
+    if not body_rates_coef:
+        return cost
+    return lambda flown: cost(flown) + body_rates_coef * body_rates_cost(flown)
+
+
 def length(vectors: th.Tensor) -> th.Tensor:
     """Return the length of vectors (..., 3), smooth at zero."""
     return (vectors.square().sum(dim=-1) + 1e-8).sqrt()

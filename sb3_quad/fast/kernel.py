@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import float32, uint64
 
-from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
 from sb3_quad.base.compiled import compiled
 from sb3_quad.base.types import Float32Array, IntArray
+from sb3_quad.fast.losses import actor_loss, critic_loss
 
 # Rows per block: loops are long, yet a layer of 64 units and its gradients fit into half a
 # megabyte.
@@ -250,7 +250,7 @@ def gradient(
     :func:`forward`.
 
     :param targets: (m, columns), the targets of the loss in the same rows.
-    :param loss: :class:`~sb3_quad.algorithms.networks.losses.Loss`.
+    :param loss: :class:`~sb3_quad.fast.losses.Numbers`.
     :param log_std: log_std of the actions, (a,); of size 0 for a critic.
     :param sums: float32 (chunks, parameters + a), the gradient of each chunk.
     :param terms: float64 (chunks, TERMS), likewise, the terms of the loss.

@@ -16,7 +16,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_quad.agents.statistics import statistics_of
+from sb3_quad.agents.agent_settings import settings_of_model
+from sb3_quad.algorithms.statistics import statistics_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import FloatArray
@@ -48,14 +49,15 @@ def correct_offset(
     """Find μ for an agent, and fold it into its first layer after α.
 
     :param seed: seed of the flights that measure the offset.
-    :param settings: vehicle, noise and scaling that the agent flies with.
+    :param settings: vehicle, noise and scaling that the agent flies with. None: those that the
+        model was trained with, or the defaults.
     :param scale: α, above 0.
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not
         read the 18 features. It is then left unchanged.
     """
     if not scale > 0.0:
         raise ConfigError(f"scale {scale}: must be above 0; 1 leaves distances as they are")
-    own = settings or FlightSettings()
+    own = settings or settings_of_model(model) or FlightSettings()
     std = DEFAULT_STD if own.observation_std is None else np.asarray(own.observation_std)
     statistics = statistics_of(model)
     if statistics is not None:

@@ -3,13 +3,15 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_quad.algorithms.networks.kernel import (
+from sb3_quad.algorithms.buffers import Batch
+from sb3_quad.base.types import AnyArray, Float32Array, FloatArray
+from sb3_quad.fast.kernel import (
     FEW,
     LINEAR,
     RELU,
@@ -19,8 +21,7 @@ from sb3_quad.algorithms.networks.kernel import (
     for_blocks,
     gradient,
 )
-from sb3_quad.algorithms.networks.losses import TERMS, Loss
-from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, IntArray
+from sb3_quad.fast.losses import TERMS, Numbers
 
 # A mini-batch is cut into at most this many chunks. Their sums are added up in order, so that
 # results do not depend on the number of threads, to the bit.
@@ -36,27 +37,6 @@ _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
 _PASSES = {size: for_blocks(size) for size in (FEW, ROWS)}  # type: ignore[no-untyped-call]
 _NONE = np.empty(0)
 _NOT_KEPT = np.empty((0, 0), np.float32)
-
-
-class Batch(NamedTuple):
-    """A mini-batch as rows of arrays of length m, which are not copied.
-
-    :param rows: (b,).
-    :param observations: (m, ...).
-    :param targets: (m, columns), see :mod:`.losses`.
-    """
-
-    rows: IntArray
-    observations: AnyArray
-    targets: Float32Array
-
-    def tensors(self, device: th.device) -> tuple[th.Tensor, th.Tensor]:
-        """Return the observations (b, ...) and targets (b, columns)."""
-        # PyTorch gathers in a third of the time that NumPy's indexing and a copy take.
-        rows = th.from_numpy(self.rows)
-        observations = th.from_numpy(self.observations).index_select(0, rows)
-        targets = th.from_numpy(self.targets).index_select(0, rows)
-        return observations.to(device), targets.to(device)
 
 
 class Perceptron:
@@ -136,7 +116,7 @@ class Perceptron:
         self._compute(forward, n, _flat(observations), np.arange(n), out, activations)
         return out
 
-    def gradient(self, batch: Batch, loss: Loss, log_std: th.Tensor | None = None) -> FloatArray:
+    def gradient(self, batch: Batch, loss: Numbers, log_std: th.Tensor | None = None) -> FloatArray:
         """Set ``.grad`` of all parameters to the gradient of a loss.
 
         :param log_std: log_std of an actor, (a,); its gradient is set, too.
@@ -148,8 +128,6 @@ class Perceptron:
         chunks = _chunks(len(rows))
         sums = np.empty((chunks, self._size + len(stds)), np.float32)
         terms = np.empty((chunks, TERMS))
-        # Numba would compile again for an int where it had a float.
-        loss = Loss._make(map(float, loss))
         x = _flat(batch.observations)
         self._compute(gradient, len(rows), x, rows, batch.targets, loss, stds, sums, terms)
         total = self.set_gradients(sums)
@@ -259,17 +237,13 @@ def use_one_torch_thread() -> None:
 
 
 @contextmanager
-def one_torch_thread(compiled: bool) -> Iterator[None]:
-    """Call :func:`use_one_torch_thread` for the duration of the block.
-
-    :param compiled: whether there is work for perceptrons; otherwise nothing changes.
-    """
+def one_torch_thread() -> Iterator[None]:
+    """Call :func:`use_one_torch_thread` for the duration of the block."""
     global _threads, _pool
     torch_threads = th.get_num_threads()
     threads = _threads
     pool = _pool
-    if compiled:
-        use_one_torch_thread()
+    use_one_torch_thread()
     try:
         yield
     finally:

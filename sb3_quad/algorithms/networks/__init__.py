@@ -1,1 +1,0 @@
-"""Networks that train faster than layer by layer, with the same results."""
