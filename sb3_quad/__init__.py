@@ -1,5 +1,5 @@
-"""Quadcopter environments, experts, DAgger, PPO and SAC with behavioural cloning, and training by
-the gradient of the model, for Stable-Baselines3.
+"""Quadcopter environments, experts, DAgger, PPO with behavioural cloning, and training by the
+gradient of the model, for Stable-Baselines3.
 """
 
 import signal
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from sb3_quad.algorithms.apg import APG
     from sb3_quad.algorithms.dagger import DAgger
     from sb3_quad.algorithms.ppo_bc import PPOBC
-    from sb3_quad.algorithms.sac_bc import SACBC
     from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
     from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 __all__ = [
     "APG",
     "PPOBC",
-    "SACBC",
     "DAgger",
     "GeometricExpert",
     "PIDExpert",
@@ -63,7 +61,6 @@ _LAZY = {
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
     "QuadcopterGymVectorEnv": "sb3_quad.envs.gym_vector",
-    "SACBC": "sb3_quad.algorithms.sac_bc",
     "compare": "sb3_quad.evaluation.compare",
     "env_kwargs": "sb3_quad.agents.agent_settings",
     "fly": "sb3_quad.evaluation.flights",

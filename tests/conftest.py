@@ -48,7 +48,6 @@ TINY = [
 HYPERPARAMS = {
     "dagger": ["n_steps:50", "gradient_steps:2", "batch_size:64"],
     "ppo_bc": ["n_steps:50", "n_epochs:2", "batch_size:400", "critic_warmup:0"],
-    "sac_bc": ["learning_starts:100", "buffer_size:2000", "batch_size:64", "gradient_steps:2"],
 }
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from stable_baselines3 import A2C, PPO, SAC
 
-from sb3_quad import APG, PPOBC, SACBC, DAgger, QuadcopterVecEnv
+from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv
 from sb3_quad.agents.zips import load_model, load_zip
 from sb3_quad.base.errors import ConfigError
 
@@ -18,11 +18,9 @@ MAKERS = {
     PPOBC: {**SHORT, "expert": "pid"},
     APG: {"n_steps": 20, "seed": 0, "device": "cpu"},
     SAC: SMALL,
-    SACBC: {**SMALL, "expert": "pid", "bc_coef": 0.5},
 }
-VALUE_BASED = (SAC, SACBC)
-LOADERS = [PPO, DAgger, PPOBC, APG, SAC, SACBC]
-OURS = (DAgger, PPOBC, APG, SACBC)
+LOADERS = [PPO, DAgger, PPOBC, APG, SAC]
+OURS = (DAgger, PPOBC, APG)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +43,7 @@ def keywords_of(loader, **keywords):
 
 
 def is_of_its_kind(made, loader):
-    return (made.partition(" ")[0] in ("SAC", "SACBC")) == (loader in VALUE_BASED)
+    return (made == "SAC") == (loader is SAC)
 
 
 MADE = [*(algorithm.__name__ for algorithm in MAKERS), "PPOBC then PPO", "DAgger then PPO"]
@@ -92,7 +90,7 @@ def test_custom_objects_replace_what_a_zip_holds(zips, made, loader):
     model = loader.load(zips / made, custom_objects=objects, **keywords_of(loader))
     assert model.lr_schedule(0.3) == 1e-5
     model.learn(80, reset_num_timesteps=False)
-    if "bc_coef" in vars(model) and made.startswith(("PPOBC", "SACBC")) and loader in OURS:
+    if "bc_coef" in vars(model) and made.startswith("PPOBC") and loader in OURS:
         assert loader in (DAgger, APG) or model.bc_coef(0.3) == 0.25
 
 
@@ -110,7 +108,7 @@ def test_parameters_are_taken_or_refused(zips, made, loader):
         assert th.equal(tensor, model.policy.state_dict()[name])
 
 
-@pytest.mark.parametrize("algorithm", [DAgger, PPOBC, SACBC])
+@pytest.mark.parametrize("algorithm", [DAgger, PPOBC])
 def test_parameters_of_other_layers_are_refused_in_one_line(algorithm):
     one = algorithm("MlpPolicy", QuadcopterVecEnv(2), device="cpu")
     other = algorithm(
@@ -147,7 +145,6 @@ RARE = {
         (SAC, RARE),
         (DAgger, {**NUMBERS, **OWN, "beta": np.float32(0.5)}),
         (PPOBC, {**NUMBERS, **OWN, "bc_coef": np.float32(0.1)}),
-        (SACBC, {**RARE, **OWN, "bc_coef": np.float32(0.1), "train_freq": np.int64(1)}),
     ],
 )
 def test_numbers_of_numpy_do_not_keep_a_zip_from_being_read(algorithm, keywords, tmp_path):
@@ -177,14 +174,13 @@ def test_what_is_no_number_is_named(name, value):
 
 @pytest.mark.parametrize(
     ("algorithm", "keywords"),
-    [(SACBC, {"bc_coef": "x"}), (DAgger, {"beta": "x"})],
+    [(PPOBC, {"bc_coef": "x"}), (DAgger, {"beta": "x"})],
 )
 def test_what_is_no_number_is_named_by_all(algorithm, keywords):
     with pytest.raises(ConfigError, match="'x': must be a number"):
         algorithm("MlpPolicy", QuadcopterVecEnv(2), **keywords)
 
 
-@pytest.mark.parametrize("algorithm", [DAgger, SACBC])
-def test_a_batch_of_more_rows_than_are_kept_is_refused(algorithm):
+def test_a_batch_of_more_rows_than_are_kept_is_refused():
     with pytest.raises(ConfigError, match="batch_size 1000000000"):
-        algorithm("MlpPolicy", QuadcopterVecEnv(2), batch_size=10**9)
+        DAgger("MlpPolicy", QuadcopterVecEnv(2), batch_size=10**9)

@@ -8,7 +8,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from sb3_quad import PPOBC, SACBC, DAgger
+from sb3_quad import PPOBC, DAgger
 from sb3_quad.agents.controller import Controller
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError
 from sb3_quad.envs.simulation.state import STATE_SIZE, QuadcopterState
@@ -59,7 +59,6 @@ def test_the_true_state_is_collected_from_single_environments():
     [
         (DAgger, {"n_steps": 8}),
         (PPOBC, {"n_steps": 8, "batch_size": 16, "bc_coef": 1.0}),
-        (SACBC, {"bc_coef": 1.0}),
     ],
 )
 def test_an_expert_by_name_is_made_for_the_vehicle_of_the_environments(algorithm, settings):

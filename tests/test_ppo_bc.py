@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium.wrappers import TransformObservation
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNorma
 
 from sb3_quad import load_pretrained
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.algorithms import PPOBC, SACBC, DAgger, offset_correction
+from sb3_quad.algorithms import PPOBC, DAgger, offset_correction
 from sb3_quad.algorithms.networks.losses import CLONING_LOSSES
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
@@ -235,7 +235,7 @@ class Raised(BaseFeaturesExtractor):
         return 2.0 * observations + 1.0
 
 
-@pytest.mark.parametrize(("teacher", "algorithm"), [(PPO, PPOBC), (PPO, DAgger), (SAC, SACBC)])
+@pytest.mark.parametrize(("teacher", "algorithm"), [(PPO, PPOBC), (PPO, DAgger)])
 def test_an_initial_policy_hands_on_how_its_networks_compute(teacher, algorithm):
     settings = {"net_arch": [8], "features_extractor_class": Raised}
     agent = teacher("MlpPolicy", "Pendulum-v1", policy_kwargs=settings, seed=0, device="cpu")
@@ -453,7 +453,7 @@ def test_by_default_a_rollout_is_16_mini_batches_or_fewer_of_64_rows(n_envs, n_s
 
 @pytest.mark.parametrize(
     ("algorithm", "given"),
-    [(PPOBC, {"expert": swing_back}), (DAgger, {"expert": swing_back}), (SACBC, {})],
+    [(PPOBC, {"expert": swing_back}), (DAgger, {"expert": swing_back})],
 )
 def test_learn_takes_sb3s_arguments_by_position(algorithm, given, tmp_path):
     model = algorithm("MlpPolicy", "Pendulum-v1", tensorboard_log=str(tmp_path), **given)
@@ -465,8 +465,7 @@ def test_learn_takes_sb3s_arguments_by_position(algorithm, given, tmp_path):
 
     assert model.learn(200, callback, 4, "run", True, False) is model
     assert len(seen) == 3 and [path.name for path in tmp_path.iterdir()] == ["run_1"]
-    stock = {PPOBC: PPO, DAgger: PPO, SACBC: SAC}[algorithm]
-    theirs, ours = (inspect.signature(each.learn).parameters for each in (stock, algorithm))
+    theirs, ours = (inspect.signature(each.learn).parameters for each in (PPO, algorithm))
     assert [*theirs] == [*ours]
     for name, parameter in theirs.items():
         assert ours[name].kind == parameter.kind
@@ -597,7 +596,7 @@ def test_zips_say_how_their_agent_flies_where_wrappers_leave_the_flight_alone(tm
     assert flights_of(DAgger("MlpPolicy", single))["vehicle"]["name"] == settings.vehicle.name
 
     plain = QuadcopterVecEnv(2)
-    assert flights_of(SACBC("MlpPolicy", plain))["observation_mean"] is None
+    assert flights_of(PPOBC("MlpPolicy", plain))["observation_mean"] is None
     for stacked in (VecFrameStack(plain, 2), VecNormalize(VecFrameStack(plain, 2))):
         assert flights_of(PPOBC("MlpPolicy", stacked)) is None
     normalised = PPOBC("MlpPolicy", VecNormalize(plain))

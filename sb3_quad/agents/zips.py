@@ -39,7 +39,6 @@ _FAMILIES = {
 _OURS = {
     "PPOBC": ("PPO", "bc_coef"),
     "DAgger": ("PPO", "beta"),
-    "SACBC": ("SAC", "bc_coef"),
     "APG": ("PPO", "continue_flights"),
 }
 # ``predict`` needs only these of an agent's pickles.
@@ -101,7 +100,7 @@ def _open(file: Any, where: str) -> zipfile.ZipFile:
 def saved_algorithm(path: StrPath) -> str:
     """Return the name of the algorithm that made an SB3 ``.zip``.
 
-    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, SACBC, DAgger or APG of this package. A zip does not
+    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, DAgger or APG of this package. A zip does not
     name its algorithm; the policy class and the settings in it tell which one it is.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an

@@ -253,7 +253,7 @@ def check_policy(policy: Any, where: str) -> None:
         names = " with ".join(kind.__name__ for kind in kinds if kind is not type(None))
         raise ConfigError(
             f"{where}: its policy is {names}; "
-            "only MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC, TD3) will do, "
+            "only MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, TD3) will do, "
             "without a features extractor of its own"
         )
 

@@ -62,7 +62,7 @@ def export_policy(
     n_observations: int = N_OBSERVATIONS,
     half: bool = False,
 ) -> Export:
-    """Export an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC, APG; ``MlpPolicy``) as a
+    """Export an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, APG; ``MlpPolicy``) as a
     self-contained policy file.
 
     The file takes the features of an observation in physical units, see

@@ -26,7 +26,6 @@ from sb3_quad.base.types import StrDict
 ALGORITHMS = {
     "dagger": "sb3_quad.algorithms.dagger:DAgger",
     "ppo_bc": "sb3_quad.algorithms.ppo_bc:PPOBC",
-    "sac_bc": "sb3_quad.algorithms.sac_bc:SACBC",
     "apg": "sb3_quad.algorithms.apg:APG",
     "ppo": "stable_baselines3.ppo.ppo:PPO",
     "sac": "stable_baselines3.sac.sac:SAC",

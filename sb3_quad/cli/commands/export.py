@@ -44,7 +44,7 @@ from sb3_quad.cli.parser import (
 FLAGS: Flags = {
     "model MODEL": (
         agent_path,
-        "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC, SACBC or TD3): "
+        "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     ),
     "--format": ({"required": True}, "onnx, torchscript, c, crazyflie, px4 or safetensors"),
