@@ -12,7 +12,6 @@ import argparse
 from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 from rich.console import Console
 
 from sb3_quad import load_vehicle
@@ -49,6 +48,8 @@ def main():
     vehicle = load_vehicle(arguments.vehicle)
     logs = [log for log in read_logs(arguments.folder, STEP) if log.flying.any()]
     fitted, judged = split(logs, arguments.leave_out)
+    if len(fitted) < 2:
+        raise SystemExit(f"{arguments.folder}: two flights, or more, must be left to fit")
     print("fitted:", ", ".join(log.path.stem for log in fitted))
     print("judged:", ", ".join(log.path.stem for log in judged))
     console = Console(width=160)
@@ -83,18 +84,15 @@ def state_of(motion):
     return QuadcopterState(motion.T)
 
 
-def columns_of(log, names):
-    """Return further columns of a log's file, (n, names), which follow the clock of the vehicle."""
-    table = pd.read_csv(log.path)
-    grid = table["t"].iloc[0] + STEP * np.arange(len(log.motion)) + log.offset
-    return np.stack([np.interp(grid, table["t"], table[name]) for name in names], axis=1)
-
-
 def run_of(log):
     """Return commands and response of a log's flight."""
     rows = longest_flight(log)
-    force = 9.81 * columns_of(log, ["imu_acc_z"])[rows, 0]
-    response = np.column_stack([state_of(log.motion[rows]).body_rates, force])
+    state = state_of(log.motion[rows])
+    acceleration = np.gradient(state.velocity, STEP, axis=0)
+    acceleration[:, 2] += 9.81
+    # The specific force along the body's z axis, which an accelerometer would show.
+    force = np.einsum("nj,nj->n", state.rotation[:, :, 2], acceleration)
+    response = np.column_stack([state.body_rates, force])
     return Run(log.thrusts[rows] @ SIDES.T, response)
 
 
@@ -190,11 +188,10 @@ def fit(logs, vehicle, names=FITTED, iterations=4):
         step = np.linalg.solve(sum(squares), sum(products))
         parts = []
         for one, other in zip(squares, products, strict=True):
-            if len(logs) > 1:
-                parts.append(np.linalg.solve(sum(squares) - one, sum(products) - other))
+            parts.append(np.linalg.solve(sum(squares) - one, sum(products) - other))
         step = np.clip(step, -0.5, 0.5)
         vehicle = scaled(vehicle, dict(zip(names, np.exp(step), strict=True)))
-    spread = 1.96 * np.sqrt((len(logs) - 1) * np.var(parts, axis=0)) if parts else None
+    spread = 1.96 * np.sqrt((len(logs) - 1) * np.var(parts, axis=0))
     return vehicle, spread
 
 

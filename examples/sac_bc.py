@@ -22,7 +22,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.utils import LinearSchedule, polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
@@ -230,7 +230,7 @@ def quadcopter(timesteps: int, seed: int) -> SACBC:
         batch_size=1024,
         gamma=0.995,
         tau=0.01,
-        learning_rate=1e-3,
+        learning_rate=LinearSchedule(1e-3, 5e-5, 1.0),
         ent_coef="auto_0.005",
         target_entropy=-4.0,
         policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},
@@ -246,7 +246,7 @@ def quadcopter(timesteps: int, seed: int) -> SACBC:
     return model
 
 
-TASKS = {"pendulum": (pendulum, 3_200), "quadcopter": (quadcopter, 600_000)}
+TASKS = {"pendulum": (pendulum, 8_000), "quadcopter": (quadcopter, 600_000)}
 
 
 def main() -> None:
@@ -255,7 +255,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("task", choices=TASKS)
-    parser.add_argument("--timesteps", type=int, help="3,200 (pendulum), 600,000 (quadcopter)")
+    parser.add_argument("--timesteps", type=int, help="8,000 (pendulum), 600,000 (quadcopter)")
     parser.add_argument("--seed", type=int, default=0, help="of the training (%(default)s)")
     parser.add_argument("--output", help="where the agent goes (sac_bc_TASK.zip)")
     arguments = parser.parse_args()

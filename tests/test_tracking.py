@@ -1,0 +1,59 @@
+"""What of a training TensorBoard and Weights & Biases are shown; the second in its offline mode,
+where it is installed.
+"""
+
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import HYPERPARAMS, TINY
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+
+from sb3_quad.cli import main
+
+TRAIN = ["train", "--algo", "dagger", *TINY, "--hyperparams", *HYPERPARAMS["dagger"]]
+
+
+def hyperparameters(folder):
+    """What TensorBoard shows under HPARAMS: the settings by name."""
+    data = EventAccumulator(str(folder)).Reload().PluginTagToContent("hparams")
+    start = HParamsPluginData.FromString(data["_hparams_/session_start_info"])
+    return {
+        name: getattr(value, value.WhichOneof("kind"))
+        for name, value in start.session_start_info.hparams.items()
+    }
+
+
+def test_tensorboard_has_the_hyperparameters_and_the_evaluations(tmp_path):
+    folders = ["-f", str(tmp_path / "logs"), "-tb", str(tmp_path / "tb")]
+    assert main([*TRAIN, *folders, "--seed", "3"]) == 0
+    (folder,) = (tmp_path / "tb").iterdir()
+    values = hyperparameters(folder)
+    assert (values["algo"], values["seed"], values["n_steps"]) == ("dagger", 3, 50)
+    assert len(EventAccumulator(str(folder)).Reload().Scalars("eval/success_rate")) == 2
+
+
+def test_tracking_says_what_it_needs(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert main([*TRAIN, "-f", str(tmp_path / "logs"), "--track"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--track" in line and "[track]" in line and not [*tmp_path.iterdir()]
+
+
+@pytest.mark.slow
+def test_weights_and_biases_has_settings_and_evaluations(tmp_path, monkeypatch, capsys):
+    wandb = pytest.importorskip("wandb", reason="needs wandb, the extra [track]")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    assert main([*TRAIN, "--track", "--wandb-project-name", "quads", "--seed", "3"]) == 0
+    assert capsys.readouterr().err.count("eval/mean_reward") == 2  # history and summary
+    (events,) = Path("wandb").glob("offline-run-*/files/runs/*/events.*")
+    assert hyperparameters(events.parent)["seed"] == 3
+
+    def refuse(**settings):
+        raise wandb.errors.UsageError("no key,\nsee wandb login")
+
+    monkeypatch.setattr(wandb, "init", refuse)
+    assert main([*TRAIN, "--track", "-f", "refused"]) == 2
+    assert "--track" in capsys.readouterr().err.splitlines()[-1] and not Path("refused").exists()
