@@ -1,4 +1,4 @@
-"""Our environments in Stable-Baselines3's checker, and in the example of its page Getting Started."""
+"""Our environments in Stable-Baselines3's checker, and in its example Getting Started."""
 
 import warnings
 
