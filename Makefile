@@ -112,7 +112,7 @@ notebooks: $(INSTALLED)
 docs-links: $(DOCS_INSTALLED)
 	$(SPHINX) -b linkcheck docs build/links $(ARGS)
 
-# RAPTOR's policy, in robustness.png, comes with the extra [raptor], films with [video]; dev has both.
+# Films come with the extra [video], which dev has.
 pictures: $(INSTALLED)
 	$(PY) docs/pictures.py $(ARGS)
 
@@ -160,7 +160,7 @@ $(PY):
 		echo "$(PYTHON) cannot make virtual environments; its venv package is missing (Debian: python3-venv)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-# What comes without a wheel is built by setuptools (this package) or hatchling (foundation-policy).
+# What comes without a wheel is built by setuptools, as this package is.
 # An environment that another checkout has installed itself into is used as it is: it would point here from then on.
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 	@owner=$$(cat $@ 2>/dev/null || true); \
@@ -168,7 +168,7 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 		echo "$(VENV) is that of $$owner, and is used as it is"; \
 	else \
 		echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."; \
-		$(INSTALL) setuptools hatchling && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
+		$(INSTALL) setuptools && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
 	fi
 
 # Simulators of others, without this package: they fly its exported files.

@@ -1,4 +1,7 @@
-r"""Make the pictures of the pages anew, each by the commands that stand beside its name.
+r"""Make pictures of the pages anew, each by the commands that stand beside its name.
+
+Scripts drew adaptive_times.png, cloning.png, learning_speed.png and robustness.png; commit 5e3ee3c0
+is the last that has them, in its folder of examples.
 
     make pictures                       # those that need no training
     make pictures ARGS="starts.png"     # only these
@@ -78,16 +81,6 @@ sb3-quad evaluate PID=pid geometric "imitation agent=itm-imitation" "RL agent=it
     --suite robustness --scenario starts -o starts
 cp starts/figures/starts_0_success.png starts.png
 """,
-    "adaptive_times.png": """
-python examples/adaptive_scaling.py PID=pid IL-agent=thesis-imitation RL-agent=thesis-recovery
-    -o adaptive_times.png
-""",
-    "robustness.png": """
-sb3-quad evaluate PID=pid geometric "RL agent=itm-recovery" itm-robust RAPTOR=raptor:Raptor
-    --suite robustness --scenario mass constant_force motor_gain delay noise wandering_gusts
-    --no-report -o robustness
-python examples/robustness_plot.py robustness robustness.png
-""",
 }
 # The committed ones were drawn when the trainings ran. Since then, only their colours have changed,
 # and those of the printed recipe were cut to three rows.
@@ -138,14 +131,6 @@ sb3-quad plot "PPO only, on recoveries=printed_ppo/ppo_bc/QuadStateRecovery-v0_1
 sb3-quad plot "PPO only, on targets=printed_ppo/ppo_bc/QuadTargetTracking-v0_1"
     --thesis target_tracking --show survival reward -o reference_tracking_curves.png
 """,
-    "cloning.png": """
-sb3-quad train --algo dagger --env QuadTargetTracking-v0 -n 240000
-sb3-quad sweep cloning
-python examples/cloning_plot.py logs/sweep/cloning_1/results.csv cloning.png
-""",
-    "learning_speed.png": """
-python examples/learning_speed.py --cpu-seconds 45 learning_speed.csv learning_speed.png
-""",
 }
 PICTURES = SHORT | LONG
 
@@ -167,13 +152,11 @@ def run(words: list[str]) -> None:
     if program == "frame":
         frame(BUILD / arguments[0], int(arguments[1]), BUILD / arguments[2])
         return
-    if arguments[0].startswith("examples/"):
-        arguments[0] = str(ROOT / arguments[0])
     if program == "sb3-quad":
         arguments = ["-m", "sb3_quad.cli", *arguments]
         if words[1] in ("enjoy", "plot"):
             arguments.append("--overwrite")
-    paths = [str(ROOT), str(ROOT / "examples"), os.environ.get("PYTHONPATH", "")]
+    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
     subprocess.run([sys.executable, *arguments], cwd=BUILD, env=environment, check=True)
 

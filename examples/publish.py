@@ -6,34 +6,24 @@ The card holds measured metrics, the command that trained the policy, seed and v
         --name my-agent
     python examples/publish.py logs/ppo/QuadStateRecovery-v0_2/best_model.zip --name other \
         --command "my.py" -o published
-    python examples/publish.py itm-recovery --name itm-recovery --hub
-    python examples/publish.py itm-recovery --name itm-recovery --push somebody/itm-recovery
 
 The zip contains only the weights and plain numbers, so that other versions of Stable-Baselines3 can
 read it, too. For the card the policy flies fresh episodes: 3,840 recoveries, 960 targets at each of
 10, 15 and 20 m, and 960 figures of eight. The run folder says how it was trained; the card calls
 anything else "not recorded". The agents of the package were made in this way.
 
-With --hub you get a folder NAME in the layout of huggingface_sb3: the card as README.md with
-metadata, the zip and its content, config.json and results.json, whose rewards are those of the
-agent's own task. --push also uploads it to the Hugging Face Hub, after `pip install
-huggingface-hub` and `hf auth login`.
+To share it on the Hugging Face Hub, put both files into a folder, the card as README.md, and run
+`hf upload USER/REPO FOLDER`.
 """
 
 import argparse
-import datetime
 import io
-import json
 import sys
-import zipfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import jinja2
-import stable_baselines3
-import yaml
 from stable_baselines3 import PPO
 
 from sb3_quad.agents.agent_settings import agent_settings
@@ -41,11 +31,9 @@ from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
-from sb3_quad.base.imports import require
-from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli import app
-from sb3_quad.cli.parser import OVERWRITE, SWITCH, TRUST, Flags, positive
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, positive
 from sb3_quad.envs.simulation.frames import ObservationSettings
 from sb3_quad.envs.simulation.settings import FlightSettings, in_words
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
@@ -96,12 +84,6 @@ FLAGS: Flags = {
         "the command that trained it (command.txt of the run)",
     ),
     "--episodes N": (positive, 960, "episodes of each task (960; recoveries: 4 times as many)"),
-    "--hub": (
-        SWITCH,
-        False,
-        "lay out a folder NAME as huggingface_sb3 does, instead of the two files",
-    ),
-    "--push USER/REPO": "also upload that folder to the Hugging Face Hub",
     **TRUST,
     **OVERWRITE,
 }
@@ -114,18 +96,9 @@ def run(options: argparse.Namespace) -> int:
             f"--name {options.name!r}: letters, digits and, between them, '_', '.' and '-'; "
             "folders are for -o"
         )
-    # Ask for the Hub's package before the flights, which take a minute.
-    api = None
-    if options.push:
-        api = require("huggingface_hub", "", "--push").HfApi()
-    for_hub = bool(options.hub or options.push)
     folder = Path(options.folder)
-    card_name = f"{options.name}.md"
-    if for_hub:
-        folder = folder / options.name
-        card_name = "README.md"
     zip_file = folder / f"{options.name}.zip"
-    card_file = folder / card_name
+    card_file = folder / f"{options.name}.md"
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)
     settings, source = agent_settings(options.model)
@@ -140,32 +113,17 @@ def run(options: argparse.Namespace) -> int:
         **settings.in_any_task(),
         "vehicle": load_vehicle(settings.vehicle),
     }
-    with (
-        ExitStack() as last,
-        replacing(zip_file) as zip_stream,
-        replacing(card_file) as card_stream,
-    ):
+    # Both files are written, or none.
+    with replacing(zip_file) as zip_stream, replacing(card_file) as card_stream:
         zip_stream.write(content)
         zip_stream.flush()
         flown = measure(load_model(zip_stream.name), options.episodes, **how)
         rows = {name: summarise(flights) for name, flights in flown.items()}
         text = write_card(options.name, rows, options.made_by or command, facts, how)
-        metadata = ""
-        files: dict[str, bytes] = {}
-        if for_hub:
-            metadata, files = hub_layout(options.name, content, settings.task, flown)
-        card_stream.write(f"{metadata}{text}".encode())
-        # Hold signals back, so that all files are replaced or none.
-        signals = last.enter_context(StopSignals())
-        for member, data in files.items():
-            last.enter_context(replacing(folder / member)).write(data)
+        card_stream.write(text.encode())
     print(text)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
-    if api is not None and not signals.exit_code:
-        api.create_repo(repo_id=options.push, exist_ok=True)
-        message = f"Add {options.name}"
-        print(api.upload_folder(repo_id=options.push, folder_path=folder, commit_message=message))
-    return signals.exit_code
+    return 0
 
 
 def _origin(model: Path) -> tuple[str, dict[str, str]]:
@@ -259,53 +217,6 @@ def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Flights]
     how = {**settings, "task_kwargs": task, "reference": {"curve": "figure_eight", "speed": 2.0}}
     rows[FIGURE_EIGHT] = fly(policy, "target_tracking", n_episodes, seed_for("card", 8), **how)
     return rows
-
-
-def hub_layout(
-    name: str, content: bytes, task: Any, flown: Mapping[str, Flights]
-) -> tuple[str, dict[str, bytes]]:
-    """Return the metadata that huggingface_sb3 puts before a card, and its further files by path.
-
-    :param content: bytes of the zip, whose members are also unpacked in a folder ``name``.
-    :param task: task of the agent; if there are several, the recovery counts.
-    :param flown: result of :func:`measure`.
-    """
-    env_id = "QuadStateRecovery-v0"
-    row = RECOVERY
-    if task == "target_tracking":
-        env_id = "QuadTargetTracking-v0"
-        row = next(iter(TARGETS))
-    rewards = flown[row].reward
-    mean = float(rewards.mean())
-    std = float(rewards.std())
-    metric = {
-        "type": "mean_reward",
-        "value": f"{mean:.2f} +/- {std:.2f}",
-        "name": "mean_reward",
-        "verified": False,
-    }
-    kind = "reinforcement-learning"
-    dataset = {"name": env_id, "type": env_id}
-    result = {"task": {"type": kind, "name": kind}, "dataset": dataset, "metrics": [metric]}
-    metadata = {
-        "library_name": "stable-baselines3",
-        "tags": [env_id, "deep-reinforcement-learning", kind, "stable-baselines3"],
-        "model-index": [{"name": "PPO", "results": [result]}],
-    }
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        files = {f"{name}/{member}": archive.read(member) for member in archive.namelist()}
-    config = json.loads(files[f"{name}/data"])
-    config["system_info"] = stable_baselines3.get_system_info(print_info=False)[0]
-    results = {
-        "mean_reward": mean,
-        "std_reward": std,
-        "is_deterministic": True,
-        "n_eval_episodes": len(rewards),
-        "eval_datetime": datetime.datetime.now().isoformat(),
-    }
-    files["config.json"] = json.dumps(config).encode()
-    files["results.json"] = json.dumps(results).encode()
-    return f"---\n{yaml.safe_dump(metadata, sort_keys=False)}---\n\n", files
 
 
 def write_card(

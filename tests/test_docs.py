@@ -2,7 +2,6 @@
 
 import json
 import re
-import runpy
 import shlex
 import shutil
 import sys
@@ -184,22 +183,6 @@ def test_a_page_gives_what_it_says(page, capsys):
     scope = run(page)
     scope["printed"] = capsys.readouterr().out
     CHECKS[page](scope)
-
-
-@pytest.mark.slow
-def test_pages_and_examples_train_the_same_agents_and_show_the_same(monkeypatch):
-    """The test above trains one of them in full. After three rollouts the actor has learnt, too."""
-    trained = shorten_trainings(monkeypatch, rollouts=3)
-    shown = {}
-    for page in ("README.md", "docs/ppo_bc.md"):
-        scope, shown[page] = run(page), shown_output(page)
-    assert scope["agent"].num_timesteps == 3 * 60_000 + 60_000  # the second page continues
-    del trained[4:]
-    for script in (["train_dagger.py"], ["train_ppo_bc.py", "dagger.zip"]):
-        monkeypatch.setattr(sys, "argv", script)
-        runpy.run_path(str(ROOT / "examples" / script[0]), run_name="__main__")
-    assert trained[:2] == trained[2:4] == trained[4:]
-    assert shown["README.md"] == shown["docs/ppo_bc.md"]
 
 
 def test_exceptions_and_checks_belong_to_pages():

@@ -213,22 +213,6 @@ def test_wrong_observations_and_gains_raise():
         PIDExpert(kp=-1)
 
 
-def test_the_readings_of_the_thesis_contain_ours_and_agree_near_level():
-    from thesis_readings import PIDReading, zyx_body
-
-    rng = np.random.default_rng(0)
-    flying = QuadcopterVecEnv(300, task="state_recovery", noise=0.0, seed=0)
-    flying.reset()
-    state = flying.true_state()
-    np.testing.assert_array_equal(zyx_body("itm").actions(state), PIDExpert().actions(state))
-    state.array[QUATERNION] = np.vstack([np.ones(300), 1e-4 * rng.normal(size=(3, 300))])
-    ours = PIDExpert().actions(state)
-    for order in ("zyx", "zxy", "xyz"):
-        np.testing.assert_allclose(
-            PIDReading("itm", order, "world").actions(state), ours, atol=0.02
-        )
-
-
 def some_states(n=64):
     random = np.random.default_rng(2)
     array = np.zeros((STATE_SIZE, n))

@@ -33,14 +33,6 @@ def test_curves_are_those_of_a_reference(curve):
     np.testing.assert_allclose(motion, table[:, :9], atol=2e-3)
 
 
-def test_another_curve_is_refused():
-    from flights import make_curve
-
-    for name in ("square_2", "circle", "circle_0", "circle_-1"):
-        with pytest.raises(SystemExit, match="must be figure_eight or circle"):
-            make_curve(name)
-
-
 def test_an_exported_agent_sees_a_curve_as_it_does_in_training(tmp_path, monkeypatch):
     pytest.importorskip("onnxruntime")
     import flights

@@ -354,7 +354,6 @@ def test_a_pipeline_of_an_older_version_keeps_its_finished_stages(tmp_path, job,
         [],
         ["--thesis"],
         ["--algo", "dagger"],
-        ["--conf-file", "value_based/two_stage.yml"],
     ],
 )
 def test_files_in_the_working_folder_do_not_replace_the_packages(

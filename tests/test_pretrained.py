@@ -5,15 +5,12 @@ import importlib.util
 import io
 import json
 import pickle
-import sys
-import types
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import publish
 import pytest
-import yaml
 from stable_baselines3 import PPO
 
 import sb3_quad
@@ -217,80 +214,6 @@ def test_publish_copies_the_policy_and_writes_where_it_comes_from(
     assert publish.main(command) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert (tmp_path / "mine.zip").read_bytes() == before
-
-
-def test_publish_uploads_what_the_hub_takes(tmp_path, monkeypatch):
-    """It does what huggingface_sb3 does; calls that need a network are recorded."""
-    called = []
-
-    class HfApi:
-        def create_repo(self, **given):
-            called.append(given)
-
-        def upload_folder(self, **given):
-            called.append(given)
-            called.append(
-                sorted(
-                    str(path.relative_to(given["folder_path"]))
-                    for path in given["folder_path"].rglob("*.*")
-                )
-            )
-
-    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(HfApi=HfApi))
-    given = ["itm-recovery", "--name", "mine", "-o", str(tmp_path), "--episodes", "2"]
-    assert publish.main([*given, "--push", "somebody/mine"]) == 0
-    folder = tmp_path / "mine"
-    parts = ["policy.pth", "policy.optimizer.pth", "pytorch_variables.pth", "system_info.txt"]
-    files = sorted(
-        [
-            "README.md",
-            "config.json",
-            "results.json",
-            "mine.zip",
-            *(f"mine/{part}" for part in parts),
-        ]
-    )
-    upload = {"repo_id": "somebody/mine", "folder_path": folder, "commit_message": "Add mine"}
-    assert called == [{"repo_id": "somebody/mine", "exist_ok": True}, upload, files]
-    _, metadata, card = (folder / "README.md").read_text().split("---\n", 2)
-    metadata = yaml.safe_load(metadata)
-    results, config = (
-        json.loads((folder / f"{name}.json").read_text()) for name in ("results", "config")
-    )
-    assert card.startswith("\n# mine\n") and metadata["library_name"] == "stable-baselines3"
-    assert (
-        "QuadStateRecovery-v0" in metadata["tags"] and "reinforcement-learning" in metadata["tags"]
-    )
-    (result,) = metadata["model-index"][0]["results"]
-    assert (
-        result["dataset"]["type"] == "QuadStateRecovery-v0"
-        and result["task"]["type"] == "reinforcement-learning"
-    )
-    assert (
-        results["n_eval_episodes"] == 8
-        and results["is_deterministic"]
-        and results["std_reward"] > 0
-    )
-    assert (
-        result["metrics"][0]["value"]
-        == f"{results['mean_reward']:.2f} +/- {results['std_reward']:.2f}"
-    )
-    assert f"| {results['mean_reward']:.2f} ".replace("-", "−") in card
-    assert config["num_timesteps"] == PPO.load(folder / "mine.zip", device="cpu").num_timesteps
-    assert "Python" in config["system_info"]
-
-
-def test_publish_says_what_an_upload_needs(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    assert (
-        publish.main(
-            ["itm-recovery", "--name", "mine", "-o", str(tmp_path), "--push", "somebody/mine"]
-        )
-        == 2
-    )
-    assert capsys.readouterr().err.rstrip().endswith("pip install huggingface-hub") and not [
-        *tmp_path.iterdir()
-    ]
 
 
 @pytest.mark.parametrize("name", pretrained_names())

@@ -9,7 +9,6 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli import main
@@ -288,15 +287,3 @@ def test_a_machine_without_the_packages_says_what_to_install(agent, monkeypatch,
     said = capsys.readouterr().err
     assert "--format px4 needs tflite" in said and "pip install '.[px4]'" in said
     assert not [*Path(tmp_path).iterdir()]
-
-
-@pytest.mark.slow
-def test_the_shipped_agent_flies_in_the_module_as_its_zip(monkeypatch, capsys):
-    """`examples/px4_flights.py`, with fewer flights than docs/research/export.md."""
-    pytest.importorskip("tflite_micro")
-    px4_flights = pytest.importorskip("px4_flights")
-    px4_flights.main(["x500-px4", "--flights", "96"])
-    lines = re.findall(r".* succeed.*", capsys.readouterr().out)
-    shares = [float(re.search(r": ([\d.]+) % of 96 succeed", line)[1]) for line in lines]
-    assert shares[:2] == pytest.approx(shares[2:], abs=1.1) and min(shares) > 98.0
-    assert agent_settings(px4_flights.agent_path("x500-px4"))[0].features == "px4"

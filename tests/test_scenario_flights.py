@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from adaptive_scaling import AdaptiveScaling, adaptive_factor, measure_mean
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_arrays
@@ -248,31 +247,9 @@ def test_the_expert_recovers_as_often_as_specified():
     assert success.low - 0.02 < 0.319 < success.high + 0.02
 
 
-def test_scaling_changes_the_position_only():
-    observation = np.random.default_rng(0).normal(size=(5, 18)).astype(np.float32)
-    std = np.full(3, 10 / np.sqrt(3))
-    observation[0, :3] = [1 / np.sqrt(3) * np.sqrt(3), 0, 0]  # 10/√3 m: α = 0.5 (1 + 1/√3)
-    adapted = AdaptiveScaling(lambda seen: seen, (0.1, 0.0, -0.2), std).predict(observation)[0]
-    np.testing.assert_array_equal(adapted[:, 3:], observation[:, 3:])
-    metres = observation[:, :3] * std
-    factor = 0.5 * (1 + np.linalg.norm(metres, axis=1) / 10)
-    np.testing.assert_allclose(
-        adapted[:, :3], (metres - [0.1, 0.0, -0.2]) / (factor[:, None] * std), rtol=1e-5
-    )
-    np.testing.assert_allclose(adaptive_factor([0.0, 10.0, 30.0]), [0.5, 1.0, 2.0])
-
-
-def test_the_measured_offset_is_cancelled_and_the_way_is_quicker():
-    policy = OnObservations((0.3, -0.2, 0.1))
-    offset = hover_offset(policy, 8)
+def test_the_offset_of_a_policy_is_measured():
+    offset = hover_offset(OnObservations((0.3, -0.2, 0.1)), 8)
     np.testing.assert_allclose(offset, [0.3, -0.2, 0.1], atol=0.02)
-    adapted = AdaptiveScaling(policy, measure_mean(policy, n_episodes=8))
-    assert np.linalg.norm(hover_offset(adapted, 8)) < 0.01
-    plain, quick = (
-        fly(each, n_episodes=8, max_episode_steps=900, tolerances=(0.5,)).time_to[0.5].mean()
-        for each in (policy, adapted)
-    )
-    assert quick < plain
 
 
 def test_intervals_hold_the_value_and_narrow_with_n():

@@ -166,7 +166,7 @@ def test_entries_of_a_list_have_their_names_and_inherit():
         ),
         (
             {"configurations": [{"algo": "dagger"}, {"algo": "ppo_bc"}]},
-            ["--algo", "sac_bc"],
+            ["--algo", "ppo"],
             "algo differs between the runs of ",
         ),
         (

@@ -41,7 +41,7 @@ class GeometricGains(Frozen):
     descent_deceleration: PositiveFloat
     """vertical deceleration planned from above, m/s²"""
     measured: StrDict | None = None
-    """results of these gains, as ``measure_expert`` in examples/tune_expert.py returns them"""
+    """what these gains reached on fresh episodes when they were found"""
 
     def values(self) -> FloatArray:
         """Return the gains alone, in the order of the fields."""

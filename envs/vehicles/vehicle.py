@@ -155,7 +155,7 @@ class Vehicle(Frozen):
     geometric_gains: GeometricGains | None = None
     """gains of the geometric expert, found for this vehicle; without them it derives gains"""
     time_optimal: dict[PositiveFloat, PositiveFloat] | None = None
-    """from distances, m, to least times to rest there, s (examples/time_optimal.py)"""
+    """from distances, m, to least times to rest there, s, as an optimal control finds them"""
 
     @model_validator(mode="before")
     @classmethod

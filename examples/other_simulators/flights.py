@@ -31,8 +31,6 @@ QUARTER = np.pi / 2.0
 SINES = {
     "figure_eight": ((2.0, 1.0, 0.0), (1, 2, 0), (0.0, 0.0, 0.0), np.sqrt(8.0)),
     "circle": ((2.0, 2.0, 0.0), (1, 1, 0), (QUARTER, 0.0, 0.0), 2.0),
-    # The curve of crazyflow's FigureEightEnv, which takes 10 s: 0.889 m/s
-    "vertical_eight": ((1.0, 0.0, 0.5), (1, 0, 2), (0.0, 0.0, 0.0), np.sqrt(2.0)),
 }
 CURVES = ("figure_eight_1", "figure_eight_2", "figure_eight_4", "circle_2")
 
@@ -156,7 +154,7 @@ class ExportedAgent:
 
 
 class Raptor:
-    """RAPTOR's policy (package ``foundation-policy``), used as in examples/raptor.py.
+    """RAPTOR's policy (package ``foundation-policy``), which finds out in flight what it flies.
 
     As with its authors, it sees position and velocity relative to the setpoint. If rotors form a
     plus, it sees the vehicle and the world turned by 45°.

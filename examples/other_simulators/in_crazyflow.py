@@ -23,7 +23,7 @@ from crazyflow.control.transform import motor_force2rotor_vel
 from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.sim import Sim
 from crazyflow.sim.integration import Integrator
-from flights import CONTROL_STEP, CURVES, Array, Cell, Policy, Raptor, Setpoint, State, main
+from flights import CONTROL_STEP, Array, Cell, Policy, Raptor, Setpoint, State, main
 
 FREQUENCY = 500  # Hz, of its physics
 
@@ -123,4 +123,4 @@ if __name__ == "__main__":
         "RAPTOR": Raptor,
         "Mellinger (true state)": Mellinger,
     }
-    main(__doc__ or "", CELLS, others, (*CURVES, "vertical_eight_0.889"))
+    main(__doc__ or "", CELLS, others)

@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 from flights import CONTROL_STEP, Array, Cell, Raptor, Setpoint, State, main
 from rotorpy.controllers.quadrotor_control import BatchedSE3Control
@@ -47,47 +46,13 @@ def parameters_of(vehicle: str, n: int) -> BatchedMultirotorParams:
     return BatchedMultirotorParams([module.quad_params] * n, n, DEVICE)
 
 
-class Loaded(BatchedMultirotor):
-    """Vehicles with payloads: masses (kg, (n,)) at offsets (m, (n, 3)) from the centre of mass.
-
-    Only their weight acts. Mass and inertia of the vehicle do not change.
-    """
-
-    payload = torch.zeros(1), torch.zeros(1, 3)
-
-    def _s_dot_fn(
-        self, t: float, s: torch.Tensor, speeds: torch.Tensor, rows: torch.Tensor
-    ) -> torch.Tensor:
-        mass, offset = self.payload
-        weight = torch.zeros(len(rows), 3)
-        weight[:, 2] = -9.81 * mass
-        rotation = roma.unitquat_to_rotmat(s[:, 6:10])
-        torque = torch.linalg.cross(
-            offset.expand_as(weight), (weight.unsqueeze(1) @ rotation).squeeze(1)
-        )
-        dot = super()._s_dot_fn(t, s, speeds, rows)
-        dot[:, 3:6] += weight / self.params.mass
-        dot[:, 10:13] += (self.params.inv_inertia @ torque.unsqueeze(-1)).squeeze(-1)
-        return dot
-
-
 class RotorPy:
     """n vehicles of ``rotorpy.vehicles`` in a wind.
 
     :param wind: function from the number of vehicles to one of RotorPy's wind profiles.
-    :param payload: greatest mass of AdaptiveQuadBench's payload, as a share of the vehicle's mass.
-    :param weakness: greatest error of a rotor's thrust in either direction, as a share of the
-        thrust.
     """
 
-    def __init__(
-        self,
-        vehicle: str,
-        wind: Callable[[int], Any],
-        n: int,
-        payload: float = 0.0,
-        weakness: float = 0.0,
-    ) -> None:
+    def __init__(self, vehicle: str, wind: Callable[[int], Any], n: int) -> None:
         parameters = importlib.import_module(f"rotorpy.vehicles.{vehicle}_params").quad_params
         # Runge-Kutta steps in a control step: two in each time constant of the motors.
         self._substeps = max(2, round(2 * CONTROL_STEP / parameters["tau_m"]))
@@ -102,14 +67,6 @@ class RotorPy:
         positions = np.stack([*parameters["rotor_pos"].values()])
         self.rotors = np.column_stack([positions[:, :2], parameters["rotor_directions"]])
         self.parameters = parameters_of(vehicle, n)
-        rng = np.random.default_rng(0)
-        arm = np.linalg.norm(positions[0])
-        efficiency = torch.tensor(1.0 + weakness * rng.uniform(-1.0, 1.0, (n, 4)))
-        self.parameters.k_eta = self.parameters.k_eta * efficiency
-        self.parameters.k_m = self.parameters.k_m * efficiency
-        mass = payload * parameters["mass"] * rng.uniform(0.0, 1.0, n)
-        offset = 0.2 * arm * rng.uniform(-1.0, 1.0, (n, 3))
-        self._payload = (torch.tensor(mass), torch.tensor(offset))
 
     def reset(self, start: State) -> None:
         self._time = 0.0
@@ -117,8 +74,9 @@ class RotorPy:
         self.fields = to_fields(start)
         self.fields["rotor_speeds"] = torch.tensor(speeds)
         self.fields["wind"] = torch.zeros(self.n, 3)
-        self._vehicles = Loaded(self.parameters, self.n, self.fields, DEVICE, integrator="rk4")
-        self._vehicles.payload = self._payload
+        self._vehicles = BatchedMultirotor(
+            self.parameters, self.n, self.fields, DEVICE, integrator="rk4"
+        )
 
     def step(self, thrusts: Array) -> None:
         command = {"cmd_motor_speeds": torch.tensor(np.sqrt(thrusts.clip(0.0) / self._k_eta))}
@@ -179,20 +137,11 @@ WINDS = {
     "_wind": ("drag, wind 4 m/s", partial(BatchedConstantWind, wx=4.0, wy=0.0, wz=0.0)),
     "_gusts": ("drag, sine gusts 2 m/s", gusts),
 }
-# The ranges of AdaptiveQuadBench's config/randomization_config.py.
-BENCH: dict[str, tuple[str, dict[str, Any]]] = {
-    "_payload": ("drag, payload up to 0.5 m off centre", {"payload": 0.5}),
-    "_rotors": ("drag, each rotor off by up to 30 %", {"weakness": 0.3}),
-}
 CELLS = {}
 for vehicle in ("crazyflie", "hummingbird"):
     for suffix, (conditions, wind) in WINDS.items():
         CELLS[vehicle + suffix] = Cell(
             f"rotorpy_{vehicle}", conditions, partial(RotorPy, vehicle, wind)
-        )
-    for suffix, (conditions, scenario) in BENCH.items():
-        CELLS[vehicle + suffix] = Cell(
-            f"rotorpy_{vehicle}", conditions, partial(RotorPy, vehicle, BatchedNoWind, **scenario)
         )
 
 if __name__ == "__main__":

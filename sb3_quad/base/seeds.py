@@ -21,7 +21,7 @@ Purpose = Literal[
     "correction",
     # The closing table of a run.
     "table",
-    # The search for gains in examples/tune_expert.py.
+    # A search for the gains of an expert.
     "search",
     # The measurement after that search, and check-vehicle.
     "expert",

@@ -7,7 +7,7 @@ attitude agree best; how the markers of the motion capture are mounted, so that 
 force lies along z; and the motors against each other, so that the mean commands yield no moment.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -167,7 +167,6 @@ def open_loop(
     logs: Sequence[Log],
     vehicle: Vehicle,
     stride: int = 1,
-    before_step: Callable[[QuadcopterBatch], object] = id,
 ) -> Iterator[tuple[float, list[FloatArray], FloatArray]]:
     """Fly recorded commands from recorded states.
 
@@ -176,7 +175,6 @@ def open_loop(
 
     :param logs: logs with rows at the vehicle's control step.
     :param stride: rows from one window to the next.
-    :param before_step: called with the batch before each control step; it may set a wrench.
     :return: for each horizon: its time, s; the predictions in the order of ``HEADINGS``; and the
         recorded motion, each (windows, 13) as in ``Log.motion``.
     :raises ConfigError: no log flies for long enough, or the rotors are not placed as M1 to M4.
@@ -211,7 +209,6 @@ def open_loop(
     for now in range(-before, ends[-1]):
         if now == 0:
             motion[:] = start.T
-        before_step(batch)
         batch.step(actions[rows])
         rows += 1
         if now + 1 in ends:

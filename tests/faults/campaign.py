@@ -33,7 +33,7 @@ import sb3_quad.tuning.results
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterVecEnv
 
-RUNS = ("dagger", "ppo_bc", "pipeline", "sac_bc", "evaluate", "sweep", "tune", "ppo", "sac")
+RUNS = ("dagger", "ppo_bc", "pipeline", "evaluate", "sweep", "tune", "ppo", "sac")
 TINY = {
     "n_timesteps": 8000,
     "n_envs": 16,
@@ -56,7 +56,6 @@ SETTINGS = {
     "dagger": DAGGER,
     "tune": {**DAGGER, "n_timesteps": 4000},
     "sac": OFF_POLICY,
-    "sac_bc": OFF_POLICY,
 }
 # What a folder has that somebody resumes from; a run has */args.yml.
 MARKS = {"pipeline": "pipeline.yml", "sweep": "plan.json"}

@@ -52,7 +52,7 @@ SETTINGS = {
 }
 ROLLOUTS = {
     "dagger": {"n_steps": 25, "batch_size": 50, "dataset_capacity": 150},
-    "sac_bc": {
+    "sac": {
         "train_freq": 25,
         "learning_starts": 50,
         "batch_size": 16,

@@ -1,1 +1,0 @@
-"""Pipelines whose second stage is value-based: SAC from an imitation agent."""
