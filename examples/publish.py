@@ -173,9 +173,8 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
 
     Facts that are in neither its zip nor its run folder are UNKNOWN.
     """
-    data = saved_data(model)
-    algorithm = saved_algorithm(data)
-    timesteps = f"{data['num_timesteps']:,} timesteps"
+    algorithm = saved_algorithm(model)
+    timesteps = f"{saved_data(model)['num_timesteps']:,} timesteps"
     if not any(model.parent.glob("*/args.yml")):
         return f"# {UNKNOWN}", {"algorithm": f"`{algorithm}`, {timesteps}", "run": UNKNOWN}
     run = open_run(model.parent)

@@ -38,7 +38,6 @@ _SETTINGS = {
     "PPO": "n_epochs",
     "A2C": "gae_lambda",
     "SAC": "target_entropy",
-    # DDPG is TD3 with other settings, which it saves.
     "TD3": "policy_delay",
 }
 # ``predict`` needs only these of an agent's pickles.
@@ -66,13 +65,22 @@ def saved_data(path: StrPath) -> StrDict:
         return _data(_open(_read_file(Path(path))))
 
 
-def saved_algorithm(data: StrDict) -> str:
-    """Return the name of the algorithm that saved some attributes.
+def saved_algorithm(path: StrPath) -> str:
+    """Return the name of the algorithm that made an SB3 ``.zip``.
 
-    It is PPO, A2C, SAC or TD3, also for DDPG; or PPOBC, DAgger or APG of this package.
+    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, DAgger or APG of this package. A zip does not name
+    its algorithm; the settings in it tell which one it is.
 
-    :raises ConfigError: an unknown algorithm.
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or an unknown
+        algorithm.
     """
+    return _algorithm(saved_data(path))
+
+
+def _algorithm(data: StrDict) -> str:
+    # DDPG saves the settings of TD3.
+    if data.get("policy_delay") == 1:
+        return "DDPG"
     for name, setting in _SETTINGS.items():
         if setting in data:
             return name
@@ -124,7 +132,7 @@ def load_zip(algorithm: Any, source: StrPath | io.BytesIO, where: str = "", **kw
         to_fly = algorithm is None
         if to_fly:
             # ``predict`` of this package's algorithms is that of PPO.
-            name = saved_algorithm(data)
+            name = _algorithm(data)
             algorithm = getattr(stable_baselines3, name, stable_baselines3.PPO)
         if not trusted():
             content, kwargs["custom_objects"] = _copy(archive, data, to_fly, where)

@@ -10,7 +10,7 @@ from typing import Literal
 from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.resolve import EXPERTS, import_factory
-from sb3_quad.agents.zips import saved_algorithm, saved_data
+from sb3_quad.agents.zips import saved_algorithm
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrDict
@@ -123,7 +123,7 @@ def controller_record(spec: ControllerSpec) -> ControllerRecord:
         label=spec.label,
         spec=path.name,
         kind=spec.kind,
-        algorithm=saved_algorithm(saved_data(path)),
+        algorithm=saved_algorithm(path),
         content=hashlib.sha256(path.read_bytes()).hexdigest(),
     )
 

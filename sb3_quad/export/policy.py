@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
+from sb3_quad.agents.zips import load_model, saved_algorithm
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
@@ -178,5 +178,5 @@ def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:
     )
     # The name of a file may contain anything, even the end of a line.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    policy = f"{path.name} ({saved_algorithm(saved_data(path))}), sha256 {digest}"
+    policy = f"{path.name} ({saved_algorithm(path)}), sha256 {digest}"
     return {"policy": policy, **dict(line.split(": ", 1) for line in text.splitlines())}

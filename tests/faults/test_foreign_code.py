@@ -13,6 +13,7 @@ import random
 import resource
 import sys
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import cloudpickle
@@ -60,9 +61,9 @@ DOTTED = text("torch") + text("serialization.os.system") + b"\x93" + text(COMMAN
 BY_VALUE = cloudpickle.dumps(Calls(eval("lambda name: open(name, 'w')"), str(MARK)))
 # Sets an attribute of a class, by which each is taken for a subclass of it.
 BUFFER = text("stable_baselines3.common.buffers") + text("RolloutBuffer") + b"\x93"
-CHANGES = (
-    BUFFER + b"N}" + text("__subclasshook__") + text("builtins") + text("bool") + b"\x93s\x86b"
-)
+HOOK = text("__subclasshook__") + text("builtins") + text("bool") + b"\x93"
+CHANGES = BUFFER + b"N}" + HOOK + b"s\x86b"
+
 DEEP = b")" + b"\x85" * 200_000
 PAIRS = b")" + b"".join(b"\x94h" + bytes([k]) + b"\x86" for k in range(60))
 # They would crash Python, never end, or take much memory.
@@ -138,7 +139,7 @@ def same_actions(*models):
 
 @pytest.mark.parametrize("content", [CALLS, b"\x80\x04" + DOTTED, BY_VALUE])
 def test_a_pickle_that_calls_a_function_is_refused(content):
-    with pytest.raises(ConfigError, match="its policy_kwargs .*--trust"):
+    with pytest.raises(ConfigError, match=r"its policy_kwargs .*--trust"):
         load_model(zip_with({"policy_kwargs": content}))
     assert not MARK.exists()
     pickle.loads(content)
@@ -253,7 +254,7 @@ def test_a_small_zip_that_would_take_long_or_much_is_refused(name):
     ],
 )
 def test_a_zip_that_asks_for_more_than_it_holds_is_refused(key, value):
-    with pytest.raises(ConfigError, match="foreign.zip"):
+    with pytest.raises(ConfigError, match="foreign"):
         load_model(zip_with({key: value}))
 
 
@@ -281,10 +282,8 @@ def test_damaged_pickles_call_and_import_nothing():
             first, after = sorted(rng.choices(places, k=2))
             damaged = content[:first] + rng.choice(pieces) + content[rng.choice((first, after)) :]
             EVENTS.clear()
-            try:
+            with suppress(Exception):
                 read_pickle(damaged)
-            except Exception as error:
-                assert str(error) is not None
             assert not {"exec", "import", "open", "os.system"} & {*EVENTS}
     assert not MARK.exists()
 
