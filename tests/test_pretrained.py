@@ -2,16 +2,12 @@
 
 import base64
 import itertools
-import json
 import pickletools
 import re
-import sys
-import types
 
 import numpy as np
 import publish
 import pytest
-import yaml
 from stable_baselines3 import PPO
 
 import sb3_quad
@@ -118,33 +114,6 @@ def test_publish_copies_the_policy_and_writes_where_it_comes_from(dagger_run, tm
     assert publish.main([str(source), "--name", "a/b", "-o", str(tmp_path)]) == 2
 
 
-def test_publish_uploads_what_the_hub_takes(tmp_path, monkeypatch):
-    """It does what huggingface_sb3 does; calls that need a network are recorded."""
-    called = []
-
-    class HfApi:
-        def create_repo(self, **given):
-            called.append(given)
-
-        def upload_folder(self, **given):
-            called.append(given)
-
-    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(HfApi=HfApi))
-    given = ["itm-recovery", "--name", "mine", "-o", str(tmp_path), "--episodes", "2"]
-    assert publish.main([*given, "--push", "somebody/mine"]) == 0
-    folder = tmp_path / "mine"
-    assert called[0] == {"repo_id": "somebody/mine", "exist_ok": True}
-    assert called[1]["repo_id"] == "somebody/mine" and called[1]["folder_path"] == folder
-    assert {"config.json", "results.json", "mine.zip"} < {path.name for path in folder.iterdir()}
-    _, metadata, card = (folder / "README.md").read_text().split("---\n", 2)
-    metadata = yaml.safe_load(metadata)
-    results = json.loads((folder / "results.json").read_text())
-    assert card.startswith("\n# mine\n") and metadata["library_name"] == "stable-baselines3"
-    (result,) = metadata["model-index"][0]["results"]
-    assert result["dataset"]["type"] == "QuadStateRecovery-v0"
-    assert f"{results['mean_reward']:.2f}" in result["metrics"][0]["value"]
-
-
 @pytest.mark.slow
 def test_the_robust_one_ends_at_its_target_under_disturbances():
     own = sb3_quad.env_kwargs("itm-robust")
@@ -181,22 +150,6 @@ def test_the_keywords_of_an_agent_that_does_not_say_how_it_flies_are_refused(tmp
         sb3_quad.env_kwargs(tmp_path / "silent.zip")
 
 
-def test_keywords_of_your_own_replace_those_of_the_agent():
-    own = sb3_quad.env_kwargs("any-quadcopter", vehicle="hummingbird", noise=0.0)
-    assert "vehicles" not in own and own["vehicle"] == "hummingbird" and own["noise"] == 0.0
-    assert sb3_quad.QuadcopterVecEnv(2, **own).observation_space.shape == (188,)
-    assert "vehicles" in sb3_quad.env_kwargs("any-quadcopter", noise=0.0)
-
-
-def test_an_agent_of_rows_that_differ_flies_anywhere():
-    sigma = [[1.0] * 18, [2.0] * 18]
-    vehicles = ["itm", "crazyflie"]
-    env = sb3_quad.QuadcopterVecEnv(2, vehicle=vehicles, noise=[0.0, 0.1], observation_std=sigma)
-    own = sb3_quad.env_kwargs(sb3_quad.APG("MlpPolicy", env))
-    assert (own["vehicle"].name, own["noise"], own["observation_std"]) == ("itm", 0.05, sigma[0])
-    sb3_quad.QuadcopterVecEnv(3, **own)
-
-
 def test_fly_warns_of_a_vehicle_that_an_agent_was_not_trained_on(recwarn):
     model = sb3_quad.load_pretrained("crazyflie-recovery")
     fly(model, n_episodes=1, max_episode_steps=1, **sb3_quad.env_kwargs(model))
@@ -207,3 +160,9 @@ def test_fly_warns_of_a_vehicle_that_an_agent_was_not_trained_on(recwarn):
         fly(model, n_episodes=1, max_episode_steps=1, vehicle="itm")
     with pytest.raises(ControllerError, match=r"the environment's \(18,\); give \*\*env_kwargs"):
         fly("itm-robust", n_episodes=1, max_episode_steps=1)
+
+
+def test_keywords_of_your_own_replace_those_of_the_agent():
+    own = sb3_quad.env_kwargs("any-quadcopter", vehicle="hummingbird", noise=0.0)
+    assert "vehicles" not in own and own["vehicle"] == "hummingbird" and own["noise"] == 0.0
+    assert "vehicles" in sb3_quad.env_kwargs("any-quadcopter", noise=0.0)

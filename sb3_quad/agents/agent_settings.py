@@ -167,7 +167,7 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     if isinstance(task, dict) and "name" in task:
         changes["task"] = validate(Task, task, where)
     settings = validate(FlightSettings, record | changes, where)
-    # Zips of older versions name the file of a reference, which export would read.
+    # The file of a reference in a zip is not opened, for the same reason.
     if settings.reference is not None and settings.reference.curve == "file":
         settings = settings.model_copy(update={"reference": None})
     return settings
