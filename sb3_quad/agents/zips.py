@@ -30,15 +30,16 @@ from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.envs.simulation.settings import KEY
 
-# Algorithms by a setting that only they save, those of this package first.
+# Algorithms by a setting that the ones after them do not save. Subclasses of SAC and TD3 are read
+# as these.
 _SETTINGS = {
+    "SAC": "target_entropy",
+    "TD3": "policy_delay",
     "PPOBC": "bc_coef",
     "DAgger": "beta",
     "APG": "continue_flights",
     "PPO": "n_epochs",
     "A2C": "gae_lambda",
-    "SAC": "target_entropy",
-    "TD3": "policy_delay",
 }
 # ``predict`` needs only these of an agent's pickles.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs", STATISTICS)
@@ -147,7 +148,8 @@ def _read_file(path: Path) -> io.BytesIO:
     """
     if not path.is_file():
         guess = did_you_mean(path, pretrained_names())
-        raise ConfigError(f"{path}: no such file, or no run's folder; {guess}".rstrip("; "))
+        problem = f"model {path}: no such file, or no run with an agent in this folder; {guess}"
+        raise ConfigError(problem.rstrip("; "))
     if path.stat().st_size > _LARGEST:
         raise ConfigError(f"{path}: is larger than {_LARGEST:,} bytes")
     return io.BytesIO(path.read_bytes())
@@ -197,7 +199,8 @@ def _copy(
         if part.endswith(".pth"):
             with _safely(f"{where}: its {part}"):
                 tensors[part.removesuffix(".pth")] = _tensors(archive.read(part))
-    variables = tensors.pop("pytorch_variables", {})
+    # The second name is that of SB3 before 0.9.
+    variables = tensors.pop("pytorch_variables", None) or tensors.pop("tensors", {})
     # SB3 would set variables of other names on any object.
     if variables.keys() - _VARIABLES:
         raise ValueError("it holds variables that no algorithm has")
