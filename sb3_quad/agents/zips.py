@@ -211,7 +211,8 @@ def _copy(
 
 
 def _safely(its: str) -> Any:
-    return raised_as(ConfigError, f"{its} cannot be read without --trust")
+    way_out = "if you trust its maker, add --trust, or set SB3_QUAD_TRUST=1"
+    return raised_as(ConfigError, f"{its} cannot be read; {way_out}")
 
 
 def _tensors(content: bytes) -> Any:
