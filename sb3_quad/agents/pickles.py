@@ -250,7 +250,7 @@ class _Builder:
         tensor = stored.as_strided(shape, stride, offset)
         if tensor.numel() > stored.numel():
             raise ValueError("repeats the numbers of a tensor")
-        return tensor.clone()
+        return tensor
 
 
 def _known(name: Any, names: str) -> Any:
