@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad import APG, PIDExpert
-from sb3_quad.envs.flight_cost import cost_and_gradients, low_force_cost
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.flight_cost import cost_and_gradients, low_force_cost
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import (

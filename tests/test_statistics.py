@@ -166,11 +166,11 @@ def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp
     with pytest.raises(ConfigError, match=r"vecnormalize\.pkl: holds no VecNormalize"):
         DAgger("MlpPolicy", "Pendulum-v1", expert=str(path)).learn(1)
     file.write_bytes(pickle.dumps(Path(tmp_path)))
-    with pytest.raises(ConfigError, match=r"names pathlib.*may run anything"):
+    with pytest.raises(ConfigError, match=r"pathlib.*may run anything"):
         resolve_expert(path)
     file.write_bytes(b"none")
     monkeypatch.setenv("SB3_QUAD_TRUST", "1")
-    with pytest.raises(ConfigError, match=r"is not what Stable-Baselines3 pickles"):
+    with pytest.raises(ConfigError, match=r"vecnormalize\.pkl cannot be read"):
         resolve_expert(path)
     monkeypatch.undo()
     file.unlink()

@@ -24,18 +24,19 @@ from sb3_quad.envs.vehicles.layout import Turn, find_turn
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle
 
 
-def agent_settings(zip_file: StrPath) -> tuple[FlightSettings, Path | None]:
+def agent_settings(zip_file: StrPath, model: Any = None) -> tuple[FlightSettings, Path | None]:
     """Return how the agent in a zip flies, and the file that says so.
 
     The file is the zip itself, or else a ``config.yml`` in a folder next to it, where runs of this
     package and of rl_zoo3 keep their settings. If neither says how the agent flies, the settings
     are ``FlightSettings()`` and the file is None.
 
+    :param model: the model in the zip, if it has been loaded already.
     :raises ConfigError: a zip or settings that cannot be read or do not fit; settings of several
         runs next to the zip; or of a run with wrappers, which flights here do not have.
     """
     # Zips of this package contain the settings.
-    data = saved_data(zip_file)
+    data = saved_data(zip_file) if model is None else vars(model)
     if KEY in data:
         return settings_of_record(data[KEY], f"{zip_file}: {KEY}"), Path(zip_file)
 
@@ -162,7 +163,7 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     if isinstance(task, dict) and "name" in task:
         changes["task"] = validate(Task, task, where)
     settings = validate(FlightSettings, record | changes, where)
-    # Zips of older versions name the file of a reference, which export would read.
+    # The file of a reference in a zip is not opened, for the same reason.
     if settings.reference is not None and settings.reference.curve == "file":
         settings = settings.model_copy(update={"reference": None})
     return settings

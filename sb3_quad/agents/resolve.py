@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.agents.pretrained import agent_path, pretrained_names
-from sb3_quad.agents.tensors import AGENTS
 from sb3_quad.agents.zips import load_model, refuse_settings
 from sb3_quad.base.errors import ConfigError, ExpertError, raised_as, unknown
 from sb3_quad.base.imports import import_name
+from sb3_quad.envs.simulation.settings import KEY
 from sb3_quad.envs.vehicles.vehicle import VehicleSource, first_vehicle
 
 # Experts by name, and their factories, which are imported when they are asked for.
@@ -30,10 +30,10 @@ def resolve_expert(
 ) -> Any:
     """Return the expert that ``spec`` names.
 
-    :param spec: a name of ``EXPERTS``, such as ``"pid"``; the path of an SB3 ``.zip`` model or of a
-        safetensors file, or the name of a policy that comes with the package
-        (:func:`sb3_quad.pretrained_path`); ``"package.module:factory"``, where ``factory(vehicle)``
-        returns an expert; or an expert itself, returned as it is.
+    :param spec: a name of ``EXPERTS``, such as ``"pid"``; the path of an SB3 ``.zip`` model, or the
+        name of a policy that comes with the package (:func:`sb3_quad.pretrained_path`);
+        ``"package.module:factory"``, where ``factory(vehicle)`` returns an expert; or an expert
+        itself, returned as it is.
     :param vehicle: the vehicle that a named expert is designed for; of several, the first.
     :param kind: the word for it in messages.
     :param layout: ``rotor_layout`` of the environments that it flies in.
@@ -46,9 +46,12 @@ def resolve_expert(
     text = str(spec)
     # The name of a policy of the package and a run folder stand for a zip.
     path = agent_path(text)
-    if path.endswith(AGENTS):
-        refuse_settings(path)
-        return load_model(path)
+    if path.endswith(".zip"):
+        model = load_model(path)
+        # Flights here have no wrappers. An agent with flight settings had none either.
+        if not hasattr(model, KEY):
+            refuse_settings(path)
+        return model
     factory = import_factory(text, kind)
     with raised_as(ExpertError, f"{kind} {text}: the factory failed"):
         return factory(first_vehicle(vehicle, layout))

@@ -1,261 +1,103 @@
-"""Loading a saved SB3 model whose algorithm is not known beforehand."""
+"""Reading the model in an SB3 zip whose algorithm is not known beforehand.
 
+The zip is read once, as data: JSON, the pickles in it (:mod:`.pickles`) and the weights. Then it is
+written anew from what was read, and SB3 loads that copy. So SB3 and PyTorch never open a stranger's
+file.
+"""
+
+import base64
+import functools
 import io
 import json
 import warnings
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_quad.agents.pickles import read_pickle
 from sb3_quad.agents.pretrained import pretrained_names
-from sb3_quad.agents.tensors import ENDING, read_tensors
-from sb3_quad.agents.unpickle import WAY_OUT, held, unpickle
 from sb3_quad.algorithms.statistics import STATISTICS
 from sb3_quad.base.errors import ConfigError, did_you_mean, raised_as
-from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import trusted
-from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
-from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.envs.simulation.settings import KEY
 
-Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
-
-# The module of the saved policy class tells the algorithm's family.
-_FAMILIES = {
-    "stable_baselines3.common.policies": "PPO",
-    "stable_baselines3.sac.policies": "SAC",
-    "stable_baselines3.td3.policies": "TD3",
-}
-# This package's algorithms with their family, and a setting that only they save. Otherwise their
-# zips are those of the stock algorithm.
-_OURS = {
-    "PPOBC": ("PPO", "bc_coef"),
-    "DAgger": ("PPO", "beta"),
-    "APG": ("PPO", "continue_flights"),
+# Algorithms by a setting that the ones after them do not save. Subclasses of SAC and TD3 are read
+# as these.
+_SETTINGS = {
+    "SAC": "target_entropy",
+    "TD3": "policy_delay",
+    "PPOBC": "bc_coef",
+    "DAgger": "beta",
+    "APG": "continue_flights",
+    "PPO": "n_epochs",
+    "A2C": "gae_lambda",
 }
 # ``predict`` needs only these of an agent's pickles.
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs", STATISTICS)
-# SB3 pickles NumPy numbers; these prefixes mark them.
-_NUMBERS = ("<class 'numpy.int", "<class 'numpy.float")
-# The others become None, or these values where SB3 cannot load None.
-_STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}
 # SB3 and this package never save these, and loading them would import the modules that they name.
 _NEVER_READ = ("env", "expert", "_labeller")
-DAMAGED = "not a complete SB3 zip"
 WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
-# The variables that SB3 saves besides policies and optimisers. Loading others would set any
-# attribute.
+# The variables that SB3 saves besides policies and optimisers.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
-_VARIABLE_FILES = ("pytorch_variables.pth", "tensors.pth")
-# Largest number of values in spaces and in the policy's keywords; each layer takes time.
-_LARGEST = 1000
+# The largest zip, in bytes.
+_LARGEST = 2**28
 # Keywords that do not affect a policy's layers, and that not all policies or devices accept.
 _WITHOUT_SIZE = ("device", "optimizer_class", "optimizer_kwargs", "squash_output", "use_sde")
 
 
-def saved_data(path: StrPath | io.BytesIO, where: str = "") -> StrDict:
-    """Return the attributes of the model in an SB3 ``.zip``, or in a safetensors file, as in its
-    JSON.
+def saved_data(path: StrPath) -> StrDict:
+    """Return the attributes of the model in an SB3 ``.zip``, as in its JSON.
 
     Attributes that are pickled there stay pickled.
 
-    :param where: what messages call the file; empty: its path.
     :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
     """
-    where = where or f"model {path}"
-    if str(path).endswith(ENDING):
-        return read_tensors(str(path))[0]
-    if not isinstance(path, io.BytesIO):
-        if Path(path).is_dir():
-            raise ConfigError(f"{where}: no run with an agent in this folder")
-        if not Path(path).is_file():
-            guess = did_you_mean(path, pretrained_names())
-            raise ConfigError(f"{where}: no such file; {guess}".rstrip("; "))
     # A damaged archive may raise anything.
-    with raised_as(ConfigError, f"{where}: {DAMAGED}"), _open(path, where) as archive:
-        return dict(json.loads(archive.read("data")))
-
-
-def _open(file: Any, where: str) -> zipfile.ZipFile:
-    """Open a zip whose parts need no more memory than its size, as SB3 and PyTorch write it.
-
-    :raises ConfigError: parts are compressed, or overlap.
-    """
-    archive = zipfile.ZipFile(file)
-    parts = archive.infolist()
-    size = sum(part.file_size for part in parts)
-    if size > archive.start_dir or any(part.compress_type for part in parts):
-        raise ConfigError(f"{where}: is compressed, as no zip of SB3 is; pack it with zip -0")
-    return archive
+    with raised_as(ConfigError, f"model {path}: not a complete SB3 zip"):
+        return _data(_open(_read_file(Path(path))))
 
 
 def saved_algorithm(path: StrPath) -> str:
     """Return the name of the algorithm that made an SB3 ``.zip``.
 
-    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, DAgger or APG of this package. A zip does not
-    name its algorithm; the policy class and the settings in it tell which one it is.
+    It is PPO, A2C, SAC, TD3 or DDPG; or PPOBC, DAgger or APG of this package. A zip does not name
+    its algorithm; the settings in it tell which one it is.
 
-    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an
-        unknown family.
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or an unknown
+        algorithm.
     """
-    data = saved_data(path)
-    with raised_as(ConfigError, f"model {path}: {DAMAGED}"):
-        module = str(data["policy_class"]["__module__"])
-    if module not in _FAMILIES:
-        raise ConfigError(
-            f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}"
-        )
-    family = _FAMILIES[module]
-    for name, (stock, setting) in _OURS.items():
-        if family == stock and setting in data:
-            return name
-    # A2C and DDPG have the policy classes of PPO and TD3.
-    if family == "PPO" and "n_epochs" not in data:
-        return "A2C"
-    if family == "TD3" and data.get("policy_delay") == 1:
+    return _algorithm(saved_data(path))
+
+
+def _algorithm(data: StrDict) -> str:
+    # DDPG saves the settings of TD3.
+    if data.get("policy_delay") == 1:
         return "DDPG"
-    return family
-
-
-def load_zip(
-    algorithm: type[Algorithm],
-    path: StrPath | io.BytesIO,
-    to_fly: bool = False,
-    where: str = "",
-    **kwargs: Any,
-) -> Algorithm:
-    """Return ``algorithm.load(path, **kwargs)``, without running any code from the file.
-
-    PyTorch reads the weights with ``weights_only``; :func:`unpickle` reads the pickles that are
-    saved with them. If the user has declared files :func:`trusted`, SB3 reads everything.
-
-    :param to_fly: load for ``predict`` only. Schedules, noise and the like, which may be functions,
-        are then not read at all.
-    :param where: what messages call the file; empty: its path.
-    :raises ConfigError: a missing or damaged file, or one that may run code.
-    """
-    where = where or f"model {path}"
-    # SB3 does not unpickle what is in ``custom_objects``.
-    objects: StrDict = {}
-    data = {} if trusted() else saved_data(path, where)
-    for key, entry in data.items():
-        if key in _NEVER_READ:
-            objects[key] = None
-        elif isinstance(entry, dict) and ":serialized:" in entry:
-            is_number = str(entry.get(":type:")).startswith(_NUMBERS)
-            if to_fly and key not in _TO_FLY and not is_number:
-                objects[key] = _STAND_INS.get(key)
-            else:
-                objects[key] = unpickle(entry[":serialized:"], f"{where}: its {key}")
-    # A zip with parts that do not fit may raise anything.
-    with raised_as(ConfigError, f"{where}: cannot be loaded"), warnings.catch_warnings():
-        # SB3 mistakes the buffer of n-step returns, its own choice, for the user's.
-        warnings.filterwarnings("ignore", "`n_steps=")
-        # SB3 reads the layers of older zips, too.
-        warnings.filterwarnings("ignore", "As shared layers")
-        if data:
-            with _open(path, where) as archive:
-                _check_parameters(archive, data | objects, where)
-        return algorithm.load(path, custom_objects=objects, **kwargs)
-
-
-def _check_parameters(archive: zipfile.ZipFile, data: StrDict, where: str) -> None:
-    """Check the parameters and the policy in a zip, since neither PyTorch nor the policy's class
-    limits their size.
-    """
-    for part in archive.namelist():
-        if not part.endswith(".pth"):
-            continue
-        its = f"{where}: its {part}"
-        with (
-            raised_as(ConfigError, f"{its} is not what PyTorch saves since 1.6; {WAY_OUT}"),
-            _open(archive.open(part), its) as weights,
-        ):
-            (name,) = [name for name in weights.namelist() if name.endswith("/data.pkl")]
-            content = unpickle(weights.read(name), its)
-        # SB3 sets variables by their names, on any part of the model.
-        if part in _VARIABLE_FILES and content and content.keys() - _VARIABLES:
-            raise ConfigError(
-                f"{where}: holds variables that no algorithm has; "
-                f"known are {', '.join(sorted(_VARIABLES))}"
-            )
-    # Half precision is the smallest format that somebody may have saved.
-    _check_size(data, archive.getinfo("policy.pth").file_size // 2, where)
-
-
-def _check_size(data: StrDict, most: int, where: str) -> None:
-    """Check how many parameters a policy asks for, without making it.
-
-    :param data: the attributes of its model, unpickled.
-    :param most: the most parameters that its file can contain.
-    """
-    walk([data.get(key) for key in _TO_FLY], held, _LARGEST)
-    given = data["policy_kwargs"]
-    keywords = {key: given[key] for key in given if key not in _WITHOUT_SIZE}
-    if keywords.get("n_critics", 2) > 100:
-        raise ConfigError(f"{where}: asks for more than 100 critics")
-    # Parameters on this device take no memory.
-    meta = th.device("meta")
-    sketch: Any = type("Sketch", (data["policy_class"],), {"device": meta})
-    with meta:
-        policy = sketch(data["observation_space"], data["action_space"], lambda _: 0.0, **keywords)
-    asked = sum(parameter.numel() for parameter in policy.parameters())
-    if asked > most:
-        raise ConfigError(f"{where}: asks for {asked:,} parameters, its file holds fewer")
-
-
-def _build_model(algorithm: Any, path: StrPath, device: str) -> Any:
-    """Return the model of a stock algorithm in a safetensors file.
-
-    :raises ConfigError: see :func:`.read_tensors`; or settings and parameters that do not fit.
-    """
-    data, tensors = read_tensors(path)
-    with raised_as(ConfigError, f"model {path}: cannot be loaded"):
-        keywords = parse_mapping(data["policy_kwargs"], "policy_kwargs")
-        model = algorithm("MlpPolicy", None, policy_kwargs=keywords, _init_setup_model=False)
-        model.device = th.device(device)
-        # A policy cannot observe more numbers than its file has weights.
-        most = sum(tensor.numel() for tensor in tensors.values())
-        seen = min(data["observation_size"], most)
-        model.observation_space, model.action_space = quadcopter_spaces(seen)
-        _check_size(vars(model), most, f"model {path}")
-        # Nothing is stored here, or trained.
-        model.n_envs = model.buffer_size = 1
-        model.target_entropy = 0.0
-        model._setup_model()
-        model.policy.load_state_dict(tensors)
-    if KEY in data:
-        setattr(model, KEY, data[KEY])
-    return model
+    for name, setting in _SETTINGS.items():
+        if setting in data:
+            return name
+    raise ConfigError(f"its algorithm is unknown; known are {', '.join(_SETTINGS)}")
 
 
 def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
-    """Return the model in an SB3 ``.zip``, or in a safetensors file, ready for ``predict``.
+    """Return the model in an SB3 ``.zip``, ready for ``predict``.
 
     It may be of PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, or of this package. Its
     ``vec_normalize`` has the statistics of VecNormalize that it was trained with, if any.
 
-    :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown
-        family, parameters that are not finite, or a file that may run code.
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, an unknown algorithm,
+        parameters that are not finite, or a file that may run code.
     """
-    name = saved_algorithm(path)
-    # ``predict`` of this package's algorithms is that of the stock ones.
-    if name in _OURS:
-        name, _ = _OURS[name]
-    algorithm: type[BaseAlgorithm] = getattr(stable_baselines3, name)
-    model: BaseAlgorithm
-    if str(path).endswith(ENDING):
-        model = _build_model(algorithm, path, device)
-    else:
-        model = load_zip(algorithm, path, to_fly=True, device=device)
+    model: BaseAlgorithm = load_zip(None, path, device=device)
     for parameter, tensor in model.policy.state_dict().items():
         if not th.isfinite(tensor).all():
             raise ConfigError(
@@ -267,6 +109,145 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     return model
 
 
+def load_zip(algorithm: Any, source: StrPath | io.BytesIO, where: str = "", **kwargs: Any) -> Any:
+    """Return ``algorithm.load(source, **kwargs)``, without running any code from the zip.
+
+    If the user has declared files :func:`trusted`, SB3 reads everything.
+
+    :param algorithm: its class; None: the stock algorithm for ``predict`` only. Schedules, noise
+        and the like, which may be functions, are then left out.
+    :param where: what messages call the zip; empty: its path.
+    :raises ConfigError: a missing or damaged file, or one that may run code.
+    """
+    where = where or f"model {source}"
+    with raised_as(ConfigError, f"{where}: not a complete SB3 zip"), warnings.catch_warnings():
+        # SB3 mistakes the buffer of n-step returns, its own choice, for the user's.
+        warnings.filterwarnings("ignore", "`n_steps=")
+        # SB3 reads the layers of older zips, too.
+        warnings.filterwarnings("ignore", "As shared layers")
+        content = source
+        if not isinstance(content, io.BytesIO):
+            content = _read_file(Path(content))
+        archive = _open(content)
+        data = _data(archive)
+        to_fly = algorithm is None
+        if to_fly:
+            # ``predict`` of this package's algorithms is that of PPO.
+            name = _algorithm(data)
+            algorithm = getattr(stable_baselines3, name, stable_baselines3.PPO)
+        if not trusted():
+            content, kwargs["custom_objects"] = _copy(archive, data, to_fly, where)
+        content.seek(0)
+        return algorithm.load(content, **kwargs)
+
+
+def _read_file(path: Path) -> io.BytesIO:
+    """Return the content of a file.
+
+    :raises ConfigError: it is missing, or too large.
+    """
+    if not path.is_file():
+        guess = did_you_mean(path, pretrained_names())
+        problem = f"model {path}: no such file, or no run with an agent in this folder; {guess}"
+        raise ConfigError(problem.rstrip("; "))
+    if path.stat().st_size > _LARGEST:
+        raise ConfigError(f"{path}: is larger than {_LARGEST:,} bytes")
+    return io.BytesIO(path.read_bytes())
+
+
+def _open(content: io.BytesIO) -> zipfile.ZipFile:
+    """Open a zip whose parts need no more memory than its size, as SB3 and PyTorch write it.
+
+    :raises ValueError: it begins with something else, or parts are compressed, or overlap.
+    """
+    # Before version 1.6, PyTorch wrote files of another kind.
+    if not content.getvalue().startswith(b"PK\x03\x04"):
+        raise ValueError("it does not begin as a zip")
+    archive = zipfile.ZipFile(content)
+    parts = archive.infolist()
+    size = sum(part.file_size for part in parts)
+    if size > archive.start_dir or any(part.compress_type for part in parts):
+        raise ValueError("is compressed, as no zip of SB3 is; pack it with zip -0")
+    return archive
+
+
+def _data(archive: zipfile.ZipFile) -> StrDict:
+    text = archive.read("data")
+    # Brackets take 20 times as much memory as text.
+    if text.count(b"[") + text.count(b"{") > 100_000:
+        raise ValueError("its data holds too much")
+    return dict(json.loads(text))
+
+
+def _copy(
+    archive: zipfile.ZipFile, data: StrDict, to_fly: bool, where: str
+) -> tuple[io.BytesIO, StrDict]:
+    """Return a zip that has been written anew with the weights in another one, and the model's
+    attributes for SB3's ``custom_objects``.
+    """
+    kept = {}
+    for key, entry in data.items():
+        if isinstance(entry, dict) and ":serialized:" in entry:
+            if to_fly and key not in _TO_FLY:
+                continue
+            with _safely(f"{where}: its {key}"):
+                kept[key] = read_pickle(base64.b64decode(entry[":serialized:"]))
+        elif key not in _NEVER_READ:
+            kept[key] = entry
+    tensors = {}
+    for part in archive.namelist():
+        if part.endswith(".pth"):
+            with _safely(f"{where}: its {part}"):
+                tensors[part.removesuffix(".pth")] = _tensors(archive.read(part))
+    # The second name is that of SB3 before 0.9.
+    variables = tensors.pop("pytorch_variables", None) or tensors.pop("tensors", {})
+    # SB3 would set variables of other names on any object.
+    if variables.keys() - _VARIABLES:
+        raise ValueError("it holds variables that no algorithm has")
+    # Half precision is the smallest format. Without gSDE, layers may be a little larger, too.
+    _check_size(kept, archive.getinfo("policy.pth").file_size // 2)
+    copy = io.BytesIO()
+    save_to_zip_file(copy, dict.fromkeys(kept), tensors, variables)
+    return copy, kept
+
+
+def _safely(its: str) -> Any:
+    way_out = "if you trust its maker, add --trust, or set SB3_QUAD_TRUST=1"
+    return raised_as(ConfigError, f"{its} cannot be read; {way_out}")
+
+
+def _tensors(content: bytes) -> Any:
+    """Return what PyTorch has saved."""
+    weights = _open(io.BytesIO(content))
+    (name,) = [name for name in weights.namelist() if name.endswith("/data.pkl")]
+    folder = name.removesuffix(".pkl") + "/"
+    # Several tensors may share their numbers.
+    return read_pickle(
+        weights.read(name), functools.cache(lambda key: bytearray(weights.read(folder + key)))
+    )
+
+
+def _check_size(data: StrDict, most: int) -> None:
+    """Check how many parameters a policy asks for, without making it.
+
+    :param data: the attributes of its model.
+    :param most: the most parameters that its file can hold.
+    :raises ValueError: there are too many, or too many layers, each of which takes time.
+    """
+    given = data["policy_kwargs"]
+    if len(str(given)) > 10_000 or given.get("n_critics", 2) > 100:
+        raise ValueError("its policy_kwargs are too large")
+    keywords = {key: given[key] for key in given if key not in _WITHOUT_SIZE}
+    # Parameters on this device take no memory.
+    meta = th.device("meta")
+    sketch: Any = type("Sketch", (data["policy_class"],), {"device": meta})
+    with meta:
+        policy = sketch(data["observation_space"], data["action_space"], lambda _: 0.0, **keywords)
+    asked = sum(parameter.numel() for parameter in policy.parameters())
+    if asked > most:
+        raise ValueError(f"it asks for {asked:,} parameters, which its file does not hold")
+
+
 def _statistics_beside(path: StrPath) -> VecNormalize | None:
     """Return what is in the ``vecnormalize.pkl`` that rl_zoo3 keeps in a folder next to a zip.
 
@@ -275,7 +256,8 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
     :raises ConfigError: a file that cannot be read, or no file although the run had statistics.
     """
     for file in Path(path).parent.glob("*/vecnormalize.pkl"):
-        statistics = unpickle(file.read_bytes(), str(file))
+        with _safely(str(file)):
+            statistics = read_pickle(_read_file(file).getvalue())
         if not isinstance(statistics, VecNormalize):
             raise ConfigError(f"{file}: holds no VecNormalize")
         return statistics
@@ -286,13 +268,9 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
 def refuse_settings(path: StrPath, keys: Sequence[str] = WRAPPERS) -> None:
     """Check that an agent was trained without some settings, according to its run folder.
 
-    A zip of this package with flight settings always was.
-
     :param keys: keys of settings files, of this package and of rl_zoo3.
     :raises ConfigError: it was trained with one of them.
     """
-    if KEY in saved_data(path):
-        return
     for config in Path(path).parent.glob("*/config.yml"):
         used = ", ".join(filter(read_yaml(config).get, keys))
         if used:

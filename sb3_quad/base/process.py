@@ -138,7 +138,7 @@ def has_ended(process: int) -> bool:
 
 def trusted() -> bool:
     """Whether files may run their own code: after ``--trust``, or by ``SB3_QUAD_TRUST=1``."""
-    return os.environ.get(TRUST_VARIABLE, "0") not in ("", "0")
+    return os.environ.get(TRUST_VARIABLE, "").lower() in ("1", "true", "yes")
 
 
 @contextmanager

@@ -10,7 +10,6 @@ from typing import Literal
 from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.resolve import EXPERTS, import_factory
-from sb3_quad.agents.tensors import AGENTS, ENDING
 from sb3_quad.agents.zips import saved_algorithm
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_name
@@ -34,8 +33,8 @@ class ControllerSpec:
 
     @property
     def is_zip(self) -> bool:
-        """Whether it is an agent in a zip or in a safetensors file."""
-        return self.spec.endswith(AGENTS)
+        """Whether it is an agent in a zip."""
+        return self.spec.endswith(".zip")
 
     @property
     def kind(self) -> Literal["expert", "model", "factory"]:
@@ -96,7 +95,7 @@ def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
         label, equals, path = text.partition("=")
         # An equals sign after a slash belongs to the path.
         if not equals or {"/", "\\"} & {*label}:
-            label = Path(text).name.removesuffix(".zip").removesuffix(ENDING)
+            label = Path(text).name.removesuffix(".zip")
             path = text
         if not label or not path or not label.isprintable():
             raise ConfigError(

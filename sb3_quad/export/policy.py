@@ -10,14 +10,12 @@ from typing import Any, NamedTuple
 from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.agents.tensors import ENDING, write_tensors
-from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
+from sb3_quad.agents.zips import load_model, saved_algorithm
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.envs.simulation.observation import FEATURES, GROUPS
-from sb3_quad.envs.simulation.settings import KEY
 from sb3_quad.envs.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
 from sb3_quad.export import crazyflie, load, px4
 from sb3_quad.export.c_header import c_name, write_header
@@ -34,7 +32,6 @@ FORMATS = {
     "c": ".h",
     "crazyflie": "_crazyflie",
     "px4": "_px4",
-    "safetensors": ENDING,
 }
 # Formats that are folders, with the file that contains the policy
 FOLDERS = {"crazyflie": "src/policy.h", "px4": "control_net.tflite"}
@@ -73,7 +70,7 @@ def export_policy(
     it finds none, the vehicle must be given, and the scaling is that of Table A.2.
 
     :param file_format: ``onnx``, ``torchscript``, ``c``, ``crazyflie``, which is an app around the
-        C header, ``px4`` or ``safetensors``; ``output``: ``thrusts`` or ``speeds``.
+        C header, or ``px4``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: the vehicle whose body frame, order of rotors, thrust limits and, for speeds, kF
         the file uses.
     :param name: the C function is called ``NAME_policy``; None: the name of the zip.
@@ -97,15 +94,13 @@ def export_policy(
     refuse_unknown("format", [file_format], FORMATS)
     if half and file_format != "c":
         raise ConfigError(f"--half: is for --format c; --format {file_format} keeps float32")
-    if file_format == "safetensors":
-        return _agent_itself(path, output, vehicle)
     if file_format in FOLDERS and output != "thrusts":
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
     if half:
         model.policy.half().float()
-    settings, source = agent_settings(path)
+    settings, source = agent_settings(path, model)
     if vehicle is None:
         if source is None:
             raise ConfigError(
@@ -162,25 +157,6 @@ def export_policy(
     if file_format == "px4":
         metadata["parameters"] = "; ".join(files[px4.PARAMETERS].decode().splitlines())
     return Export(content, metadata, error, network.unit, source, files)
-
-
-def _agent_itself(path: StrPath, output: str, vehicle: VehicleSource | None) -> Export:
-    """Make a safetensors file of a zip."""
-    if output != "thrusts" or vehicle is not None:
-        raise ConfigError(
-            "--format safetensors: is the agent as it is; remove --output and --vehicle"
-        )
-    model = load_model(path)
-    settings, source = agent_settings(path)
-    trained = TrainedPolicy(model, settings, first_vehicle(settings.vehicle))
-    build_network(trained, f"model {path}", settings.features)
-    if trained.clip or model.use_sde:
-        raise ConfigError(f"model {path}: has normalize or use_sde; only its zip holds these")
-    data = saved_data(path)
-    if source is not None:
-        settings.write_into(model)
-        data[KEY] = getattr(model, KEY)
-    return Export(write_tensors(model, data), {}, 0.0, "N", source, None)
 
 
 def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:

@@ -24,7 +24,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
 from sb3_quad.agents.pretrained import agent_path, pretrained_names
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.agents.tensors import AGENTS
 from sb3_quad.agents.zips import load_model
 from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
@@ -423,7 +422,7 @@ def with_absolute_paths(env_id: str, settings: StrDict) -> StrDict:
         settings["demonstrations"] = str(Path(settings["demonstrations"]).absolute())
     expert = str(settings.get("expert"))
     # A zip or a run folder, and not the name of an agent of the package.
-    if expert not in pretrained_names() and agent_path(expert).endswith(AGENTS):
+    if expert not in pretrained_names() and agent_path(expert).endswith(".zip"):
         settings["expert"] = str(Path(expert).absolute())
     return settings
 

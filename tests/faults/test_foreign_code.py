@@ -8,7 +8,12 @@ import io
 import json
 import os
 import pickle
+import pickletools
+import random
+import resource
+import sys
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import cloudpickle
@@ -16,24 +21,24 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
-from stable_baselines3.common.buffers import BaseBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 
 from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pickles import read_pickle
 from sb3_quad.agents.pretrained import pretrained_path
-from sb3_quad.agents.unpickle import unpickle
-from sb3_quad.agents.zips import load_model, load_zip
+from sb3_quad.agents.zips import load_model, load_zip, saved_data
 from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.process import trusted
 from sb3_quad.cli import main
-from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 MARK = Path("foreign_code_ran")
 AGENT = pretrained_path("itm-imitation")
 COMMAND = f"echo > {MARK}"
+SECONDS = 5
 
 
 class Calls:
@@ -46,52 +51,30 @@ class Calls:
         return self.call
 
 
-def text(value: str) -> bytes:
+def text(value):
     return b"\x8c" + bytes([len(value)]) + value.encode()
 
 
-FOREIGN = Calls(os.system, COMMAND)
-PICKLES = {
-    "os.system": pickle.dumps(FOREIGN),
-    "a dotted name": b"\x80\x04"
-    + text("torch")
-    + text("serialization.os.system")
-    + b"\x93"
-    + text(COMMAND)
-    + b"\x85R.",
-    "names from the memo": b"\x80\x04"
-    + text("os")
-    + b"\x940"
-    + text("system")
-    + b"\x940h\x00h\x01\x93"
-    + text(COMMAND)
-    + b"\x85R.",
-    "a function by value": cloudpickle.dumps(
-        Calls(eval("lambda name: open(name, 'w')"), str(MARK))
-    ),
-}
+CALLS = pickle.dumps(Calls(os.system, COMMAND))
+DOTTED = text("torch") + text("serialization.os.system") + b"\x93" + text(COMMAND) + b"\x85R."
+BY_VALUE = cloudpickle.dumps(Calls(eval("lambda name: open(name, 'w')"), str(MARK)))
+# Sets an attribute of a class, by which each is taken for a subclass of it.
+BUFFER = text("stable_baselines3.common.buffers") + text("RolloutBuffer") + b"\x93"
+HOOK = text("__subclasshook__") + text("builtins") + text("bool") + b"\x93"
+CHANGES = BUFFER + b"N}" + HOOK + b"s\x86b"
 
-
-def changed(name: str, hook: tuple[str, str]) -> bytes:
-    """Sets an attribute of a class, by which each is taken for a subclass of it; then SB3's own
-    wrapper of pickles.
-    """
-    state = b"N}" + text("__subclasshook__") + text(hook[0]) + text(hook[1]) + b"\x93s\x86"
-    wrapper = pickle.dumps(CloudpickleWrapper(FOREIGN), 4)[11:]  # without its own PROTO and FRAME
-    return (
-        b"\x80\x04"
-        + text("stable_baselines3.common.buffers")
-        + text(name)
-        + b"\x93"
-        + state
-        + b"b0"
-        + wrapper
-    )
-
-
-CHANGED = {  # not to be read by pickle here: the change would stay
-    "no class of a zip": changed("BaseBuffer", ("builtins", "bool")),
-    "a class of zips": changed("RolloutBuffer", ("numpy", "float64")),
+DEEP = b")" + b"\x85" * 200_000
+PAIRS = b")" + b"".join(b"\x94h" + bytes([k]) + b"\x86" for k in range(60))
+# They would crash Python, never end, or take much memory.
+MONSTERS = {
+    "a deep key": b"}" + DEEP + b"Ns.",
+    "a deep name": DEEP + b")R.",
+    "pairs": PAIRS + b".",
+    "a key of pairs": b"}" + PAIRS + b"Ns.",
+    "a call of pairs": PAIRS + b")R.",
+    "itself": b"]\x94h\0a.",
+    "many": b"}\x94" * 10**6 + b".",
+    "a long array": b"\x96" + (1 << 40).to_bytes(8, "little") + b".",
 }
 
 
@@ -102,293 +85,242 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def foreign_zip(
-    key: str, source: Path = AGENT, path: str = "foreign.zip", content: bytes = PICKLES["os.system"]
-) -> str:
-    """A copy of an agent's zip, in which a pickle is put; as an attribute of the model, or as a
-    file of weights.
+def zip_with(changes, source=AGENT, path="foreign.zip"):
+    """A copy of an agent's zip, some parts of which, or attributes in whose JSON, are others. An
+    attribute in bytes is a pickle.
     """
     with zipfile.ZipFile(source) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
-    if key.endswith(".pth"):
-        parts[key] = content
-    else:
-        data = json.loads(parts["data"])
-        data[key] = {":type:": "harmless", ":serialized:": base64.b64encode(content).decode()}
-        parts["data"] = json.dumps(data).encode()
+    data = json.loads(parts["data"])
+    for key, value in changes.items():
+        if key.endswith(".pth"):
+            parts[key] = value
+        elif isinstance(value, bytes):
+            data[key] = {":type:": "x", ":serialized:": base64.b64encode(value).decode()}
+        else:
+            data[key] = value
+    parts["data"] = json.dumps(data).encode()
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in parts.items():
             archive.writestr(name, content)
     return path
 
 
-def same_actions(*models) -> bool:
+def weights(content=b"", compression=0, tensor=None):
+    """A file of torch.save, whose pickle may be another."""
+    plain = io.BytesIO()
+    torch.save({"a": tensor}, plain)
+    changed = io.BytesIO()
+    with zipfile.ZipFile(plain) as archive, zipfile.ZipFile(changed, "w", compression) as copied:
+        for name in archive.namelist():
+            is_pickle = content and name.endswith("/data.pkl")
+            copied.writestr(name, content if is_pickle else archive.read(name))
+    return changed.getvalue()
+
+
+def legacy(content):
+    """A file of PyTorch before 1.6."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer, _use_new_zipfile_serialization=False)
+    return buffer.getvalue()
+
+
+def the_line(capsys):
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if "warning" not in line)
+    return line
+
+
+def same_actions(*models):
     observation = models[0].observation_space.sample()
     first, second = (model.predict(observation, deterministic=True)[0] for model in models)
     return np.array_equal(first, second)
 
 
-@pytest.mark.parametrize("name", PICKLES)
-def test_a_pickle_that_calls_what_no_agent_needs_is_refused(name):
-    with pytest.raises(
-        ConfigError, match=r"^here names \S+\.\S+, which may run anything; .* --trust"
-    ):
-        unpickle(base64.b64encode(PICKLES[name]).decode(), "here")
+@pytest.mark.parametrize("content", [CALLS, b"\x80\x04" + DOTTED, BY_VALUE])
+def test_a_pickle_that_calls_a_function_is_refused(content):
+    with pytest.raises(ConfigError, match=r"its policy_kwargs .*--trust"):
+        load_model(zip_with({"policy_kwargs": content}))
     assert not MARK.exists()
-    pickle.loads(PICKLES[name])
-    assert MARK.exists()  # so it does what it is here for
-
-
-@pytest.mark.parametrize("content", CHANGED.values(), ids=CHANGED)
-def test_no_class_is_changed(content, capsys, dagger_run):
-    with pytest.raises(
-        ConfigError,
-        match=r"here (names \S+BaseBuffer|is not what Stable-Baselines3 pickles).* --trust",
-    ):
-        unpickle(base64.b64encode(content).decode(), "here")
-    assert (
-        main(["enjoy", foreign_zip("policy_kwargs", content=content), "--no-render", "-n", "1"])
-        == 2
-    )
-    foreign_zip("lr_schedule", dagger_run / "QuadStateRecovery-v0.zip", content=content)
-    model = np.fromfile("foreign.zip", dtype=np.uint8)
-    np.savez(dagger_run / "resume.npz", timesteps=np.array(5), model=model)
-    assert main(["train", "--resume", str(dagger_run)]) == 2
-    assert len([line for line in capsys.readouterr().err.splitlines() if "--trust" in line]) == 2
-    assert not any("__subclasshook__" in vars(kind) for kind in (BaseBuffer, RolloutBuffer))
-    assert not MARK.exists()
+    pickle.loads(content)
+    # So it does what it is here for.
+    assert MARK.exists()
 
 
 @pytest.mark.parametrize(
     ("command", "key"),
     [
-        ("evaluate foreign.zip --suite quick --episodes 1 --no-report", "policy_kwargs"),
-        pytest.param(
-            *(
-                "evaluate foreign.zip pid --suite quick --episodes 1 --no-report --workers 2",
-                "policy_kwargs",
-            ),
-            marks=pytest.mark.slow,
-        ),
+        ("evaluate foreign.zip --suite quick --episodes 1 --no-report", "policy_class"),
         ("enjoy foreign.zip --no-render -n 1", "action_space"),
-        ("export foreign.zip --format torchscript", "observation_space"),
-        ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "action_space"),
-        ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "policy.pth"),
+        ("export foreign.zip --format c", "observation_space"),
+        ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "vec_normalize"),
         ("train --algo ppo -i foreign.zip -n 100 --eval-episodes 0", "policy.pth"),
     ],
 )
 def test_no_command_runs_what_a_zip_holds(command, key, capsys):
-    foreign_zip(key)
+    zip_with({key: weights(CALLS) if key == "policy.pth" else CALLS})
     assert main(command.split()) != 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if "foreign.zip: " in line]
-    assert lines
-    for line in lines:
-        assert key == "policy.pth" or (
-            f"its {key} names posix.system" in line and "--trust" in line
-        )
+    lines = [line for line in capsys.readouterr().err.splitlines() if f"its {key} " in line]
+    assert lines and "--trust" in lines[0]
     assert not MARK.exists()
 
 
-@pytest.mark.parametrize("key", ["learning_rate", "policy_class", "clip_range", "anything"])
+@pytest.mark.parametrize("key", ["learning_rate", "anything"])
 def test_a_run_folder_that_is_resumed_runs_nothing(key, capsys, dagger_run):
-    content = Path(foreign_zip(key, dagger_run / "QuadStateRecovery-v0.zip")).read_bytes()
-    np.savez(
-        dagger_run / "resume.npz",
-        timesteps=np.array(5),
-        model=np.frombuffer(content, dtype=np.uint8),
-    )
+    content = Path(zip_with({key: CALLS}, dagger_run / "QuadStateRecovery-v0.zip")).read_bytes()
+    model = np.frombuffer(content, np.uint8)
+    np.savez(dagger_run / "resume.npz", timesteps=np.array(5), model=model)
     assert main(["train", "--resume", str(dagger_run)]) == 2
-    assert f"its {key} names posix.system, which may run anything" in capsys.readouterr().err
+    assert f"its {key}" in the_line(capsys)
     assert not MARK.exists()
 
 
-def test_trust_goes_on_and_ends_with_the_command(capsys):
-    export = ["export", foreign_zip("observation_space"), "--format", "torchscript"]
+def test_trust_ends_with_the_command_and_has_to_be_meant(monkeypatch):
+    export = ["export", zip_with({"observation_space": CALLS}), "--format", "c"]
     main([*export, "--trust"])
     assert MARK.exists()
     MARK.unlink()
-    assert main(export) == 2
+    for value in ("false", "no", "0", "", " "):
+        monkeypatch.setenv("SB3_QUAD_TRUST", value)
+        assert main(export) == 2
     assert not MARK.exists()
+    monkeypatch.setenv("SB3_QUAD_TRUST", "True")
+    assert trusted()
+
+
+def test_no_class_is_changed():
+    """SB3 would set variables wherever their names lead, and Python attributes of a class."""
+    before = {kind: dict(vars(kind)) for kind in (RolloutBuffer, ActorCriticPolicy, PPO)}
+    name = "policy.action_net.weight.__class__"
+    variables = io.BytesIO()
+    torch.save({name: torch.zeros(1)}, variables)
+    with zipfile.ZipFile(AGENT) as archive:
+        plain = archive.read("pytorch_variables.pth")
+    late = legacy({name: torch.zeros(1)})
+    for changes in (
+        {"policy_kwargs": b"\x80\x04" + CHANGES + b"."},
+        {"pytorch_variables.pth": variables.getvalue()},
+        # Two files in one: PyTorch reads the first, zipfile the second.
+        {"pytorch_variables.pth": late + plain},
+        {"pytorch_variables.pth": late[:100] + plain},
+    ):
+        with pytest.raises(ConfigError):
+            load_model(zip_with(changes))
+    assert {kind: dict(vars(kind)) for kind in before} == before
+    assert isinstance(torch.nn.Parameter.data, type(torch.Tensor.data))
+
+
+def status(job):
+    """The exit code of a process that does a job, below 0 the signal that ended it, and how much
+    memory it took.
+    """
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    child = os.fork()
+    if child == 0:
+        code = 70
+        try:
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+            job()
+            code = 0
+        except ConfigError:
+            code = 1
+        finally:
+            os._exit(code)
+    _, ended, usage = os.wait4(child, 0)
+    return os.waitstatus_to_exitcode(ended), (usage.ru_maxrss - before) / 1024
+
+
+@pytest.mark.parametrize("name", MONSTERS)
+def test_a_small_zip_that_would_take_long_or_much_is_refused(name):
+    load_model(AGENT)
+    content = b"\x80\x04" + MONSTERS[name]
+    for changes in ({"policy_kwargs": content}, {"policy.pth": weights(content)}):
+        foreign = zip_with(changes)
+        code, megabytes = status(lambda foreign=foreign: load_model(foreign))
+        assert (code, megabytes < 300) == (1, True)
 
 
 @pytest.mark.parametrize(
-    "key", ["learning_rate", "lr_schedule", "clip_range", "ep_info_buffer", "expert"]
+    ("key", "value"),
+    [
+        ("policy_kwargs", {"net_arch": [20_000] * 3}),
+        ("policy_kwargs", {"net_arch": [1] * 10**6}),
+        ("policy_kwargs", {"n_critics": 10**9}),
+        ("anything", [[]] * 10**6),
+        ("policy.pth", weights(compression=8)),
+        ("policy.optimizer.pth", weights(tensor=torch.zeros(1).expand(9_999, 9_999))),
+        ("policy.pth", legacy({})),
+    ],
 )
-def test_what_flying_does_not_need_is_not_even_read(key):
-    agent, whole = load_model(foreign_zip(key)), load_model(AGENT)
+def test_a_zip_that_asks_for_more_than_it_holds_is_refused(key, value):
+    with pytest.raises(ConfigError, match="foreign"):
+        load_model(zip_with({key: value}))
+
+
+EVENTS = []
+sys.addaudithook(lambda event, _: EVENTS.append(event))
+
+
+def test_damaged_pickles_call_and_import_nothing():
+    """Pieces of an agent's pickles, and opcodes that no agent has, in random order."""
+    rng = random.Random(0)
+    entries = saved_data(AGENT).values()
+    encoded = [entry[":serialized:"] for entry in entries if ":serialized:" in str(entry)]
+    pieces = [CALLS[2:-1], DOTTED[:-1], CHANGES, b"\x81", b"R", b"b", b"s", b"h\0", b")", b"}"]
+    for content in map(base64.b64decode, encoded):
+        read_pickle(content)
+        places = [place for _, _, place in pickletools.genops(content)]
+        for _ in range(60):
+            first, after = sorted(rng.choices(places, k=2))
+            damaged = content[:first] + rng.choice(pieces) + content[rng.choice((first, after)) :]
+            EVENTS.clear()
+            with suppress(Exception):
+                read_pickle(damaged)
+            assert not {"exec", "import", "open", "os.system"} & {*EVENTS}
     assert not MARK.exists()
-    assert same_actions(agent, whole)
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3, DDPG])
 def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
-    off_policy = algorithm in (SAC, TD3, DDPG)
-    kwargs = {"buffer_size": 200} if off_policy else {"n_steps": 16}
-    kwargs |= (
-        {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}
-        if algorithm in (SAC, TD3, DDPG)
-        else {}
-    )
-    kwargs |= {
-        "policy_kwargs": {
-            "net_arch": [8],
-            "activation_fn": torch.nn.ELU,
-            "optimizer_class": torch.optim.SGD,
-        }
-    }
+    kwargs = {"n_steps": 16}
+    if algorithm in (SAC, TD3, DDPG):
+        noise = NormalActionNoise(np.zeros(1), np.ones(1))
+        kwargs = {"buffer_size": 200, "action_noise": noise, "train_freq": (1, "episode")}
+    layers = {"net_arch": [8], "activation_fn": torch.nn.ELU, "optimizer_class": torch.optim.SGD}
     model = algorithm(
-        "MlpPolicy", "Pendulum-v1", learning_rate=lambda progress: 1e-3 * progress, **kwargs
+        "MlpPolicy",
+        "Pendulum-v1",
+        learning_rate=lambda progress: 1e-3 * progress,
+        policy_kwargs=layers,
+        **kwargs,
     ).learn(32)
     model.save("agent.zip")
     again = load_model("agent.zip")
-    assert type(again) is algorithm
+    assert isinstance(model, type(again))
     assert same_actions(again, model)
-    with pytest.raises(ConfigError, match=r"its learning_rate names cloudpickle\.cloudpickle\._"):
+    with pytest.raises(ConfigError, match="its learning_rate"):
         load_zip(algorithm, "agent.zip")
+    # All of it, as for going on.
     model.learning_rate = model.lr_schedule = LinearSchedule(1e-3, 0.0, 1.0)
     model.save("agent.zip")
-    assert (
-        load_zip(algorithm, "agent.zip", device="cpu").lr_schedule(0.5) == 5e-4
-    )  # all of it, as for going on
-
-
-@pytest.mark.parametrize(
-    ("key", "entry"),
-    [
-        ("callback", {"os.makedirs": {"name": str(MARK)}}),
-        ("callback", {"gymnasium.Wrapper": {"env": 1}}),
-        (
-            "callback",
-            [{"stable_baselines3.common.callbacks.EventCallback": None}, {"pathlib.Path": {}}],
-        ),
-        ("vec_env_wrapper", {"os.makedirs": {"exist_ok": True}}),
-        ("vec_env_wrapper", "builtins.print"),
-        ("env_wrapper", "os.mkdir"),
-    ],
-)
-@pytest.mark.parametrize("way", ["a settings file", "a run folder"])
-def test_settings_call_only_classes_of_the_right_kind(key, entry, way, capsys):
-    environment = "QuadTargetTracking-v0"
-    content = {"n_timesteps": 400, "n_envs": 2, "n_steps": 100, "vec_env": "dummy", key: entry}
-    file, how = Path("foreign.yml"), ["--conf-file", "foreign.yml", "--algo", "dagger"]
-    if way == "a run folder":
-        file, how = Path(f"run/{environment}/config.yml"), ["--resume", "run"]
-        file.parent.mkdir(parents=True)
-        (file.parent / "args.yml").write_text(f"{{algo: dagger, env: {environment}}}")
-    else:
-        content = {environment: content}
-    file.write_text(json.dumps(content))  # which is YAML, too
-    assert main(["train", *how]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"error: {file}: {key}: ")
-    assert "name a subclass of" in line
-    assert not MARK.exists()
-    assert not Path("logs").exists()
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../outside",
-        "a/b",
-        "a\\b",
-        "*/ int x; /*",
-        "<script>",
-        "two\nlines",
-        "\x1b[2J",
-        "",
-        "a" * 101,
-    ],
-)
-def test_a_vehicle_s_name_is_a_name(name, capsys, here, monkeypatch):
-    own = here / "own"
-    own.mkdir()
-    monkeypatch.chdir(own)
-    parameters = load_vehicle("itm").model_dump(mode="json") | {"name": name}
-    Path("foreign.yaml").write_text(json.dumps(parameters))
-    assert main(["check-vehicle", "foreign.yaml"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: foreign.yaml: name: ")
-    with zipfile.ZipFile(AGENT) as archive, zipfile.ZipFile("foreign.zip", "w") as copy:
-        data = json.loads(archive.read("data"))
-        data["flight_settings"]["vehicle"]["name"] = name
-        copy.writestr("data", json.dumps(data))
-    with pytest.raises(ConfigError, match=r"foreign\.zip: flight_settings: name: "):
-        agent_settings("foreign.zip")
-    assert sorted(path.name for path in here.rglob("*")) == ["foreign.yaml", "foreign.zip", "own"]
-
-
-def zip_with(changes: dict) -> str:
-    """A copy of an agent's zip, some attributes of whose JSON are others."""
-    with zipfile.ZipFile(AGENT) as archive, zipfile.ZipFile("foreign.zip", "w") as copy:
-        for name in archive.namelist():
-            content = archive.read(name)
-            copy.writestr(
-                name, json.dumps(json.loads(content) | changes) if name == "data" else content
-            )
-    return "foreign.zip"
-
-
-@pytest.mark.parametrize("source", ["/dev/zero", "fifo.yaml", "./fifo"])
-@pytest.mark.parametrize("key", ["rotor_layout", "vehicles", "vehicles.distribution", "vehicle"])
-def test_a_zip_opens_no_file_of_this_machine(key, source, capsys):
-    os.mkfifo("fifo.yaml")  # who opens it waits for ever
-    settings = agent_settings(AGENT)[0].model_dump(mode="json")
-    name, _, inner = key.partition(".")
-    foreign = zip_with({"flight_settings": settings | {name: {inner: source} if inner else source}})
-    assert main(["enjoy", foreign, "--no-render", "-n", "1"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(
-        "error: foreign.zip: flight_settings: " + (f"{name}: " if name != "vehicle" else "")
-    )
-
-
-@pytest.mark.parametrize("source", ["fifo.csv", {"curve": "file", "file": "/dev/zero"}])
-def test_a_zip_flies_without_the_file_of_its_reference(source):
-    """Older versions wrote its path."""
-    os.mkfifo("fifo.csv")
-    settings = agent_settings(AGENT)[0].model_dump(mode="json")
-    foreign = zip_with({"flight_settings": settings | {"reference": source}})
-    assert agent_settings(foreign)[0] == agent_settings(AGENT)[0]
-    named = zip_with({"flight_settings": settings | {"reference": "circle"}})
-    assert agent_settings(named)[0].reference.curve == "circle"
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ([], "flight_settings: must be a mapping"),
-        (None, "flight_settings: must be a mapping"),
-        ({"observation_std": [1e-320] * 18}, "observation_std: every value must be from 1e-6"),
-        ({"observation_mean": [1e30] * 18}, "observation_mean: every value must be from -1e6"),
-    ],
-)
-def test_settings_that_no_flight_can_have_are_refused(changes, says, capsys):
-    settings = agent_settings(AGENT)[0].model_dump(mode="json")
-    foreign = zip_with({"flight_settings": changes and settings | changes})
-    assert main(["enjoy", foreign, "--no-render", "-n", "1"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert says in line
+    whole = load_zip(algorithm, "agent.zip", device="cpu")
+    assert whole.lr_schedule(0.5) == 5e-4 and whole._last_obs is not None
+    assert getattr(whole, "train_freq", 0) == getattr(model, "train_freq", 0)
 
 
 def test_spaces_of_gym_are_read_as_gymnasium_s():
     """The zips in rl-trained-agents, of 2021."""
-    model, foreign = load_model(AGENT), AGENT
+    model = load_model(AGENT)
+    changes = {}
     for key in ("action_space", "observation_space"):
         space = copy.deepcopy(getattr(model, key))
         space._np_random = Calls(vars(np.random)["_pickle"].__randomstate_ctor, "MT19937")
-        content = pickle.dumps(space, protocol=3).replace(b"gymnasium.spaces", b"gym.spaces")
-        foreign = foreign_zip(key, foreign, f"{key}.zip", content)
-    ours = load_model(foreign)
+        content = pickle.dumps(space, protocol=3)
+        changes[key] = content.replace(b"gymnasium.spaces", b"gym.spaces")
+    ours = load_model(zip_with(changes))
     assert ours.observation_space == model.observation_space
     assert same_actions(ours, model)
     ours.action_space.sample()
-
-
-def test_a_zip_names_what_comes_with_the_package():
-    settings = agent_settings(AGENT)[0].model_dump(mode="json")
-    named = {"rotor_layout": "itm", "vehicles": {"distribution": "raptor"}}
-    assert agent_settings(zip_with({"flight_settings": settings | named}))[0].rotor_layout == "itm"
 
 
 def test_a_zip_imports_nothing(monkeypatch):
@@ -403,47 +335,44 @@ def test_a_zip_imports_nothing(monkeypatch):
     assert not MARK.exists()
 
 
-def weights(content: bytes = b"", compression: int = 0, tensor: object = None) -> bytes:
-    """A file of torch.save, whose pickle may be another."""
-    plain, changed = io.BytesIO(), io.BytesIO()
-    torch.save({"a": tensor}, plain)
-    with zipfile.ZipFile(plain) as archive, zipfile.ZipFile(changed, "w", compression) as copied:
-        for name in archive.namelist():
-            is_pickle = content and name.endswith("/data.pkl")
-            copied.writestr(name, content if is_pickle else archive.read(name))
-    return changed.getvalue()
+@pytest.mark.parametrize("source", ["/dev/zero", "fifo.yaml"])
+@pytest.mark.parametrize("key", ["rotor_layout", "vehicles", "vehicles.distribution", "vehicle"])
+def test_a_zip_opens_no_file_of_this_machine(key, source, capsys):
+    # Who opens it waits for ever.
+    os.mkfifo("fifo.yaml")
+    settings = agent_settings(AGENT)[0].model_dump(mode="json")
+    name, _, inner = key.partition(".")
+    settings[name] = {inner: source} if inner else source
+    assert main(["enjoy", zip_with({"flight_settings": settings}), "--no-render", "-n", "1"]) == 2
+    assert "foreign.zip: flight_settings: " in the_line(capsys)
+    settings = agent_settings(AGENT)[0].model_dump(mode="json")
+    settings["reference"] = {"curve": "file", "file": source}
+    assert agent_settings(zip_with({"flight_settings": settings}))[0] == agent_settings(AGENT)[0]
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "says"),
+    ("key", "entry"),
     [
-        ("policy_kwargs", {"net_arch": [20_000] * 3}, r"asks for 1,\d+,\d+,\d+ parameters"),
-        ("policy_kwargs", {"net_arch": [1] * 10**6}, "too many values"),
-        ("policy_kwargs", {"n_critics": 10**9}, "more than 100 critics"),
-        ("policy.pth", weights(b"}" + b")" + b"\x85" * 300_000 + b"Ns."), r"policy.pth .* .a key"),
-        ("policy.pth", weights(compression=8), "its policy.pth: is compressed"),
-        ("policy.optimizer.pth", weights(tensor=torch.zeros(1).expand(9_999, 9_999)), "a tensor"),
-        ("policy.pth", b"\x80\x02K\x01.", "not what PyTorch saves since 1.6"),
+        ("callback", {"os.makedirs": {"name": str(MARK)}}),
+        ("vec_env_wrapper", "builtins.print"),
+        ("env_wrapper", "os.mkdir"),
     ],
 )
-def test_a_small_zip_that_would_take_much_memory_or_time_is_refused(key, value, says):
-    is_part = isinstance(value, bytes)
-    with pytest.raises(ConfigError, match=says):
-        load_model(foreign_zip(key, content=value) if is_part else zip_with({key: value}))
+def test_settings_call_only_classes_of_the_right_kind(key, entry, capsys):
+    folder = Path("run/QuadTargetTracking-v0")
+    folder.mkdir(parents=True)
+    settings = {"n_timesteps": 400, "n_envs": 2, "vec_env": "dummy", key: entry}
+    # JSON is YAML, too.
+    (folder / "config.yml").write_text(json.dumps(settings))
+    (folder / "args.yml").write_text("{algo: dagger, env: QuadTargetTracking-v0}")
+    assert main(["train", "--resume", "run"]) == 2
+    assert f"config.yml: {key}: " in the_line(capsys)
+    assert not MARK.exists()
 
 
-def test_a_zip_that_unpacks_to_more_than_itself_is_refused(capsys):
-    with zipfile.ZipFile("foreign.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("data", b" " * 10**8)
-    assert main(["enjoy", "foreign.zip", "--no-render"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "model foreign.zip: is compressed, as no zip of SB3 is; pack it with zip -0" in line
-
-
-def test_weights_are_put_only_where_algorithms_have_some():
-    """SB3 writes what is beside the weights wherever its name leads, as to a class of its own."""
-    buffer = io.BytesIO()
-    torch.save({"policy_class": torch.zeros(1)}, buffer)
-    with pytest.raises(ConfigError, match="holds variables that no algorithm has"):
-        load_model(foreign_zip("pytorch_variables.pth", content=buffer.getvalue()))
-    assert not hasattr(ActorCriticPolicy, "data")
+@pytest.mark.parametrize("name", ["../outside", "*/ int x; /*", "two\nlines", "\x1b[2J", "a" * 101])
+def test_a_vehicle_s_name_is_a_name(name):
+    settings = saved_data(AGENT)["flight_settings"]
+    settings["vehicle"]["name"] = name
+    with pytest.raises(ConfigError, match="flight_settings: name: "):
+        agent_settings(zip_with({"flight_settings": settings}))

@@ -9,8 +9,7 @@ earlier frames, its last action or the position integral also takes a state,
 and returns the next one.
 
 A network for PX4 takes the 15 numbers of its module mc_nn_control instead, and
-comes with the module's parameters (docs/export.md). A safetensors file is the
-agent itself, without a pickle, for the commands of this package.
+comes with the module's parameters (docs/export.md).
 
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1 --format onnx
@@ -20,11 +19,10 @@ examples:
   sb3-quad export agent.zip --format torchscript --output speeds
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
   sb3-quad export x500-px4 --format px4
-  sb3-quad export agent.zip --format safetensors
   # a folder that the Crazyflie's firmware builds
   sb3-quad export crazyflie-robust --format crazyflie -o my_app
 
-ONNX and safetensors: pip install '.[export]' from a clone; PX4: pip install
+ONNX: pip install '.[export]' from a clone; PX4: pip install
 '.[px4]'. The check of a C header needs a C compiler.
 """
 
@@ -47,10 +45,10 @@ FLAGS: Flags = {
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     ),
-    "--format": ({"required": True}, "onnx, torchscript, c, crazyflie, px4 or safetensors"),
+    "--format": ({"required": True}, "onnx, torchscript, c, crazyflie or px4"),
     "-o FILE": (
         {"dest": "file"},
-        "file to write, or a folder for it (MODEL.onnx, .pt, .h or .safetensors in this folder); "
+        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder); "
         "for crazyflie and px4 the folder of all files (MODEL_crazyflie, MODEL_px4)",
     ),
     "--output KIND": (

@@ -161,9 +161,10 @@ def describe(spec: ControllerSpec) -> StrDict:
     further = ", ".join(sorted(GROUPS.keys() - FEATURES))
     if further:
         raise ConfigError(f"controller {spec.spec}: the page does not compute {further}")
-    settings = agent_settings(spec.spec)[0]
+    model = load_model(spec.spec)
+    settings, _ = agent_settings(spec.spec, model)
     layout = settings.layout
-    trained = TrainedPolicy(load_model(spec.spec), settings, layout)
+    trained = TrainedPolicy(model, settings, layout)
     network = build_network(trained, f"model {spec.spec}")
     return {
         "kind": "network",
