@@ -21,7 +21,6 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.training.config import TrainingJob, build_config, describe, load_config
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import resume, train
-from sb3_quad.tuning.space import load_space
 
 ENV = "QuadStateRecovery-v0"
 TINY = {
@@ -191,8 +190,6 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
     assert short.rollout_steps == 1 and short.keyword("n_steps") == config.keyword(
         "n_steps"
     )  # of the returns: it stays
-    space = load_space(config)
-    assert space.start() is not None and "n_minibatches" not in space.dimensions
 
 
 @pytest.mark.parametrize(
