@@ -3,7 +3,6 @@ table of one that nothing disturbs; run by make test-zoo.
 """
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -41,7 +40,7 @@ SWEEP = {
 
 
 class NotesNode(BaseCallback):
-    """Leaves a file with the name of the node, and takes its time while there is a file ``slow``."""
+    """Leaves a file with the name of the node, and takes time while there is a file ``slow``."""
 
     def _on_training_start(self):
         Path(f"{ray.get_runtime_context().get_node_id()}.node").touch()
@@ -81,9 +80,9 @@ def test_a_killed_sweep_on_two_nodes_is_restored_with_the_same_table(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "s.yaml").write_text(json.dumps(SWEEP))
     Path("slow").touch()
-    where = ["--address", cluster.address]
-    command = [sys.executable, "-m", "sb3_quad.cli", "sweep", "s.yaml", *where]
-    driver = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT}/tests"})
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT}/tests")
+    command = [sys.executable, "-m", "sb3_quad.cli", "sweep", "--address", cluster.address]
+    driver = subprocess.Popen([*command, "s.yaml"])
     end = time.monotonic() + 600
     while len([*tmp_path.glob("*.node")]) < 2 and driver.poll() is None:
         assert time.monotonic() < end
@@ -92,7 +91,7 @@ def test_a_killed_sweep_on_two_nodes_is_restored_with_the_same_table(
     assert driver.wait() == -signal.SIGKILL
     Path("slow").unlink()
     assert len([*tmp_path.glob("*.node")]) == 2
-    assert main(["sweep", "--resume", "logs/sweep/s_1", "--trust", *where]) == 0
-    assert main(["sweep", "s.yaml", *where]) == 0
+    subprocess.run([*command, "--resume", "logs/sweep/s_1", "--trust"], check=True)
+    subprocess.run([*command, "s.yaml"], check=True)
     restored, whole = (Path(f"logs/sweep/s_{k}/results.csv").read_text() for k in (1, 2))
     assert restored == whole and len(whole.splitlines()) == 1 + 4 * 2

@@ -126,7 +126,6 @@ def test_sweeps_of_the_package_have_configurations(trained_runs, tmp_path, monke
 def test_a_run_is_what_train_gives_and_is_not_trained_twice(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(process, "_most_cpus", process._most_cpus)
-    monkeypatch.setattr(sys, "argv", sys.argv)
     Path("s.yaml").write_text(json.dumps(TINY))
     planned = load_sweep("s.yaml")
     known = {
@@ -134,7 +133,6 @@ def test_a_run_is_what_train_gives_and_is_not_trained_twice(tmp_path, monkeypatc
         "sweep": planned,
         "configurations": checked_configurations(planned),
         "home": str(tmp_path),
-        "command": ["sb3-quad", "sweep"],
     }
     known["folder"].mkdir()
     choice = {"configuration": "run", "seed": 1}
@@ -166,7 +164,7 @@ def test_a_link_in_a_sweep_of_others_leads_nowhere(tmp_path):
     (folder / "runs/run/seed_0").symlink_to(tmp_path / "mine")
     choice = {"configuration": "run", "seed": 0}
     with pytest.raises(ConfigError, match="seed_0"):
-        train_run(choice, folder, sweep(), {}, str(tmp_path), sys.argv)
+        train_run(choice, folder, sweep(), {}, str(tmp_path))
     assert not any((tmp_path / "mine").iterdir())
 
 
@@ -177,10 +175,12 @@ def test_the_table_has_means_over_seeds_and_differences_from_the_first(tmp_path)
     flights = {}
     for name, seed in itertools.product(("a", "b"), (0, 1, 2)):
         values = common + random.normal(float(name == "b"), 0.3, 60)
-        flights[name, seed] = {"hover": {**dict.fromkeys(ROWS, values), "time": [np.nan] * 60}}
+        flights[name, seed] = {
+            "hover": {**dict.fromkeys(ROWS, values), "final_error": [np.nan] * 60}
+        }
     (table,) = write_results(tmp_path, flights)
     rows = {row.name: row.cells for row in table.rows}
-    assert not any("time" in name for name in rows)
+    assert not any("error" in name for name in rows)
     difference = rows["mean reward, more than a (n = 3)"][1]
     assert 0.7 < difference.ends[0] < difference.value < difference.ends[1] < 1.3
     lines = (tmp_path / "results.csv").read_text().splitlines()

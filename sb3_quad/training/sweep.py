@@ -16,14 +16,12 @@ import itertools
 import os
 import platform
 import re
-import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from pydantic import BeforeValidator, Field, PositiveInt
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -66,7 +64,6 @@ from sb3_quad.training.sweep_results import RunFlights, numbers
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 # How often Ray repeats a run that fails, or whose node is lost. It continues from its snapshot.
 RETRIES = 2
-LONGEST = 80  # characters of a name
 TASKS = ("state_recovery", "target_tracking")
 
 
@@ -137,14 +134,10 @@ class Evaluation(Frozen):
         return None
 
 
-def _each_once(seeds: list[int] | int) -> list[int]:
-    return list(dict.fromkeys(as_list(seeds)))
-
-
 class Sweep(Configuration):
     """The keys of a sweep's file."""
 
-    seed: Annotated[list[Seed], BeforeValidator(_each_once)] = Field(default=[0], min_length=1)
+    seed: Annotated[set[Seed], BeforeValidator(as_list)] = Field(default={0}, min_length=1)
     """one or a list"""
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = {}
     """keys, each with a list of values"""
@@ -178,7 +171,7 @@ def checked_configurations(sweep: Sweep) -> dict[str, Configuration]:
     for label, data in _cells(sweep):
         where = f"configuration {label!r}"
         configuration = validate(Configuration, data, where)
-        name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,")[:LONGEST] or "run"
+        name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,")
         # Some file systems do not tell capital letters from small ones.
         if name.lower() in map(str.lower, configurations):
             raise ConfigError(
@@ -258,19 +251,17 @@ def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> tuple[RunFligh
         sweep=sweep,
         configurations=configurations,
         home=os.getcwd(),
-        command=sys.argv,
     )
     trainable = tune.with_resources(work, sweep.resources)
     # A sweep that was killed early has no state yet.
     if any(folder.glob("experiment_state-*")):
-        with raised_as(ConfigError, f"sweep folder {folder}: cannot be restored"):
-            tuner = tune.Tuner.restore(str(folder), trainable, resume_errored=True)
+        tuner = tune.Tuner.restore(str(folder), trainable, resume_errored=True)
     else:
         tuner = tune.Tuner(
             trainable,
             param_space={
                 "configuration": tune.grid_search([*configurations]),
-                "seed": tune.grid_search(sweep.seed),
+                "seed": tune.grid_search(sorted(sweep.seed)),
             },
             tune_config=tune.TuneConfig(max_concurrent_trials=workers),
             run_config=tune.RunConfig(
@@ -302,13 +293,11 @@ def train_run(
     sweep: Sweep,
     configurations: dict[str, Configuration],
     home: str,
-    command: list[str],
 ) -> StrDict:
     """Train a run in its folder, or continue it there, and fly its agent.
 
     :param choice: the ``configuration``, by name, and the ``seed``.
     :param home: the working directory, in which relative paths make sense.
-    :param command: the command line that runs record.
     :raises ConfigError: a machine that does not see the folder; files that lead out of it.
     """
     if not folder.is_dir():
@@ -316,7 +305,6 @@ def train_run(
             f"{folder}: not seen by {platform.node()}; a Ray cluster needs a shared disk"
         )
     os.chdir(home)
-    sys.argv = command
     # One core for each run, so that the weights are the same on any machine.
     torch.set_num_threads(1)
     use_cpus(1)
@@ -344,9 +332,9 @@ def fly_agent(agent: Path, job: TrainingJob, evaluation: Evaluation) -> StrDict:
     """Return the numbers of an agent's flights, by scenario and measure."""
     model = load_model(agent)
     suite = evaluation.load()
-    flights = {}
     if suite is not None:
         spec = ControllerSpec("agent", str(agent))
+        flights = {}
         for scenario in suite.scenarios:
             flown = scenario.flown_by(spec.own and spec.own.vehicle)
             flights[scenario.name] = numbers(fly_scenario(model, flown, own=spec.observed))
@@ -355,12 +343,11 @@ def fly_agent(agent: Path, job: TrainingJob, evaluation: Evaluation) -> StrDict:
     # Without a suite, the episodes are those of the closing table of train.
     seed = seed_for("table", evaluation.seed or 0)
     if hasattr(model, KEY):
-        for task in TASKS:
-            flights[task] = numbers(fly(model, task, episodes, seed, **env_kwargs(model)))
-        return flights
+        how = env_kwargs(model)
+        return {task: numbers(fly(model, task, episodes, seed, **how)) for task in TASKS}
     # A third-party environment has rewards alone, and so has a wrapped one.
     config = job.for_evaluation()
     with closing(make_environments(config, 1, seed)) as env:
         share_statistics(getattr(model, STATISTICS, None), env)
         rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
-    return {config.env_id: {"reward": np.ravel(rewards).tolist()}}
+    return {config.env_id: {"reward": rewards}}

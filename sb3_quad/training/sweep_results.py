@@ -12,7 +12,7 @@ from sb3_quad.evaluation import metric_tables
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.metric_tables import estimate_cell
 from sb3_quad.evaluation.statistics import over_seeds
-from sb3_quad.evaluation.tables import Column, Row, Table
+from sb3_quad.evaluation.tables import Column, Table
 
 # The rows of the measures.
 ROWS = {
@@ -20,7 +20,6 @@ ROWS = {
     "survival": metric_tables.SURVIVAL,
     "reward": metric_tables.REWARD,
     "final_error": metric_tables.MEDIAN,
-    "time": Row("mean time until there, or stable", "s"),
 }
 # All are means, except for the final error, which is a median.
 STATISTICS = {**dict.fromkeys(ROWS, "mean"), "final_error": "median"}
@@ -33,26 +32,20 @@ CAPTION = (
 LEVELS = ("configuration", "seed", "scenario", "episode")
 RunFlights: TypeAlias = dict[tuple[str, int], StrDict]
 """By configuration and seed, by scenario and measure: a number for each episode, the same episodes
-in every run. Success and survival are 0 or 1; reward is the sum; final_error is in m (NaN: crashed
-or out of range); time in s to the tightest tolerance, or until stable if it starts at its target
-(NaN: never).
+in every run. Success and survival are 0 or 1; reward is the sum; final_error is in m, NaN if it
+crashed or left the range.
 """
 
 
 def numbers(flights: Flights) -> StrDict:
     """Return the measures of all episodes, NaN where there is no number."""
-    # The time to the tightest tolerance.
-    arrival = flights.time_to[min(flights.time_to)]
-    # An episode that starts at its target has no way to it, and thus no cross-track error.
-    has_way = np.isfinite(flights.cross_track_error)
-    measures = {
-        "success": flights.success,
-        "survival": flights.survival,
-        "reward": flights.reward,
-        "final_error": np.where(flights.survival, flights.final_error, np.nan),
-        "time": np.where(has_way, arrival, flights.recovery_time),
+    final_error = np.where(flights.survival, flights.final_error, np.nan)
+    return {
+        "success": flights.success.tolist(),
+        "survival": flights.survival.tolist(),
+        "reward": flights.reward.tolist(),
+        "final_error": final_error.tolist(),
     }
-    return {name: values.tolist() for name, values in measures.items()}
 
 
 def write_results(folder: Path, runs: RunFlights) -> list[Table]:

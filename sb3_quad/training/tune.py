@@ -196,12 +196,11 @@ def _start(objective: Objective) -> StrDict:
     """Return the parameters that stand for the given settings."""
     start = {}
     for name, values in objective.space.items():
-        value: Any = _plain(objective.job.config)
-        for key in name.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
-        if value is not None:
-            text = str(value).removeprefix(LINEAR)
-            start[name] = text if isinstance(values, list) else parse_number(text)
+        value = str(objective.job.config.settings.get(name))
+        if isinstance(values, list):
+            start[name] = value
+        elif value != "None":
+            start[name] = parse_number(value.removeprefix(LINEAR))
     return start
 
 

@@ -30,7 +30,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, raised_as, refuse_unknown
+from sb3_quad.base.errors import refuse_unknown
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import CONF_FILE, SETTINGS_FLAGS, plan, prepare
@@ -70,8 +70,10 @@ def run(options: Namespace) -> int:
 
     # Processes that share a storage must not propose the same trials.
     sampler_seed = None if options.storage else options.seed
-    sampler = _make(optuna.samplers, "sampler", options.sampler, seed=sampler_seed)
-    pruner = _make(optuna.pruners, "pruner", options.pruner)
+    refuse_unknown("sampler", [options.sampler], optuna.samplers.__all__)
+    refuse_unknown("pruner", [options.pruner], optuna.pruners.__all__)
+    sampler = getattr(optuna.samplers, options.sampler)(seed=sampler_seed)
+    pruner = getattr(optuna.pruners, options.pruner)()
     prepare(options)
     # A search is for the settings of a single run.
     options.algo = options.algo or DEFAULT_ALGO
@@ -101,13 +103,3 @@ def run(options: Namespace) -> int:
     print(f"to train: sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {best}")
     print(f"to continue: --storage {shlex.quote(storage)} --study-name {shlex.quote(name)}")
     return signals.exit_code
-
-
-def _make(module: Any, kind: str, name: str, **keywords: Any) -> Any:
-    """Make a sampler or pruner of Optuna.
-
-    :raises ConfigError: an unknown one, or one that needs more arguments.
-    """
-    refuse_unknown(kind, [name], module.__all__)
-    with raised_as(ConfigError, f"--{kind} {name}: cannot be used"):
-        return getattr(module, name)(**keywords)
