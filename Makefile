@@ -178,12 +178,12 @@ $(TRANSFER_INSTALLED): examples/other_simulators/requirements.txt
 	@touch $@
 
 # Environments that borrow all packages of the first: Ray, rl_zoo3 and wandb; Sphinx.
-BORROW = $(PY) -m venv --without-pip $(1) && $(PY) -c 'import sysconfig as s; print(s.get_path("purelib")); print(s.get_path("platlib"))' > \
+BORROW = $(PY) -m venv --without-pip $(1) && $(PY) -c 'import sysconfig as s; print("import site; site.addsitedir(%r)" % s.get_path("purelib"))' > \
 	"$$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth" && \
 	$(PY) -m pip --python $(1) install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 
 $(ZOO_INSTALLED): constraints.txt $(INSTALLED)
-	@$(call BORROW,$(ZOO_VENV)) 'rl_zoo3[plots]' requests ray wandb
+	@$(call BORROW,$(ZOO_VENV)) 'rl_zoo3[plots]' requests 'ray[tune]' wandb
 	@touch $@
 
 # What the extra `docs` of setup.cfg lists.

@@ -30,7 +30,6 @@ Pendulum-v1:
 """
 # Parts of lines that are not run here: which test runs them, or why nothing does.
 ELSEWHERE = {
-    "--executor ray": "tests/test_ray.py",
     "--flights": "tests/test_real_flights.py",
     "--resume": "tests/test_runs.py",
     "--track": "tests/test_tracking.py",
@@ -50,7 +49,7 @@ SHORTER = {
     "export": ["--overwrite"],
     "sweep": ["--dry-run"],
     "train": ["--eval-episodes", "2", *EVALUATED],
-    "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", *EVALUATED],
+    "tune": ["-n", "960", "--n-trials", "1", *EVALUATED],
     "demo": ["--overwrite"],
     "plot": ["--overwrite"],
     "benchmark": ["--seconds", "0.02", "--sizes", "8", "--n-envs", "1"],
@@ -168,7 +167,7 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
     )
     monkeypatch.setattr(load, "parse_keys", lambda text, where: shorter(parse_keys(text, where)))
     # Worker processes would not see the patches below.
-    monkeypatch.setattr(evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1))
+    monkeypatch.setattr(evaluate, "ProcessPoolExecutor", lambda *options: ThreadPoolExecutor(1))
     monkeypatch.setattr(
         FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN))
     )

@@ -121,21 +121,6 @@ def available_cpus() -> int:
     return min(os.cpu_count() or 1, _most_cpus)
 
 
-def has_ended(process: int) -> bool:
-    """Whether no process of this machine has this id. False on Windows, which cannot tell."""
-    # On Windows, os.kill sends Ctrl-C or ends the process.
-    if sys.platform == "win32":
-        return False
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    except PermissionError:
-        # The process of another user.
-        pass
-    return False
-
-
 def trusted() -> bool:
     """Whether files may run their own code: after ``--trust``, or by ``SB3_QUAD_TRUST=1``."""
     return os.environ.get(TRUST_VARIABLE, "").lower() in ("1", "true", "yes")

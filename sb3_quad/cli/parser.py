@@ -201,16 +201,6 @@ def field_flags(model: type[BaseModel], *names: str) -> StrDict:
     return flags
 
 
-EXECUTOR: Flags = {
-    "--executor KIND": (
-        str,
-        "local",
-        "local (processes on this machine, default) or ray (docs/sweeps.md)",
-    ),
-    "--address WHERE": (
-        "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)"
-    ),
-}
 TRUST = {
     "--trust": (
         SWITCH,

@@ -3,18 +3,26 @@ folder.
 """
 
 import hashlib
+import multiprocessing
+import os
+import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import as_completed
-from contextlib import closing
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import torch
 
 from sb3_quad.agents.agent_settings import settings_of_model
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays
+from sb3_quad.base.process import ignore_interrupts
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.envs import registration
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
@@ -44,7 +52,6 @@ from sb3_quad.evaluation.results import (
 )
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
-from sb3_quad.executors import start_executor
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
 # The number of flights whose trajectories are kept: of a scenario that is the same each time, and
@@ -80,8 +87,6 @@ def evaluate(
     overwrite: bool = False,
     progress: Progress = lambda done, total, name: None,
     report: Report = lambda line: None,
-    executor: str = "local",
-    address: str | None = None,
     reward: OwnReward = None,
 ) -> Results:
     """Fly all scenarios of a suite with all controllers, on the same episodes.
@@ -91,17 +96,16 @@ def evaluate(
     if there is a reward of your own, fly again, since their code may have changed.
 
     :param folder: folder of the results; it is not made if no controller can be loaded.
-    :param workers: processes that fly at the same time; with one, and no Ray, this process flies.
+    :param workers: processes that fly at the same time; with one, this process flies.
     :param overwrite: remove the results in the folder, instead of refusing it, and start from
         scratch.
     :param report: gets a line for each agent that flies another vehicle than it was trained on, or
         does not say on which.
-    :param executor: executor of the workers, see :func:`~sb3_quad.executors.start_executor`, as for
-        ``address``.
     :param reward: a reward of your own, see :func:`~sb3_quad.evaluation.flights.fly`, or
         ``package.module:function``.
     :raises ConfigError: an unknown backend; a reward that cannot be imported; a folder that holds
         results of another call, that cannot be written, or that another process is writing to.
+    :raises WorkerDied: a worker that ended before its task; what the others have flown is written.
     """
     refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
@@ -136,7 +140,7 @@ def evaluate(
         make_folder(place, "results folder", "-o")
         with locked(place, "folder"):
             results.entries.extend(_resume(place, results.digest, jobs, overwrite))
-            return _fly_missing(place, results, jobs, workers, progress, executor, address)
+            return _fly_missing(place, results, jobs, workers, progress)
     return results
 
 
@@ -177,8 +181,6 @@ def _fly_missing(
     jobs: Sequence[Job],
     workers: int,
     progress: Progress,
-    executor: str,
-    address: str | None,
 ) -> Results:
     """Fly the jobs without an entry, and write everything into the folder."""
     # Workers finish in any order; the entries are in that of the suite.
@@ -187,7 +189,7 @@ def _fly_missing(
     missing = [job for job in jobs if job.name not in done]
     progress(len(done), len(jobs), "")
     # Closed, so that the workers end at once if an outcome cannot be written.
-    with closing(_fly_jobs(missing, workers, executor, address)) as flown:
+    with closing(_fly_jobs(missing, workers)) as flown:
         for number, (job, outcome) in enumerate(flown, len(done) + 1):
             if isinstance(outcome, Failure):
                 results.failures.append(outcome)
@@ -279,24 +281,47 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
 
 
 def _fly_jobs(
-    jobs: Sequence[Job], workers: int, executor: str, address: str | None
-) -> Generator[tuple[Job, Any], None, None]:
-    """Fly jobs and yield each when it is done: in this process, or in an executor's workers.
+    jobs: Sequence[Job], workers: int
+) -> Generator[tuple[Job, tuple[Entry, Arrays] | Failure], None, None]:
+    """Fly jobs and yield each when it is done: in this process, or in workers.
 
-    A job whose worker process ends, by a crash or too little memory, becomes a :class:`Failure`.
+    :raises WorkerDied: a worker that ended by a crash, or because memory was short.
     """
-    if executor == "local" and min(workers, len(jobs)) <= 1:
+    if min(workers, len(jobs)) <= 1:
         for job in jobs:
             yield job, fly_job(job)
         return
-    with start_executor(executor, workers, address) as pool:
-        submitted = {pool.submit(fly_job, job): job for job in jobs}
+    # Threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    alive, end = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(workers, context, _begin_worker, (alive,))
+    submitted = {pool.submit(fly_job, job): job for job in jobs}
+    try:
         for future in as_completed(submitted):
-            job = submitted[future]
-            try:
-                yield job, future.result()
-            except WorkerDied as error:
-                yield job, _failure(job.name, error)
+            yield submitted[future], future.result()
+    except BrokenProcessPool:
+        raise WorkerDied(
+            "a worker process ended unexpectedly (out of memory?); "
+            "repeat the command with fewer --workers to fly what is left"
+        ) from None
+    finally:
+        end.close()
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker(alive: Connection) -> None:
+    """Prepare a worker, which ends when the other end of ``alive`` is closed: by the process that
+    started it, or because that was killed.
+    """
+    ignore_interrupts()
+    torch.set_num_threads(1)
+    threading.Thread(target=_end_with_starter, args=[alive], daemon=True).start()
+
+
+def _end_with_starter(alive: Connection) -> None:
+    with suppress(EOFError):
+        alive.recv()
+    os._exit(1)
 
 
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:

@@ -27,13 +27,12 @@ import sb3_quad.cli.closing
 import sb3_quad.evaluation.evaluate
 import sb3_quad.evaluation.offset_correction
 import sb3_quad.report.results_page
-import sb3_quad.sweep.run
 import sb3_quad.training.snapshots
-import sb3_quad.tuning.results
+import sb3_quad.training.tune
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterVecEnv
 
-RUNS = ("dagger", "ppo_bc", "pipeline", "evaluate", "sweep", "tune", "ppo", "sac")
+RUNS = ("dagger", "ppo_bc", "pipeline", "evaluate", "tune", "ppo", "sac")
 TINY = {
     "n_timesteps": 8000,
     "n_envs": 16,
@@ -58,8 +57,8 @@ SETTINGS = {
     "sac": OFF_POLICY,
 }
 # What a folder has that somebody resumes from; a run has */args.yml.
-MARKS = {"pipeline": "pipeline.yml", "sweep": "plan.json"}
-NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline|sweep)_\d+"
+MARKS = {"pipeline": "pipeline.yml"}
+NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline)_\d+"
 SUITE = """
 name: one
 scenarios:
@@ -69,20 +68,6 @@ scenarios:
     duration: 2
     episodes: 400
 """
-SWEEP = {
-    **{key: DAGGER[key] for key in ("n_timesteps", "n_envs", "env_kwargs")},
-    "hyperparams": {
-        key: DAGGER[key] for key in DAGGER if key not in ("n_timesteps", "n_envs", "env_kwargs")
-    },
-    "name": "sweep",
-    "conf_file": "nominal/dagger.yml",
-    "algo": "dagger",
-    "env": "QuadTargetTracking-v0",
-    "seed": [0, 1],
-    "eval_freq": 2000,
-    "eval_episodes": 4,
-    "evaluation": {"episodes": 4},
-}
 STAGES = [
     {
         "name": "one",
@@ -114,15 +99,11 @@ def command(kind: str, folder: Path) -> list[str]:
         return given.split()
     small = {"QuadTargetTracking-v0": SETTINGS.get(kind, TINY)}
     settings.write_text(yaml.safe_dump({"stages": STAGES} if kind == "pipeline" else small))
-    if kind == "sweep":
-        settings.write_text(yaml.safe_dump(SWEEP))
-        return ["sweep", str(settings), "-f", str(logs), "--workers", "2", "--no-progress"]
     more = ["--conf-file", str(settings), "-f", str(logs), "--no-progress"]
     if kind == "tune":
         space = folder / "space.yml"
         space.write_text("learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}\n")
-        more += f"--search-space {space} --storage {folder / 'study.log'}".split()
-        more += ["--max-total-trials", "3"]
+        more += f"--search-space {space} --storage {folder / 'study.log'} --n-trials 3".split()
         return ["tune", "--algo", "dagger", *more, "--eval-episodes", "4", "--n-evaluations", "2"]
     single = [] if kind == "pipeline" else ["--algo", kind, "--env", "QuadTargetTracking-v0"]
     often = "--eval-freq 1500 --eval-episodes 4 --save-freq 4000 --snapshot-every 0.2"
@@ -170,14 +151,12 @@ def again(kind: str, folder: Path) -> list[str]:
     """What a user types after a kill: ``--resume``, or the same command if there is nothing to go
     on with yet.
     """
-    begun = {"pipeline": "pipeline/*/pipeline.yml", "sweep": "sweep/*/plan.json"}.get(
-        kind, f"{kind}/*/*/args.yml"
-    )
+    begun = {"pipeline": "pipeline/*/pipeline.yml"}.get(kind, f"{kind}/*/*/args.yml")
     found = sorted(folder.glob(f"logs/{begun}"))
     if not found:
         return command(kind, folder)
-    place = found[-1].parent if kind in ("pipeline", "sweep") else found[-1].parent.parent
-    return ["sweep" if kind == "sweep" else "train", "--resume", str(place)]
+    place = found[-1].parent if kind == "pipeline" else found[-1].parent.parent
+    return ["train", "--resume", str(place)]
 
 
 def never_began(path: Path) -> bool:
@@ -204,7 +183,9 @@ def outcome(folder: Path) -> dict[str, object]:
         rows = csv.DictReader(tables[-1].read_text().splitlines())
         return {
             "trials": [
-                (row["learning_rate"], row["value"]) for row in rows if row["state"] == "COMPLETE"
+                (row["params_learning_rate"], row["value"])
+                for row in rows
+                if row["state"] == "COMPLETE"
             ]
         }
     for path in sorted(folder.glob("logs/*/*/**/*")):

@@ -21,7 +21,6 @@ examples:
   sb3-quad evaluate pid agent.zip --suite quick
   # in two processes, or on a Ray cluster
   sb3-quad evaluate agent.zip --suite robustness --workers 2
-  sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
   # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
   # the mean of your own reward next to the task's
@@ -41,7 +40,6 @@ import sys
 from argparse import Namespace
 
 from sb3_quad.cli.parser import (
-    EXECUTOR,
     PROGRESS,
     SEVERAL,
     SWITCH,
@@ -72,7 +70,6 @@ FLAGS: Flags = {
         "show the mean of a reward of your own, function(state, actions) per control step"
     ),
     "--report": (YES_OR_NO, True, "update report.html and its plots (yes)"),
-    **EXECUTOR,
     **TRUST,
     **PROGRESS,
 }
@@ -98,7 +95,7 @@ def run(options: Namespace) -> int:
             folder,
             progress=show,
             report=warn,
-            **given(options, "backend", "workers", "overwrite", "executor", "address", "reward"),
+            **given(options, "backend", "workers", "overwrite", "reward"),
         )
     # Each controller once, in the order of the command line.
     flown = list(dict.fromkeys(entry.controller for entry in results.entries))

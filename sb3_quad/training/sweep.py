@@ -1,0 +1,353 @@
+"""Sweeps: every configuration of a grid or list, trained with every seed by Ray Tune.
+
+A sweep's YAML file has rl-zoo's terms. Keys at the top apply to every configuration;
+``configurations`` maps names to the keys in which some differ; ``grid`` maps keys, dotted for
+nested ones, to lists of values, and every combination of them is a configuration. A sweep's folder
+holds
+
+- ``sweep.yaml``, the sweep as given;
+- ``runs/<configuration>/seed_<k>/``, a pipeline's folder, as ``train`` leaves it;
+- ``results.csv`` and ``report.md``, see :mod:`sb3_quad.training.sweep_results`;
+- Ray Tune's own files, among them ``tuner.pkl``.
+"""
+
+import copy
+import itertools
+import os
+import platform
+import re
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import BeforeValidator, Field, PositiveInt
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_quad.agents.agent_settings import env_kwargs
+from sb3_quad.agents.pretrained import agent_path
+from sb3_quad.agents.statistics import STATISTICS, share_statistics
+from sb3_quad.agents.zips import load_model
+from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.files import one_line
+from sb3_quad.base.imports import import_packages, require
+from sb3_quad.base.literals import put_key
+from sb3_quad.base.process import TRUST_VARIABLE, use_cpus
+from sb3_quad.base.seeds import Seed, seed_for
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.envs.simulation.settings import KEY
+from sb3_quad.envs.vehicles.vehicle import first_vehicle
+from sb3_quad.evaluation.controllers import ControllerSpec
+from sb3_quad.evaluation.evaluate import fly_scenario
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.scenarios.load import load_suite
+from sb3_quad.evaluation.scenarios.scenario import Suite
+from sb3_quad.training.algorithms import as_list
+from sb3_quad.training.config import TrainingJob
+from sb3_quad.training.environments import make_environments
+from sb3_quad.training.options import RunOptions, SettingsOptions, all_changes
+from sb3_quad.training.pipeline import (
+    STATUS_FILE,
+    Pipeline,
+    Stage,
+    plan_training,
+    resume_pipeline,
+    run_pipeline,
+    stage_jobs,
+)
+from sb3_quad.training.sweep_results import RunFlights, numbers
+
+SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
+# How often Ray repeats a run that fails, or whose node is lost. It continues from its snapshot.
+RETRIES = 2
+TASKS = ("state_recovery", "target_tracking")
+
+
+class Configuration(SettingsOptions, RunOptions):
+    """The settings of one training, except for its seed; a missing key has the default of
+    ``train``.
+    """
+
+    algo: str | None = None
+    """algorithm of a single run"""
+    env: str | None = None
+    """environment id of a single run"""
+    conf_file: str | None = None
+    """settings file, of a single run or of a pipeline"""
+    hyperparams: StrDict = {}
+    """settings to change, such as n_steps: 500"""
+
+    def given(self, options: type[Frozen]) -> StrDict:
+        """Return the keys of some options that have another value than their default."""
+        return self.model_dump(include={*options.model_fields}, exclude_defaults=True)
+
+    def plan(self) -> tuple[Pipeline, StrDict]:
+        """Return the pipeline that this trains, a single run as one of one stage, and the options
+        of its jobs.
+        """
+        changes = all_changes(self.hyperparams, self.given(SettingsOptions))
+        planned = plan_training(self.given(Configuration), changes)
+        if isinstance(planned, Stage):
+            planned = Pipeline(stages=[planned])
+        options = self.given(RunOptions)
+        if self.trained_agent is not None:
+            options["trained_agent"] = agent_path(self.trained_agent)
+        return planned, options
+
+    def check(self) -> None:
+        """Check everything that can be checked before a training.
+
+        :raises ConfigError: a setting that does not fit; an unknown vehicle or expert; no agent.
+        """
+        pipeline, options = self.plan()
+        agent = options.get("trained_agent")
+        if agent is not None and not Path(agent).is_file():
+            raise ConfigError(f"trained_agent {agent}: no such file")
+        for job in stage_jobs(pipeline, options):
+            if job.config.task is not None:
+                first_vehicle(job.flight_settings.vehicle)
+            job.config.make_expert()
+
+
+class Evaluation(Frozen):
+    """The fresh episodes on which all agents are compared."""
+
+    suite: str | None = None
+    """name or YAML file; without it, fresh episodes of both tasks"""
+    scenario: Annotated[list[str], BeforeValidator(as_list)] = []
+    """only these of the suite"""
+    episodes: PositiveInt | None = None
+    """of each scenario; without a suite 240"""
+    seed: Seed | None = None
+    """of the episodes"""
+
+    def load(self) -> Suite | None:
+        """Return the scenarios; None without a suite."""
+        if self.suite is not None:
+            return load_suite(self.suite).with_changes(self.scenario, self.episodes, self.seed)
+        if self.scenario:
+            raise ConfigError("evaluation: scenario goes with a suite")
+        return None
+
+
+class Sweep(Configuration):
+    """The keys of a sweep's file."""
+
+    seed: Annotated[set[Seed], BeforeValidator(as_list)] = Field(default={0}, min_length=1)
+    """one or a list"""
+    grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = {}
+    """keys, each with a list of values"""
+    configurations: dict[str, StrDict] = {}
+    """names, each with keys and values"""
+    evaluation: Evaluation = Evaluation()
+    """the episodes that the agents fly in the end"""
+    resources: dict[str, float] = {"cpu": 1}
+    """what Ray reserves for a run, such as gpu: 1"""
+    gym_packages: list[str] = []
+    """modules that register further environments"""
+
+
+def load_sweep(source: StrPath) -> Sweep:
+    """Load the sweep in a YAML file, by path or by the name of one in the package.
+
+    :raises ConfigError: an unreadable file, or a key that is unknown or does not fit.
+    """
+    return validate(Sweep, *SWEEPS.read(source))
+
+
+def checked_configurations(sweep: Sweep) -> dict[str, Configuration]:
+    """Return the configurations of a sweep by their names, which are names of folders, too.
+
+    :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
+        two configurations with the same name.
+    """
+    import_packages(sweep.gym_packages, "gym_packages:")
+    sweep.evaluation.load()
+    configurations: dict[str, Configuration] = {}
+    for label, data in _cells(sweep):
+        where = f"configuration {label!r}"
+        configuration = validate(Configuration, data, where)
+        name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,")
+        # Some file systems do not tell capital letters from small ones.
+        if name.lower() in map(str.lower, configurations):
+            raise ConfigError(
+                f"two configurations are called {name!r}; give them names, or values that differ"
+            )
+        try:
+            configuration.check()
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from None
+        configurations[name] = configuration
+    return configurations
+
+
+def _cells(sweep: Sweep) -> Iterator[tuple[str, StrDict]]:
+    """Yield each configuration: its name with the values of the grid, and all its keys."""
+    # Without configurations there is one, that of the shared keys.
+    for name, own in (sweep.configurations or {"": {}}).items():
+        for values in itertools.product(*sweep.grid.values()):
+            cell = dict(zip(sweep.grid, values, strict=True))
+            data = sweep.given(Configuration)
+            # The entries of mappings are merged, such as those of env_kwargs.
+            for key, value in [*own.items(), *cell.items()]:
+                if isinstance(value, dict) and isinstance(data.get(key), dict):
+                    value = data[key] | value
+                put_key(data, key, copy.deepcopy(value), f"configuration: {key}")
+            words = [name] if name else []
+            words += [f"{key.rpartition('.')[2]}={value}" for key, value in cell.items()]
+            yield ",".join(words) or "run", data
+
+
+@contextmanager
+def ray_cluster(address: str | None) -> Iterator[None]:
+    """Be connected to a Ray cluster within the block.
+
+    :param address: ``auto``, ``host:port`` or ``ray://host:port``; None: a cluster on this machine,
+        which ends with the block.
+    :raises MissingExtra: Ray Tune is not installed.
+    :raises ConfigError: no cluster answers at the address.
+    """
+    require("ray.tune", "ray", "a sweep")
+    ray = require("ray", "ray", "a sweep")
+    trust = {TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0")}
+    where = (
+        f"--address {address}: cannot be used; give auto, host:port or ray://host:port "
+        "of a cluster that ray start has started"
+    )
+    with raised_as(ConfigError, where):
+        ray.init(
+            address or "local",
+            runtime_env={"env_vars": trust},
+            log_to_driver=False,
+            logging_level="ERROR",
+        )
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> tuple[RunFlights, dict[str, str]]:
+    """Train and fly all runs of a sweep, within :func:`ray_cluster`.
+
+    :param folder: the sweep's, which all machines of the cluster see. What Ray Tune has begun in it
+        is continued.
+    :param workers: number of concurrent runs; None: as many as fit.
+    :return: the flights of the finished runs, and why others failed, by name. A run that was
+        interrupted is in neither.
+    :raises ConfigError: a configuration that does not fit; files that Ray Tune cannot restore.
+    """
+    from ray import tune
+
+    folder = folder.absolute()
+    configurations = checked_configurations(sweep)
+    work = partial(
+        train_run,
+        folder=folder,
+        sweep=sweep,
+        configurations=configurations,
+        home=os.getcwd(),
+    )
+    trainable = tune.with_resources(work, sweep.resources)
+    # A sweep that was killed early has no state yet.
+    if any(folder.glob("experiment_state-*")):
+        tuner = tune.Tuner.restore(str(folder), trainable, resume_errored=True)
+    else:
+        tuner = tune.Tuner(
+            trainable,
+            param_space={
+                "configuration": tune.grid_search([*configurations]),
+                "seed": tune.grid_search(sorted(sweep.seed)),
+            },
+            tune_config=tune.TuneConfig(max_concurrent_trials=workers),
+            run_config=tune.RunConfig(
+                name=folder.name,
+                storage_path=str(folder.parent),
+                failure_config=tune.FailureConfig(max_failures=RETRIES),
+                verbose=1,
+            ),
+        )
+    flights = {}
+    failed = {}
+    for result in tuner.fit():
+        run = (result.config["configuration"], result.config["seed"])
+        if result.error is not None:
+            failed[run_name(*run)] = one_line(result.error)
+        elif "flights" in result.metrics:
+            flights[run] = result.metrics["flights"]
+    return flights, failed
+
+
+def run_name(configuration: str, seed: int) -> str:
+    """Return the name of a run, which is that of its folder."""
+    return f"{configuration}/seed_{seed}"
+
+
+def train_run(
+    choice: StrMapping,
+    folder: Path,
+    sweep: Sweep,
+    configurations: dict[str, Configuration],
+    home: str,
+) -> StrDict:
+    """Train a run in its folder, or continue it there, and fly its agent.
+
+    :param choice: the ``configuration``, by name, and the ``seed``.
+    :param home: the working directory, in which relative paths make sense.
+    :raises ConfigError: a machine that does not see the folder; files that lead out of it.
+    """
+    if not folder.is_dir():
+        raise ConfigError(
+            f"{folder}: not seen by {platform.node()}; a Ray cluster needs a shared disk"
+        )
+    os.chdir(home)
+    # One core for each run, so that the weights are the same on any machine.
+    torch.set_num_threads(1)
+    use_cpus(1)
+    import_packages(sweep.gym_packages, "gym_packages:")
+    place = folder / "runs" / run_name(**choice)
+    # A link in a folder from someone else must not make this write elsewhere.
+    for path in (place, *place.rglob("*")):
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(f"{path}: leads out of the sweep's folder; remove it")
+    place.mkdir(parents=True, exist_ok=True)
+    with (place / "log.txt").open("a", buffering=1, encoding="utf-8") as log:
+        report = partial(print, file=log)
+        begun = next(place.glob(f"*/*/{STATUS_FILE}"), None)
+        if begun is not None:
+            trained = resume_pipeline(begun.parent, report)
+        else:
+            pipeline, options = configurations[choice["configuration"]].plan()
+            options |= {"seed": choice["seed"], "log_folder": str(place)}
+            trained = run_pipeline(pipeline, options, "pipeline", report)
+    *_, last = trained.stages.values()
+    return {"flights": fly_agent(Path(last.agent), trained.job, sweep.evaluation)}
+
+
+def fly_agent(agent: Path, job: TrainingJob, evaluation: Evaluation) -> StrDict:
+    """Return the numbers of an agent's flights, by scenario and measure."""
+    model = load_model(agent)
+    suite = evaluation.load()
+    if suite is not None:
+        spec = ControllerSpec("agent", str(agent))
+        flights = {}
+        for scenario in suite.scenarios:
+            flown = scenario.flown_by(spec.own and spec.own.vehicle)
+            flights[scenario.name] = numbers(fly_scenario(model, flown, own=spec.observed))
+        return flights
+    episodes = evaluation.episodes or 240
+    # Without a suite, the episodes are those of the closing table of train.
+    seed = seed_for("table", evaluation.seed or 0)
+    if hasattr(model, KEY):
+        how = env_kwargs(model)
+        return {task: numbers(fly(model, task, episodes, seed, **how)) for task in TASKS}
+    # A third-party environment has rewards alone, and so has a wrapped one.
+    config = job.for_evaluation()
+    with closing(make_environments(config, 1, seed)) as env:
+        share_statistics(getattr(model, STATISTICS, None), env)
+        rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
+    return {config.env_id: {"reward": rewards}}
