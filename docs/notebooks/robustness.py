@@ -26,8 +26,8 @@ import numpy as np
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
+from sb3_quad.evaluation.plots import STYLE
 from sb3_quad.evaluation.scenarios.load import axis_label, parse_suite
-from sb3_quad.report.plots import STYLE
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 

@@ -6,7 +6,7 @@ A sweep's folder holds
   settings;
 - ``runs/<configuration>/seed_<k>/``, folders as ``train`` leaves them;
 - ``records/<configuration>/seed_<k>.json``, a :class:`RunResult` of each run that ended;
-- ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: the measurements.
+- ``results.csv``, ``results.json``, ``report.md``, ``curves.png``: the measurements.
 """
 
 from pathlib import Path

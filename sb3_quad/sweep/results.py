@@ -24,11 +24,9 @@ from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation import metric_tables
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
 from sb3_quad.evaluation.metric_tables import estimate_cell
+from sb3_quad.evaluation.plots import plot_curves, save_figure
 from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
-from sb3_quad.report.curves import plot_curves
-from sb3_quad.report.page import Section, write_page
-from sb3_quad.report.plots import Plot
 from sb3_quad.sweep.folder import RunResult, Sweep
 
 # The rows of the measures.
@@ -234,20 +232,16 @@ def _write_report(
     tables: Sequence[Table],
     curves: Mapping[str, Sequence[Curve]],
 ) -> None:
-    """Write the report of the finished runs: a section for each table, and the learning curves."""
-    sections = [
-        Section(f"table-{number}", table.title, tables=[table], facts=table.caption)
-        for number, table in enumerate(tables)
+    """Write ``report.md`` of the finished runs, and their learning curves as a picture."""
+    parts = [
+        f"# Sweep: {summary.sweep}",
+        f"{summary.finished} of {summary.runs} runs are finished.",
     ]
+    for table in tables:
+        parts += [f"## {table.title}", table.markdown(), table.caption]
     if curves:
-        caption = "Mean over seeds, with their range; of pipelines, that of the last stage."
         # A third-party environment may report neither success nor reward.
         with suppress(ConfigError):
-            plots = [Plot("curves", caption, plot_curves(curves, {}))]
-            sections.append(Section("curves", "Learning curves", plots=plots))
-    write_page(
-        folder,
-        f"Sweep: {summary.sweep}",
-        f"{summary.finished} of {summary.runs} runs are finished.",
-        sections,
-    )
+            save_figure(plot_curves(curves), folder / "curves.png")
+            parts.append("![learning curves](curves.png)")
+    write_text(folder / "report.md", "\n\n".join(parts) + "\n")

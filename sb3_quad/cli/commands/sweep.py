@@ -17,8 +17,8 @@ examples:
   # continue after Ctrl-C or a crash
   sb3-quad sweep --resume logs/sweep/my_sweep_1
 
-The new folder receives the run folders, results.csv, results.json, report.md
-and report.html. For the keys of the file, see docs/sweeps.md.
+The new folder receives the run folders, results.csv, results.json and
+report.md. For the keys of the file, see docs/sweeps.md.
 """
 
 import shlex
