@@ -217,7 +217,9 @@ def features_of(
         to_body = features[:, GROUPS["rotation"]].reshape(-1, 3, 3) @ turns
         features[:, GROUPS["rotation"]] = to_body.reshape(-1, 9)
         features[:, GROUPS["velocity"]] += (to_body @ state.target_velocity[:, :, None])[:, :, 0]
-        features[:, GROUPS["body_rates"]] += state.array[X.target_heading_rate][:, None] * to_body[:, :, 2]
+        features[:, GROUPS["body_rates"]] += (
+            state.array[X.target_heading_rate][:, None] * to_body[:, :, 2]
+        )
         position = features[:, None, GROUPS["position"]] @ turns
         features[:, GROUPS["position"]] = position[:, 0]
         ahead = (ahead.reshape(state.n, -1, 3) @ turns).reshape(ahead.shape)
