@@ -318,7 +318,7 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
     commands = [
         ["train", *algo, "0", *small],
         ["export", zip_file, "--format", "onnx"],
-        ["export", "itm-recovery", "--format", "torchscript", "-o", "pretrained.pt"],
+        ["export", "itm-recovery", "--format", "onnx", "-o", "pretrained.pt"],
         ["tune", *algo, "2", *search, *small],
         ["train", *algo, "0", "--conf-file", best],
     ]

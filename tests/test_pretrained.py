@@ -129,7 +129,7 @@ def test_any_quadcopter_flies_vehicles_with_another_order_of_rotors(vehicle):
 
 
 def test_any_quadcopter_is_exported_for_a_given_vehicle(tmp_path, capsys):
-    command = ["export", "any-quadcopter", "--format", "torchscript", "-o", str(tmp_path)]
+    command = ["export", "any-quadcopter", "--format", "onnx", "-o", str(tmp_path)]
     assert main(command) == 2
     assert "flies any vehicle; say with --vehicle" in capsys.readouterr().err
     assert main([*command, "--vehicle", "crazyflie"]) == 0
@@ -346,10 +346,10 @@ def test_fly_warns_of_a_vehicle_that_an_agent_was_not_trained_on(recwarn):
 def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     before = sorted(FOLDER.iterdir())
-    assert main(["export", "crazyflie-recovery", "--format", "torchscript"]) == 0
+    assert main(["export", "crazyflie-recovery", "--format", "onnx"]) == 0
     output = capsys.readouterr().out
     assert "vehicle: crazyflie" in output and "crazyflie-recovery.zip" in output
-    assert main(["export", "itm-recovery", "--format", "torchscript", "-o", "there"]) == 0
+    assert main(["export", "itm-recovery", "--format", "onnx", "-o", "there"]) == 0
     assert sorted(path.name for path in tmp_path.rglob("*.pt")) == [
         "crazyflie-recovery.pt",
         "itm-recovery.pt",

@@ -38,6 +38,7 @@ def write_report(folder: StrPath) -> Path:
     parts = [
         f"# Suite {escape(results.suite)}",
         escape(results.description),
+        escape(f"Own reward: {results.reward}" if results.reward else ""),
         f"{n_flights:,} flights in {len(results.scenarios)} scenarios, flown by sb3_quad "
         f"{results.package_version}; {CAPTION}.",
     ]

@@ -171,7 +171,7 @@ def test_no_class_is_changed(content, capsys, dagger_run):
             marks=pytest.mark.slow,
         ),
         ("enjoy foreign.zip --no-render -n 1", "action_space"),
-        ("export foreign.zip --format torchscript", "observation_space"),
+        ("export foreign.zip --format onnx", "observation_space"),
         ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "action_space"),
         ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "policy.pth"),
         ("train --algo ppo -i foreign.zip -n 100 --eval-episodes 0", "policy.pth"),
@@ -203,7 +203,7 @@ def test_a_run_folder_that_is_resumed_runs_nothing(key, capsys, dagger_run):
 
 
 def test_trust_goes_on_and_ends_with_the_command(capsys):
-    export = ["export", foreign_zip("observation_space"), "--format", "torchscript"]
+    export = ["export", foreign_zip("observation_space"), "--format", "onnx"]
     main([*export, "--trust"])
     assert MARK.exists()
     MARK.unlink()
