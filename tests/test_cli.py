@@ -226,12 +226,12 @@ def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, ca
     agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
     for line, more, made in zip(
         lines,
-        ([], [], ["--episodes", "2", "--no-report"], ["-o", "agent.pt"]),
+        ([], [], ["--episodes", "2", "--no-report"], ["-o", "agent.onnx"]),
         (
             f"dagger_{ENV}_1.png",
             f"dagger_{ENV}_1.html",
             f"evaluations/dagger_{ENV}_1/results.json",
-            "agent.pt",
+            "agent.onnx",
         ),
         strict=True,
     ):
@@ -378,7 +378,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(
         in capsys.readouterr().err
     )
     assert main(["export", str(run.path), "--format", "onnx"]) == 0
-    assert "vehicle: heavy" in capsys.readouterr().out and (tmp_path / "best_model.pt").is_file()
+    assert "vehicle: heavy" in capsys.readouterr().out and (tmp_path / "best_model.onnx").is_file()
     small = [
         "--suite",
         "quick",

@@ -160,8 +160,8 @@ def test_its_offset_is_trimmed(clone):
 @pytest.mark.slow
 def test_its_export_flies_where_it_flies(clone, tmp_path):
     """In closed loop: the file's thrusts lead to the same ends."""
-    assert main(["export", str(clone), "--format", "onnx", "-o", str(tmp_path / "agent.pt")]) == 0
-    module = th.jit.load(tmp_path / "agent.pt")
+    assert main(["export", str(clone), "--format", "onnx", "-o", str(tmp_path / "agent.onnx")]) == 0
+    module = th.jit.load(tmp_path / "agent.onnx")
     env = QuadcopterVecEnv(1)
     low, high = env.vehicle.thrust_range
     mean, std = env.batch.mean[:, 0], env.batch.std[:, 0]
