@@ -40,8 +40,7 @@ sb3-quad enjoy "RL agent=itm-recovery" geometric "PID expert=pid"
     --task state_recovery --seed 13 -n 90 --speed 0.5 --size 320x320 -o film.webp
 frame film.webp 32 film_frame.png
 """,
-    "side_hit_size.png": CHAPTER_4
-    + "cp thesis/figures/side_hit_size_0.png side_hit_size.png",
+    "side_hit_size.png": CHAPTER_4 + "cp thesis/figures/side_hit_size_0.png side_hit_size.png",
     "tracking_times.png": CHAPTER_4 + "cp thesis/figures/tracking_times.png tracking_times.png",
     "starts.png": """
 sb3-quad evaluate PID=pid geometric "imitation agent=itm-imitation" "RL agent=itm-recovery"
@@ -59,6 +58,8 @@ sb3-quad evaluate PID=pid geometric "RL agent=itm-recovery" itm-robust RAPTOR=ra
 python examples/robustness_plot.py robustness robustness.png
 """,
 }
+
+
 def commands(text: str) -> list[list[str]]:
     """Return the words of each command of a picture."""
     return [shlex.split(line) for line in text.strip().replace("\n    ", " ").splitlines() if line]

@@ -96,32 +96,22 @@ def flight():
     return env.reset(), physical_features(env.true_state())
 
 
-SEES = {
-    "all": {"history": [0, 1, 2, 5], "last_action": True, "position_integral": {"gain": 2.0}},
-    "action": {"last_action": True},
-    "integral": {"position_integral": {}},
-    "frames": {"history": [0, 3]},
-}
+SEES = {"history": [0, 1, 2, 5], "last_action": True, "position_integral": {"gain": 2.0}}
 
 
 @pytest.fixture(scope="module")
 def extended(tmp_path_factory):
-    """Zips of policies that hover, by the weights of one that came with the package, and react to
-    all that they see.
+    """The zip of a policy that hovers, by the weights of one that came with the package, and reacts
+    to all that it sees.
     """
-    folder = tmp_path_factory.mktemp("extended")
+    path = tmp_path_factory.mktemp("extended") / "all.zip"
     torch.manual_seed(0)
-    for name, sees in SEES.items():
-        model = PPO(
-            "MlpPolicy",
-            QuadcopterVecEnv(1, seed=0, **sees),
-            policy_kwargs={"net_arch": [64, 64]},
-            device="cpu",
-        )
-        teach_to_hover(model, std=0.02)
-        FlightSettings(**sees).write_into(model)
-        model.save(folder / f"{name}.zip")
-    return folder
+    env = QuadcopterVecEnv(1, seed=0, **SEES)
+    model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [64, 64]}, device="cpu")
+    teach_to_hover(model, std=0.02)
+    FlightSettings(**SEES).write_into(model)
+    model.save(path)
+    return path
 
 
 compiled = [needs_compiler, pytest.mark.slow]
@@ -140,11 +130,11 @@ def load(file_format, exported, name):
     ("file_format", "output"), [("onnx", "speeds"), pytest.param("c", "thrusts", marks=compiled)]
 )
 def test_it_sees_the_frames_of_the_environment_in_whole_flights(extended, file_format, output):
-    path, sees = extended / "all.zip", SEES["all"]
-    exported = export_policy(path, file_format, output, n_observations=3000)
-    file, policy = load(file_format, exported, "all"), PPO.load(path, device="cpu")
+    exported = export_policy(extended, file_format, output, n_observations=3000)
+    file = load(file_format, exported, "all")
+    policy = PPO.load(extended, device="cpu")
     near = {"target_distance": 1.5, "nearest_target": 0.3}
-    env = QuadcopterVecEnv(4, task_kwargs=near, noise=0.0, seed=5, max_episode_steps=500, **sees)
+    env = QuadcopterVecEnv(4, task_kwargs=near, noise=0.0, seed=5, max_episode_steps=500, **SEES)
     seen, state, integrated = env.reset(), None, 0
     for step in range(499):  # the file flies
         result, state = file(physical_features(env.true_state()), state)
@@ -174,7 +164,7 @@ def test_a_file_with_another_state_is_refused(extended, monkeypatch, wrong):
 
     monkeypatch.setattr(Network, "forward", with_wrong_state)
     with pytest.raises(ExportError, match="differs"):
-        export_policy(extended / "all.zip", "onnx", n_observations=3000)
+        export_policy(extended, "onnx", n_observations=3000)
 
 
 FOLLOWS = {
@@ -310,7 +300,7 @@ def test_a_header_that_does_not_compile_is_refused(zips, monkeypatch):
 
 def test_an_onnx_model_takes_a_state_and_gives_the_next(extended):
     onnx = pytest.importorskip("onnx")
-    exported = export_policy(extended / "all.zip", "onnx", n_observations=1000)
+    exported = export_policy(extended, "onnx", n_observations=1000)
     graph = onnx.load_from_string(exported.content).graph
     ports = [
         (each.name, *each.type.tensor_type.shape.dim) for each in (*graph.input, *graph.output)
@@ -402,7 +392,7 @@ def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, c
     pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
     stateful = section == "A policy with a state"
-    path = extended / "all.zip" if stateful else zips / "tanh.zip"
+    path = extended if stateful else zips / "tanh.zip"
     for file_format, file in (("onnx", "agent.onnx"), ("c", "agent.h")):
         assert main(["export", str(path), "--format", file_format, "-o", file]) == 0
     printed = capsys.readouterr().out

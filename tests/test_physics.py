@@ -37,6 +37,10 @@ class BulletReference:
             str(path), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, **self.client
         )
         pybullet.changeDynamics(self.body, -1, linearDamping=0, angularDamping=0, **self.client)
+        if vehicle.allow_impossible_inertia:
+            # The reader of URDF files sets such an inertia to zero.
+            inertia = list(vehicle.inertia)
+            pybullet.changeDynamics(self.body, -1, localInertiaDiagonal=inertia, **self.client)
         w, x, y, z = state[QUATERNION]
         pybullet.resetBasePositionAndOrientation(
             self.body, state[POSITION], (x, y, z, w), **self.client
@@ -194,6 +198,13 @@ def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
         <= 60.0
     )
     assert worst_difference(vehicle, folder, state, actions, wrench, wind).max() < 1e-9
+
+
+def test_flight_of_an_impossible_inertia_is_pybullets(tmp_path):
+    changes = {"inertia": (0.01, 0.01, 0.025), "allow_impossible_inertia": True}
+    vehicle, rng = ITM.model_copy(update=changes), np.random.default_rng(4)
+    state, actions = random_state(rng, vehicle), random_actions(rng, 400)
+    assert worst_difference(vehicle, tmp_path, state, actions, np.zeros(12)).max() < 1e-9
 
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "itm"])

@@ -222,7 +222,10 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, tmp_path
         (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),
         (["pid", "--task", "state-recovery", "--no-render"], "'state_recovery'"),
         (["pid", "--scenario", "side_hit", "--no-render"], "--scenario"),
-        (["pid", "--scenario", "thesis:side_hit", "--env-kwargs", "noise:0"], "--env-kwargs"),
+        (
+            ["pid", "--scenario", "thesis:side_hit", "--env-kwargs", "a:0", "--no-render"],
+            "--scenario",
+        ),
         (["pid", "--env-kwargs", "nois:0", "--no-render"], "nois"),
         (["pid", "-o", "poses.png"], ".mp4"),
         (["pid", "--size", "big"], "--size"),

@@ -289,6 +289,20 @@ def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_an_inertia_that_no_body_has_is_flown_where_its_file_says_so(
+    tmp_path: Path, capfd: Any
+) -> None:
+    """RotorS gives its Iris 0.0347563, 0.0458929 and 0.0977 kg m²."""
+    data = {"inertia": [0.0347563, 0.0458929, 0.0977], "geometric_gains": None}
+    path = write(tmp_path / "iris.yaml", **data)
+    assert main(["check-vehicle", str(path), "-n", "0"]) == 2
+    assert "allow_impossible_inertia: true flies it" in capfd.readouterr().err
+    path = write(tmp_path / "iris.yaml", **data, allow_impossible_inertia=True)
+    assert main(["check-vehicle", str(path), "-n", "0"]) == 0
+    assert "here by 21 %" in capfd.readouterr().err
+    assert load_vehicle(path).model_copy(update={"mass": 2.0}).inertia_fault
+
+
 def shifted(vehicle: Vehicle, x: float, y: float = 0.0) -> Vehicle:
     """The vehicle with its centre of mass moved, by shares of its arm's length."""
     place = np.array([x, y]) * vehicle.arm_length

@@ -112,6 +112,8 @@ class Vehicle(Frozen):
     """m, kg"""
     inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
     """Ixx, Iyy, Izz of the diagonal inertia, kg m^2"""
+    allow_impossible_inertia: bool = False
+    """whether to fly an inertia that no rigid body has, by more than 5 %"""
     rotor_positions: tuple[Place, Place, Place, Place]
     """x, y of each rotor from the centre of mass (x forward, y left), m; or give rotor_order"""
     rotor_directions: tuple[int, int, int, int]
@@ -211,8 +213,11 @@ class Vehicle(Frozen):
             raise ValueError(
                 f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1"
             )
-        if self.largest_moment > INACCURACY:
-            raise ValueError(f"inertia {list(self.inertia)}: {self.inertia_fault}")
+        if self.largest_moment > INACCURACY and not self.allow_impossible_inertia:
+            raise ValueError(
+                f"inertia {list(self.inertia)}: {self.inertia_fault}; "
+                "allow_impossible_inertia: true flies it all the same"
+            )
         if abs(np.linalg.det(self.mixer)) < 1e-12:
             raise ValueError(
                 "rotor_positions: these rotors cannot give thrust, roll, pitch and yaw "

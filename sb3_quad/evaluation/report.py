@@ -83,7 +83,9 @@ def _figures(
     if not flights:
         return
     yield f"{first.name}_paths", paths_plot(flights, results.colours)
-    if len(first.tolerances) > 2:
+    # An episode that starts at its target does not fly to it.
+    has_way = first.target.waypoints is None and first.target.distance != 0.0
+    if has_way and first.reference is None and len(first.tolerances) > 2:
         yield f"{first.name}_times", arrivals_plot(metrics, results.colours)
 
 
