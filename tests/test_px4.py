@@ -24,7 +24,7 @@ HIDDEN = [5, 8, 11]
 
 
 def seen(n=200, task="recovery_and_tracking", **settings):
-    """Return an environment that shows what PX4 shows, and its present features in units, (n, 18)."""
+    """Return an environment that shows what PX4 shows, and its features in units, (n, 18)."""
     env = QuadcopterVecEnv(n, task, seed=3, vehicle="x500", noise=0.0, features="px4", **settings)
     return env, env.reset()[:, :18] * env.batch.std[:, 0]
 
