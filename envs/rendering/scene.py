@@ -113,7 +113,7 @@ def _add_vehicle(client: Client, vehicle: Vehicle) -> list[int]:
     """
     arm = vehicle.arm_length
     radius = rotor_radius(vehicle)
-    front = []
+    front: list[Part] = []
     rear = [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.0), radius=0.3 * arm, length=0.2 * arm)]
     for x, y in vehicle.rotor_positions:
         # A beam from the middle to the rotor, and the disc that the rotor sweeps.

@@ -136,7 +136,8 @@ def _own_vehicle(where: str, settings: FlightSettings, source: Path | None) -> V
             f"{where}: flies any vehicle; say with --vehicle which one's thrusts the file is to"
             " give"
         )
-    return settings.vehicle
+    vehicle: VehicleSource = settings.vehicle
+    return vehicle
 
 
 def _writer_and_reader(file_format: str, prefix: str, flown: Vehicle) -> tuple[Write, Read]:
