@@ -226,9 +226,14 @@ def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, ca
     agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
     for line, more, made in zip(
         lines,
-        ([], [], ["--episodes", "2", "--no-report"], ["-o", "agent.onnx"]),
         (
-            f"dagger_{ENV}_1.png",
+            ["-n", "5", "--size", "64x64"],
+            [],
+            ["--episodes", "2", "--no-report"],
+            ["-o", "agent.onnx"],
+        ),
+        (
+            f"dagger_{ENV}_1.mp4",
             f"dagger_{ENV}_1.html",
             f"evaluations/dagger_{ENV}_1/results.json",
             "agent.onnx",

@@ -131,15 +131,17 @@ def _add_vehicle(client: Client, vehicle: Vehicle) -> list[int]:
 
 def _add_body(client: Client, parts: Sequence[Part], colour: Colour) -> int:
     """Add a body of at most 16 parts, out of sight; return its number."""
+    shapes, places, boxes, radii, lengths, yaws = zip(*parts, strict=True)
+    attitudes = [p.getQuaternionFromEuler((0.0, 0.0, yaw)) for yaw in yaws]
     # PyBullet takes lists only; tuples crash it.
     shape = client.createVisualShapeArray(
-        shapeTypes=[part.shape for part in parts],
-        halfExtents=[list(part.box) for part in parts],
-        radii=[part.radius for part in parts],
-        lengths=[part.length for part in parts],
+        shapeTypes=list(shapes),
+        halfExtents=np.array(boxes).tolist(),
+        radii=list(radii),
+        lengths=list(lengths),
         rgbaColors=[colour] * len(parts),
-        visualFramePositions=[list(part.at) for part in parts],
-        visualFrameOrientations=[p.getQuaternionFromEuler((0, 0, part.yaw)) for part in parts],
+        visualFramePositions=np.array(places).tolist(),
+        visualFrameOrientations=attitudes,
     )
     return int(client.createMultiBody(0.0, -1, shape, NOWHERE))
 
