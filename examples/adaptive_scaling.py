@@ -10,6 +10,7 @@ flights to targets that nothing else uses. Experts fly unchanged.
 """
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from matplotlib.colors import to_hex, to_rgb
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.offset_correction import N_OFFSETS, ROUNDS, hover_offset
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_bytes
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.cli.output import console
@@ -29,10 +29,10 @@ from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.plots import arrivals_plot, save_figure
 from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
-from sb3_quad.report.scenario_plots import arrivals_plot
 
 POSITION = GROUPS["position"]
 
@@ -152,7 +152,7 @@ def main() -> None:
             red, green, blue = to_rgb(colours[label])
             light = (0.5 + 0.5 * red, 0.5 + 0.5 * green, 0.5 + 0.5 * blue)
             colours[f"{label} (adaptive)"] = to_hex(light)
-        write_bytes(options.output, arrivals_plot(scenario, metrics, colours).png)
+        save_figure(arrivals_plot(metrics, colours), Path(options.output))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ hardly matter.
 import argparse
 import itertools
 from collections.abc import Callable
+from functools import partial
 from time import process_time
 from timeit import Timer
 from typing import Any
@@ -80,10 +81,12 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 240, 1024, 4096])
     parser.add_argument("--seconds", type=float, default=3.0, help="of each one (%(default)s)")
     options = parser.parse_args()
-    subjects = {f"batch, {rows} rows": lambda rows=rows: flying(rows) for rows in options.sizes}
-    subjects["gradient"] = differentiating
+    subjects = {}
+    for rows in options.sizes:
+        subjects[f"batch, {rows} rows"] = partial(flying, rows)
+    subjects["gradient"] = partial(differentiating)
     for algorithm in (DAgger, PPOBC, APG):
-        subjects[f"{algorithm.__name__}, whole loop"] = lambda kind=algorithm: training(kind)
+        subjects[f"{algorithm.__name__}, whole loop"] = partial(training, algorithm)
     for name, make in subjects.items():
         steps, call = make()
         call()  # compiles, and fills caches
