@@ -18,7 +18,7 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs notebooks docs-links pictures pictures-long lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs notebooks docs-links pictures lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
@@ -33,7 +33,6 @@ help:
 	@echo "make test-extras    install each extra into an empty environment, as docs/installation.md says, and try it; ARGS=\"tune zoo\" some"
 	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
 	@echo "make pictures       draw the pages' pictures anew, ARGS=\"starts.png\" some of them; docs/pictures.py has their commands"
-	@echo "make pictures-long  draw those of agents that are trained first, in hours"
 	@echo "make notebooks      run the notebooks whose code has changed, and keep their outputs for the site; ARGS=--rerun all"
 	@echo "make docs-links     ask each address outside of the site, where there is a network"
 	@echo "make lint           check code style, and which package imports which"
@@ -115,9 +114,6 @@ docs-links: $(DOCS_INSTALLED)
 # Films come with the extra [video], which dev has.
 pictures: $(INSTALLED)
 	$(PY) docs/pictures.py $(ARGS)
-
-pictures-long: $(INSTALLED)
-	$(PY) docs/pictures.py --long $(ARGS)
 
 lint: $(INSTALLED) links
 	$(PY) -m ruff check .

@@ -8,7 +8,7 @@ import numpy as np
 from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Lens, chasing, framing_camera
-from sb3_quad.envs.rendering.scene import Pose, Scene
+from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import (
     Client,
     point_window,
@@ -20,7 +20,6 @@ from sb3_quad.envs.simulation.state import (
     FORCE_WORLD,
     POSITION,
     QUATERNION,
-    ROTOR_SPEEDS,
     TARGET,
     TORQUE_WORLD,
     VELOCITY,
@@ -135,7 +134,7 @@ class BulletBody:
 
 
 class Renderer:
-    """Draws one vehicle, its target and the wrench that acts on it. It does not change the flight.
+    """Draws one vehicle and its target. It does not change the flight.
 
     :param width: width of the pictures, pixels.
     :param height: height of the pictures, pixels.
@@ -160,18 +159,16 @@ class Renderer:
         """Begin an episode in ``state``, (STATE_SIZE,): the camera looks along the way to the
         target.
         """
-        self.rotor_angles = np.zeros(4)
         self.forward = chasing(state[TARGET] - state[POSITION])
 
-    def render(self, state: FloatArray, wrench: FloatArray) -> Image | None:
-        """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,). Call it every control step.
+    def render(self, state: FloatArray) -> Image | None:
+        """Draw a state, (STATE_SIZE,). Call it every control step.
 
         :return: uint8 (height, width, 3). If there is a window, None: it shows WINDOW_FPS frames a
             second, and this call waits until real time has caught up.
         """
-        control_step = self.vehicle.control_step
-        self.rotor_angles += state[ROTOR_SPEEDS] * control_step
         if self.human:
+            control_step = self.vehicle.control_step
             # Wait for real time, but do not hurry after a step that took longer.
             now = time.perf_counter()
             self.shown_at = max(self.shown_at + control_step, now)
@@ -180,7 +177,7 @@ class Renderer:
             if self.frames_due < 1.0:
                 return None
             self.frames_due %= 1.0
-        self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])
+        self.scene.place(state[:, None])
         # Vehicle and target must both be in the picture.
         both = np.stack([state[POSITION], state[TARGET]])
         camera = framing_camera(both, MARGIN * self.scene.scale, self.forward, self.lens)

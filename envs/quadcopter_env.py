@@ -360,7 +360,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     def _draw(self) -> Image | None:
         if self._renderer is None:
             return None
-        return self._renderer.render(self.batch.state[:, 0], self.batch.total_wrench()[:, 0])
+        return self._renderer.render(self.batch.state[:, 0])
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""

@@ -340,7 +340,7 @@ def test_an_own_reward_is_in_tables_and_files(here, capsys):
     results = load_results("out")
     assert (
         results.reward == "my_rewards:calm"
-        and "my_rewards:calm" in (here / "out" / "report.html").read_text()
+        and "my_rewards:calm" in (here / "out" / "report.md").read_text()
     )
     for name in ("pid", "still"):
         entry = results.entry(name, "tracking")

@@ -74,7 +74,7 @@ env = QuadcopterVecEnv(70, task="recovery_and_tracking", **given)
 sizes = {"n_steps": 20, "batch_size": 600, "n_epochs": 2}
 model = DAgger("MlpPolicy", env, expert=GeometricExpert(), seed=0, **sizes).learn(2 * 70 * 20)
 model.save("extended")
-exported = export_policy("extended.zip", "torchscript", n_observations=2000)
+exported = export_policy("extended.zip", "onnx", n_observations=2000)
 found["exported"] = len(exported.content) > 0
 weights = b"".join(part.numpy().tobytes() for part in model.policy.state_dict().values())
 found["weights"] = hashlib.sha256(weights).hexdigest()

@@ -102,7 +102,7 @@ def test_a_misspelt_name_or_a_part_of_names_is_guessed_and_nothing_else(given, v
         ("train -optimize", "argument '-optimize': the command sb3-quad tune does that"),
         ("train --optimize-hyperparameters", "the command sb3-quad tune does that"),
         ("train --sampler tpe", "argument '--sampler': it belongs to sb3-quad tune"),
-        ("report folder --nothing", "argument '--nothing': see --help, and docs/zoo.md"),
+        ("demo --nothing", "argument '--nothing': see --help, and docs/zoo.md"),
         ("train 5", "argument '5': see --help"),
         ("train --algo a2c", "algorithm 'a2c' (valid: apg, dagger,"),
         (

@@ -318,7 +318,7 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
     commands = [
         ["train", *algo, "0", *small],
         ["export", zip_file, "--format", "onnx"],
-        ["export", "itm-recovery", "--format", "torchscript", "-o", "pretrained.pt"],
+        ["export", "itm-recovery", "--format", "onnx", "-o", "pretrained.onnx"],
         ["tune", *algo, "2", *search, *small],
         ["train", *algo, "0", "--conf-file", best],
     ]
@@ -328,7 +328,7 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
         f"assert not any(map(main, {commands!r}))"
     )
     run(installed / "python", "-c", code, cwd=tmp_path)
-    for path in (Path(Path(zip_file).name).with_suffix(".onnx"), Path("pretrained.pt")):
+    for path in (Path(Path(zip_file).name).with_suffix(".onnx"), Path("pretrained.onnx")):
         assert (tmp_path / path).stat().st_size > 10_000
 
 

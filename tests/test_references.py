@@ -25,9 +25,9 @@ from sb3_quad.evaluation.flightlog import Recorder, read_tracks
 from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.evaluation.following import FOLLOWED, Following
 from sb3_quad.evaluation.metric_tables import overview
+from sb3_quad.evaluation.plots import paths_plot
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.report.scenario_plots import paths_plot
 
 DT = 0.01
 WAYPOINTS = [(3, 0, 1), (3, 3, 0), (0, 0, 0)]
@@ -405,11 +405,11 @@ def test_tables_and_files_hold_the_errors(results):
 def test_plots_show_the_path_of_the_reference(results):
     folder, flown = results
     tracks = {"geometric": read_tracks(folder / flown.entries[0].flights)}
-    figure = paths_plot(flown.scenarios[0], tracks, flown.colours).figure
+    figure = paths_plot(tracks, flown.colours)
     for axes in figure.axes:
         lines = {line.get_label(): line for line in axes.lines}
-        assert len(lines["reference"].get_xdata()) > 50
-        assert {"reference", "geometric"} == lines.keys()
+        assert len(lines["target"].get_xdata()) > 50
+        assert {"target", "geometric"} == lines.keys()
 
 
 def test_comparisons_of_flights_that_follow():

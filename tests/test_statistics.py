@@ -253,7 +253,7 @@ def test_best_model_freezes_and_synchronises_the_environments_of_a_user(tmp_path
         model.learn(64, callback=plain)
 
 
-@pytest.mark.parametrize("file_format", ["torchscript", "c"])
+@pytest.mark.parametrize("file_format", ["onnx", "c"])
 def test_files_hold_the_statistics(run, file_format):
     """The check flies beyond the statistics' bound, by which inputs are clipped."""
     exported = export_policy(run.model, file_format, n_observations=2000)
@@ -291,7 +291,7 @@ def test_a_training_behind_wrappers_ends_well_and_its_agent_is_not_flown_without
     assert f"saved in {folder}" in out and "no table: " in out and "mean reward" in out
     for command in (
         ["evaluate", str(folder), "--suite", "quick", "-o", "out"],
-        ["export", str(folder), "--format", "torchscript"],
+        ["export", str(folder), "--format", "onnx"],
         ["enjoy", str(folder), "--no-render"],
         ["train", "--expert", str(folder), "--algo", "dagger", "--env", ENV],
     ):

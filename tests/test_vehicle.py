@@ -353,8 +353,8 @@ def test_an_unknown_coefficient_changes_rotor_speeds_alone(tmp_path: Path, capsy
     known = ITM.model_copy(update={"geometric_gains": None})
     flown = [fly(GeometricExpert(each), vehicle=each, n_episodes=4) for each in (known, unknown)]
     np.testing.assert_allclose(flown[0].final_error, flown[1].final_error, atol=1e-9)
-    agent = ["export", "itm-imitation", "--format", "torchscript", "--vehicle", str(path)]
-    assert main([*agent, "--output", "speeds", "-o", str(tmp_path / "a.pt")]) == 2
+    agent = ["export", "itm-imitation", "--format", "onnx", "--vehicle", str(path)]
+    assert main([*agent, "--output", "speeds", "-o", str(tmp_path / "a.onnx")]) == 2
     assert "has no thrust_coefficient" in capsys.readouterr().err
 
 

@@ -1,118 +1,104 @@
-"""Scenes and their pictures: vehicles in poses, targets and arrows, in a PyBullet client."""
+"""Scenes and their pictures: vehicles and their targets over PyBullet's chequered ground.
+
+What is drawn has no mass and touches nothing.
+"""
 
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from PIL import Image as Pillow
+from PIL import ImageDraw
 
 from sb3_quad.base.types import FloatArray
-from sb3_quad.envs.rendering import models
 from sb3_quad.envs.rendering.bullet_client import p
-from sb3_quad.envs.rendering.camera import Camera, Lens
-from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, add_body
-from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Trail, backdrop, draw_trails
+from sb3_quad.envs.rendering.camera import Camera
 from sb3_quad.envs.rendering.window import Client
-from sb3_quad.envs.simulation.state import POSITION, QUATERNION
+from sb3_quad.envs.simulation.state import POSITION, QUATERNION, TARGET
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
+Colour: TypeAlias = tuple[float, float, float, float]
+
+FRONT = (0.93, 0.32, 0.10, 1.0)
+DARK = (0.13, 0.14, 0.17, 1.0)
 MARKER = (0.10, 0.72, 0.28, 1.0)
-FORCE = (0.86, 0.10, 0.14, 1.0)
-TORQUE = (0.55, 0.15, 0.75, 1.0)
 REFERENCE_ARM = 0.24  # of the default vehicle, m
-# Radius of the rings around a target and of a shadow, m, for a vehicle of the default size
-RING = 0.42
-# Drawn rotors turn slower than real ones by this factor; in a film, real speeds would seem to stand
-# still or turn backwards.
-SLOWED = 12.0
-# Attitudes of the two hoops of a target, (x, y, z, w)
-LENGTHWISE = (0.0, 0.0, 0.0, 1.0)
-CROSSWISE = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+BALL = 0.08  # radius of a target, m, for a vehicle of the default size
+NOWHERE = (0.0, 0.0, -1000.0)
+NEAR = 0.05  # distances between which bodies are drawn, m
+FAR = 120.0
+LINE = 0.006  # width of a trail, in heights of the picture
 
 
-class Pose(NamedTuple):
-    """A vehicle as it is to be drawn: its state, the wrench on it, and how far its rotors have
-    turned.
-    """
+class Part(NamedTuple):
+    """A part of a body: a box, or an upright cylinder."""
 
-    state: FloatArray  # (STATE_SIZE,)
-    # (12,): force in the world frame, force in the body frame, N; torques likewise, N m
-    wrench: FloatArray
-    rotor_angles: FloatArray  # (4,), rad, without sign
+    shape: int
+    at: Sequence[float]  # m
+    box: Sequence[float] = (0.0, 0.0, 0.0)  # half of its sides, m
+    radius: float = 0.0  # m
+    length: float = 0.0
+    yaw: float = 0.0  # rad
+
+
+class Trail(NamedTuple):
+    """The line that a vehicle has flown along."""
+
+    points: FloatArray  # (n, 3), m, world frame
+    colour: str  # as Pillow takes it, such as #rrggbb
 
 
 class Scene:
-    """Vehicles of one kind, targets, and arrows of wrenches. What it adds to a client has no mass
-    and touches nothing.
+    """Vehicles of one kind, each with its target, which is a green ball.
 
     :param vehicle: the vehicle to draw.
     :param client: the client to draw in; None: a new one without a display, until :meth:`close`.
-    :param n_vehicles: vehicles in the scene; ``n_targets`` likewise.
-    :param size: how much larger than life everything is drawn.
+    :param n_vehicles: vehicles in the scene.
     """
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        client: Client | None = None,
-        n_vehicles: int = 1,
-        n_targets: int = 1,
-        size: float = 1.0,
-    ) -> None:
-        client = client or Client()
-        self.client = client
+    def __init__(self, vehicle: Vehicle, client: Client | None = None, n_vehicles: int = 1) -> None:
+        self.client = client or Client()
         # Distances in pictures are multiples of the scale.
-        self.scale = size * vehicle.arm_length / REFERENCE_ARM
-        self._vehicles = [_VehicleBodies(vehicle, client, size) for _ in range(n_vehicles)]
-        # A target is two crossing hoops, through which a vehicle inside stays visible.
-        self._hoops = [
-            add_body(client, models.hoop(), RING * self.scale, MARKER) for _ in range(2 * n_targets)
+        self.scale = vehicle.arm_length / REFERENCE_ARM
+        self.client.draw_ground()
+        self._vehicles = [_add_vehicle(self.client, vehicle) for _ in range(n_vehicles)]
+        ball = self.client.createVisualShape(
+            p.GEOM_SPHERE, radius=BALL * self.scale, rgbaColor=MARKER
+        )
+        self._targets = [
+            self.client.createMultiBody(0.0, -1, ball, NOWHERE) for _ in range(n_vehicles)
         ]
 
-    def place(self, poses: Sequence[Pose], targets: FloatArray) -> None:
-        """Move everything: a pose for each vehicle, and ``targets``, (n_targets, 3)."""
-        for pose, vehicle in zip(poses, self._vehicles, strict=True):
-            vehicle.place(pose)
-        # Only the last vehicle has a shadow: those of all poses would blacken the ground.
-        x, y, _ = poses[-1].state[POSITION]
-        self._shadow = np.array([x, y, RING * self.scale], np.float32)
-        places = itertools.product(targets, (LENGTHWISE, CROSSWISE))
-        for hoop, place in zip(self._hoops, places, strict=True):
-            self.client.resetBasePositionAndOrientation(hoop, *place)
+    def place(self, states: FloatArray) -> None:
+        """Move everything to the vehicles' states, (STATE_SIZE, n_vehicles)."""
+        move = self.client.resetBasePositionAndOrientation
+        for state, bodies, target in zip(states.T, self._vehicles, self._targets, strict=True):
+            # PyBullet's quaternions end with w.
+            attitude = np.roll(state[QUATERNION], -1)
+            for body in bodies:
+                move(body, state[POSITION], attitude)
+            move(target, state[TARGET], (0.0, 0.0, 0.0, 1.0))
 
     def picture(self, camera: Camera, trails: Sequence[Trail] = ()) -> Pillow.Image:
-        """Draw the scene."""
-        # PyBullet draws the bodies larger, since its edges are hard.
+        """Draw the scene, and trails over it."""
         width, height, slope = camera.lens
-        larger = camera._replace(lens=Lens(SUPERSAMPLING * width, SUPERSAMPLING * height, slope))
-        wide, high, _ = larger.lens
-        eye = camera.eye
         forward, _, up = camera.axes
         field_of_view = 2.0 * math.degrees(math.atan(slope))
-        _, _, pixels, _, names = self.client.getCameraImage(
-            wide,
-            high,
-            p.computeViewMatrix(eye, eye + forward, up),
-            p.computeProjectionMatrixFOV(field_of_view, wide / high, NEAR, FAR),
-            lightDirection=np.array([1.2, 0.6, 6.0]) - 3.0 * forward,
+        _, _, pixels, *_ = self.client.getCameraImage(
+            width,
+            height,
+            p.computeViewMatrix(camera.eye, camera.eye + forward, up),
+            p.computeProjectionMatrixFOV(field_of_view, width / height, NEAR, FAR),
             shadow=0,
-            lightAmbientCoeff=0.62,
-            lightDiffuseCoeff=0.45,
-            lightSpecularCoeff=0.08,
             renderer=p.ER_TINY_RENDERER,
         )
-        # Without numpy at PyBullet's build time these are flat tuples.
-        bodies = np.array(pixels, np.uint8).reshape(high, wide, 4)
-        bodies[..., 3] = 255 * (np.reshape(names, (high, wide)) >= 0)
-        # Bodies are drawn over trails, and both over the backdrop.
-        drawn = Pillow.new("RGBA", (wide, high))
-        draw_trails(drawn, trails, larger)
-        drawn.alpha_composite(Pillow.fromarray(bodies))
-        drawn = drawn.convert("RGBa").reduce(SUPERSAMPLING).convert("RGBA")
-        picture = Pillow.fromarray(backdrop(camera, self._shadow))
-        picture.paste(drawn, mask=drawn)
+        # Without numpy at PyBullet's build time these are a flat tuple.
+        rows = np.array(pixels, np.uint8).reshape(height, width, 4)
+        picture = Pillow.fromarray(rows).convert("RGB")
+        for trail in trails:
+            _draw_trail(picture, trail, camera)
         return picture
 
     def close(self) -> None:
@@ -120,44 +106,57 @@ class Scene:
         self.client.close()
 
 
-class _VehicleBodies:
-    """A vehicle and the arrows of the wrench that acts on it."""
+def _add_vehicle(client: Client, vehicle: Vehicle) -> list[int]:
+    """Add a vehicle out of sight; return the numbers of its bodies: its front and its rear.
 
-    def __init__(self, vehicle: Vehicle, client: Client, size: float) -> None:
-        self.move = client.resetBasePositionAndOrientation
-        arm = size * vehicle.arm_length
-        radius = size * models.rotor_radius(vehicle)
-        places = np.array(vehicle.rotor_positions) / vehicle.arm_length
-        self.centres = arm * np.column_stack([places, np.full(len(places), 0.17)])
-        # A rotor's drag on the body opposes its sense of rotation.
-        self.senses = np.negative(vehicle.rotor_directions)
-        self.frame = []
-        for colour, parts in models.frame(places).items():
-            self.frame.append(add_body(client, parts, arm, colour))
-        self.rotors = []
-        for x, _ in places:
-            colour = FRONT if x > 0 else WHITE
-            self.rotors.append(add_body(client, models.rotor(), radius, colour))
-        self.arrows = [
-            add_body(client, models.arrow(), 2.1 * arm, FORCE),
-            add_body(client, models.arrow(), 1.7 * arm, TORQUE),
-        ]
+    A body in PyBullet's window can have only one colour.
+    """
+    arm = vehicle.arm_length
+    radius = rotor_radius(vehicle)
+    front: list[Part] = []
+    rear = [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.0), radius=0.3 * arm, length=0.2 * arm)]
+    for x, y in vehicle.rotor_positions:
+        # A beam from the middle to the rotor, and the disc that the rotor sweeps.
+        beam = Part(
+            p.GEOM_BOX,
+            (x / 2, y / 2, 0.0),
+            box=(math.hypot(x, y) / 2, 0.05 * arm, 0.04 * arm),
+            yaw=math.atan2(y, x),
+        )
+        disc = Part(p.GEOM_CYLINDER, (x, y, 0.15 * arm), radius=radius, length=0.04 * arm)
+        side = front if x > 0 else rear
+        side += [beam, disc]
+    return [_add_body(client, front, FRONT), _add_body(client, rear, DARK)]
 
-    def place(self, pose: Pose) -> None:
-        """Move it."""
-        position = pose.state[POSITION]
-        # PyBullet's quaternions end with w.
-        attitude = np.roll(pose.state[QUATERNION], -1)
-        for body in self.frame:
-            self.move(body, position, attitude)
-        turned = self.senses * pose.rotor_angles / SLOWED
-        for body, centre, angle in zip(self.rotors, self.centres, turned, strict=True):
-            spin = p.getQuaternionFromEuler((0.0, 0.0, angle))
-            self.move(body, *p.multiplyTransforms(position, attitude, centre, spin))
-        # The wrench has a part in the world frame and one in the body frame.
-        wrench = pose.wrench.reshape(2, 2, 3)
-        for body, (in_world, in_body) in zip(self.arrows, wrench, strict=True):
-            x, y, z = in_world + p.rotateVector(attitude, in_body)
-            tilt = math.atan2(math.hypot(x, y), z)
-            along = p.getQuaternionFromEuler((0.0, tilt, math.atan2(y, x)))
-            self.move(body, position if any((x, y, z)) else NOWHERE, along)
+
+def _add_body(client: Client, parts: Sequence[Part], colour: Colour) -> int:
+    """Add a body of at most 16 parts, out of sight; return its number."""
+    shapes, places, boxes, radii, lengths, yaws = zip(*parts, strict=True)
+    attitudes = [p.getQuaternionFromEuler((0.0, 0.0, yaw)) for yaw in yaws]
+    # PyBullet takes lists only; tuples crash it.
+    shape = client.createVisualShapeArray(
+        shapeTypes=list(shapes),
+        halfExtents=np.array(boxes).tolist(),
+        radii=list(radii),
+        lengths=list(lengths),
+        rgbaColors=[colour] * len(parts),
+        visualFramePositions=np.array(places).tolist(),
+        visualFrameOrientations=attitudes,
+    )
+    return int(client.createMultiBody(0.0, -1, shape, NOWHERE))
+
+
+def rotor_radius(vehicle: Vehicle) -> float:
+    """Return the radius at which neighbouring rotors are drawn just clear of each other, m."""
+    pairs = itertools.combinations(vehicle.rotor_positions, 2)
+    return 0.44 * min(itertools.starmap(math.dist, pairs))
+
+
+def _draw_trail(picture: Pillow.Image, trail: Trail, camera: Camera) -> None:
+    """Draw a trail into a picture taken by ``camera``, except for what is behind it."""
+    draw = ImageDraw.Draw(picture)
+    width = max(2, round(LINE * picture.height))
+    screen = camera.project(trail.points)
+    is_ahead = screen[:, 2] > NEAR
+    for k in np.flatnonzero(is_ahead[:-1] & is_ahead[1:]):
+        draw.line(screen[k : k + 2, :2].ravel().tolist(), trail.colour, width)

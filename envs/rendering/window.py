@@ -32,6 +32,15 @@ class Client:
         vars(self)[name] = function
         return function
 
+    def draw_ground(self) -> None:
+        """Add PyBullet's chequered ground, which nothing touches: vehicles have no shape that
+        collides with it.
+        """
+        import pybullet_data
+
+        plane = f"{pybullet_data.getDataPath()}/plane.urdf"
+        self.loadURDF(plane, useFixedBase=True, globalScaling=5.0)
+
     def close(self) -> None:
         """End the simulation, unless it has ended already, for example with its window."""
         if self.isConnected():
@@ -44,7 +53,7 @@ def has_display() -> bool:
 
 
 def open_window(width: int, height: int) -> Client:
-    """Open PyBullet's window, with a ground and without controls; it draws nothing until
+    """Open PyBullet's window, without controls; it draws nothing until
     :func:`start_drawing`.
 
     :raises ConfigError: there is one already in this process, or it cannot be opened.
@@ -64,11 +73,6 @@ def open_window(width: int, height: int) -> Client:
         p.COV_ENABLE_KEYBOARD_SHORTCUTS,
     ):
         client.configureDebugVisualizer(option, 0)
-    import pybullet_data
-
-    # Vehicles have no shape that collides with it.
-    plane = f"{pybullet_data.getDataPath()}/plane.urdf"
-    client.loadURDF(plane, useFixedBase=True, globalScaling=2.0)
     return client
 
 

@@ -23,10 +23,10 @@ from sb3_quad.training.trainer import TrainingResult
 FRESH_EPISODES = 240  # in the table after a single run
 PIPELINE_EPISODES = 480  # in each table after a pipeline
 NEXT = """next:
-  sb3-quad enjoy {agent} --env {env} -o {label}.png
+  sb3-quad enjoy {agent} --env {env} -o {label}.mp4
   sb3-quad demo {agent} pid -o {label}.html
   sb3-quad evaluate {agent} --suite quick -o evaluations/{label}
-  sb3-quad export {agent} --format torchscript{vehicle}"""
+  sb3-quad export {agent} --format onnx{vehicle}"""
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:

@@ -30,8 +30,9 @@ from sb3_quad.evaluation.supervisor import SUPERVISED
 RESULTS = "results.json"
 EPISODES = "episodes.csv"
 FLIGHTS = "flights"
-# Files that are removed together with the results; a report writes the last two.
-WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
+REPORT = "report.md"
+# Files that are removed together with the results.
+WRITTEN = (RESULTS, EPISODES, REPORT)
 # Columns of episodes.csv: arrays of one column each, and those of several numbers
 _FLOWN = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
 _COLUMNS = (*_FLOWN, *FOLLOWED, *SUPERVISED)

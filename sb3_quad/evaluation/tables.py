@@ -1,6 +1,4 @@
-"""One table for terminals (``rich``), Markdown and the page of a report: metrics with their
-intervals, or words.
-"""
+"""One table for terminals (``rich``) and Markdown: metrics with their intervals, or words."""
 
 from collections.abc import Iterable, Sequence
 from html import escape as escape_html
@@ -107,7 +105,7 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Rows of cells. ``rich`` prints it as it is; ``page.html.j2`` makes HTML of it.
+    """Rows of cells, which ``rich`` prints as they are.
 
     :param corner: heading of the row names.
     :param title: above the table and ``caption`` below it, in terminals.

@@ -1,1 +1,1 @@
-"""Trained policies as files that fly without this package: ONNX, TorchScript, a C header."""
+"""Trained policies as files that fly without this package: ONNX, C, Crazyflie, PX4."""

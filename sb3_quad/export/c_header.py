@@ -22,7 +22,7 @@ def c_name(text: str) -> str:
     return name
 
 
-def write_header(network: Network, metadata: StrDict, name: str, half: bool = False) -> bytes:
+def write_header(network: Network, metadata: StrDict, name: str) -> bytes:
     """Return the header, with ``static inline void NAME_policy(const float observation[18], float
     thrust[4])``, and ``NAME_relate``, which makes an observation relative to a moving reference.
 
@@ -32,7 +32,6 @@ def write_header(network: Network, metadata: StrDict, name: str, half: bool = Fa
     :param network: if it outputs speeds, the second parameter is called ``rotor_speed``.
     :param metadata: becomes the comment at the top.
     :param name: beginning of the identifiers, as :func:`c_name` gives it.
-    :param half: whether the weights are in half precision, which takes half the flash.
     """
     return render(
         "sb3_quad.export",
@@ -42,7 +41,6 @@ def write_header(network: Network, metadata: StrDict, name: str, half: bool = Fa
         table=_table,
         c_number=_number,
         network=network,
-        half=half,
         features=OBSERVATION_SIZE,
         F=F,
     ).encode("ascii")

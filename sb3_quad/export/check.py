@@ -9,14 +9,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.algorithms.statistics import statistics_of
 from sb3_quad.base.errors import ConfigError, ExportError
-from sb3_quad.base.types import FloatArray
+from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
-from sb3_quad.envs.simulation.observation import (
-    OBSERVATION_SIZE,
-    turn_features,
-)
+from sb3_quad.envs.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
 from sb3_quad.envs.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.envs.simulation.state import REFERENCE_PARTS, X, row_slices
+from sb3_quad.envs.simulation.state import QuadcopterState, X
 from sb3_quad.envs.simulation.tasks import TASKS, Task
 from sb3_quad.envs.simulation.tracks import ACCELERATION_STD
 from sb3_quad.envs.vehicles.layout import find_turn
@@ -149,16 +146,6 @@ def compare(
         reference=MOVING,
     )
     batch = QuadcopterBatch(max(n // steps, 1), settings, seed=0, autoreset=False)
-    # What a file observes of the same states: the present features, without the position integral
-    present = settings.with_changes(history=None, last_action=False, position_integral=None)
-    shown = QuadcopterBatch(batch.n, present)
-    if relates:
-        # As if the target rested; its motion is passed to the file separately.
-        for part in ("target_velocity", "target_heading", "target_heading_rate"):
-            shown.tracks[:, row_slices(REFERENCE_PARTS)[part]] = 0.0
-    ahead = np.zeros(3 * len(batch.previews))
-    mean = np.append(trained.mean, ahead)
-    std = np.append(trained.std, ahead + ACCELERATION_STD)
     observation = batch.reset()
     compared = np.ones(batch.n, bool)
     # The file flies the vehicle in its own axes and order of rotors.
@@ -168,8 +155,6 @@ def compare(
     error = 0.0
     count = 0
     for _ in range(steps):
-        for name in ("state", "course", "streams"):
-            getattr(shown, name)[...] = getattr(batch, name)
         state = batch.true_state()
         if integral is not None:
             # So close to a limit, rounding may begin to integrate one step earlier or later.
@@ -181,7 +166,7 @@ def compare(
             cosine, sine, rate = state.array[X.target_heading : X.target_heading_rate + 1]
             numbers = np.column_stack([state.target_velocity, np.arctan2(sine, cosine), rate])
             references = [numbers.astype(np.float32, order="C")]
-        features = shown.observe() * std + mean
+        features = features_of(trained, observation, state, rests=relates)
         features[:, :OBSERVATION_SIZE] = features[:, :OBSERVATION_SIZE] @ turned
         results, file_state = call(features.astype(np.float32), file_state, *references)
         if trained.clip:
@@ -201,3 +186,41 @@ def compare(
             f"{allowed:.3g} is allowed ({by}); nothing was written"
         )
     return error, count
+
+
+def features_of(
+    trained: TrainedPolicy, observation: Float32Array, state: QuadcopterState, rests: bool
+) -> FloatArray:
+    """Return what a file takes where the policy observes: its present features in physical units,
+    and the previewed accelerations, (n, OBSERVATION_SIZE + 3 * previews).
+
+    :param observation: of the policy, (n, ...), without noise; it begins with the present frame.
+    :param state: the true state that it shows; headings are commanded.
+    :param rests: return them as if the target rested in the world's axes, for a file that makes
+        them relative to the reference itself.
+    """
+    n_ahead = 3 * len(trained.observation.preview or ())
+    features = observation[:, :OBSERVATION_SIZE] * trained.std + trained.mean
+    ahead = observation[:, observation.shape[1] - n_ahead :] * ACCELERATION_STD
+    # From the world's axes to the reference's heading
+    cosine, sine = state.target_heading.T
+    turns = np.zeros((state.n, 3, 3))
+    turns[:, 0, 0] = turns[:, 1, 1] = cosine
+    turns[:, 0, 1] = sine
+    turns[:, 1, 0] = -sine
+    turns[:, 2, 2] = 1.0
+    if trained.observation.position_integral is not None:
+        # The policy sees the position with the integral added, which the file adds itself.
+        offset = (state.position - state.target)[:, :, None]
+        features[:, GROUPS["position"]] = (turns @ offset)[:, :, 0]
+    if rests:
+        to_body = features[:, GROUPS["rotation"]].reshape(-1, 3, 3) @ turns
+        features[:, GROUPS["rotation"]] = to_body.reshape(-1, 9)
+        features[:, GROUPS["velocity"]] += (to_body @ state.target_velocity[:, :, None])[:, :, 0]
+        features[:, GROUPS["body_rates"]] += (
+            state.array[X.target_heading_rate][:, None] * to_body[:, :, 2]
+        )
+        position = features[:, None, GROUPS["position"]] @ turns
+        features[:, GROUPS["position"]] = position[:, 0]
+        ahead = (ahead.reshape(state.n, -1, 3) @ turns).reshape(ahead.shape)
+    return np.hstack([features, ahead])

@@ -1,7 +1,6 @@
-"""Exported files, run as their users do: loaded by torch, by onnxruntime, or compiled."""
+"""Exported files, run as their users do: loaded by onnxruntime, or compiled."""
 
 import ctypes
-import io
 import shutil
 import subprocess
 import tempfile
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 
 from sb3_quad.base.errors import ConfigError, ExportError, raised_as
 from sb3_quad.base.imports import require
@@ -26,52 +24,30 @@ velocity, heading and heading rate.
 """
 
 
-def load_torchscript(content: bytes, state_size: int) -> tuple[Call, str]:
-    """Load the file with torch on the CPU. Return its call and torch's version.
+def load_onnx(content: bytes, state_size: int) -> tuple[Call, str]:
+    """Load the file with onnxruntime on one thread of the CPU. Return its call and the version.
 
     :param state_size: numbers in a state; 0: the file has no state.
-    """
-    module = th.jit.load(io.BytesIO(content), "cpu")  # type: ignore[no-untyped-call]
-
-    def run(*inputs: Float32Array) -> list[Any]:
-        outputs = module(*map(th.from_numpy, inputs))
-        if not state_size:
-            outputs = [outputs]
-        return [output.numpy() for output in outputs]
-
-    return _call(run, state_size), f"torch {th.__version__}"
-
-
-def load_onnx(content: bytes, state_size: int) -> tuple[Call, str]:
-    """Load the file with onnxruntime on one thread of the CPU, see :func:`load_torchscript`.
-
-    :raises ConfigError: it is not installed.
+    :raises ConfigError: onnxruntime is not installed.
     """
     runtime = require("onnxruntime", "export", "--format onnx")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
     session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
-    def run(*inputs: Float32Array) -> Any:
-        return session.run(None, dict(zip(("observation", "state"), inputs, strict=False)))
-
-    return _call(run, state_size), f"onnxruntime {runtime.__version__}"
-
-
-def _call(run: Callable[..., Any], state_size: int) -> Call:
     def call(rows: Float32Array, state: Any = None) -> Any:
         if not state_size:
-            return run(rows)[0], None
+            return session.run(None, {"observation": rows})[0], None
         # Zeros begin a flight.
         if state is None:
             state = np.zeros((len(rows), state_size), np.float32)
-        return tuple(run(rows, state))
+        return session.run(None, {"observation": rows, "state": state})
 
-    return call
+    return call, f"onnxruntime {runtime.__version__}"
 
 
 def load_header(content: bytes, state_size: int, name: str) -> tuple[Call, str]:
-    """Load a C header with the machine's compiler, see :func:`load_torchscript`.
+    """Load a C header with the machine's compiler, see :func:`load_onnx`.
 
     :param name: the beginning of the header's identifiers.
     :raises ConfigError: there is no compiler.

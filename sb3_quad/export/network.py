@@ -1,11 +1,8 @@
-"""A policy's computation as one torch module, and the files that torch makes from it by tracing:
-TorchScript and ONNX.
-"""
+"""A policy's computation as one torch module, and the ONNX file that torch makes from it."""
 
 import copy
 import io
 import itertools
-import json
 import math
 from typing import Any
 
@@ -253,20 +250,9 @@ def check_policy(policy: Any, where: str) -> None:
         names = " with ".join(kind.__name__ for kind in kinds if kind is not type(None))
         raise ConfigError(
             f"{where}: its policy is {names}; "
-            "only MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, TD3) will do, "
+            "only MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC, TD3) will do, "
             "without a features extractor of its own"
         )
-
-
-def write_torchscript(network: Network, metadata: StrDict) -> bytes:
-    """Return the file that ``torch.jit.load`` reads, in Python and in C++, with ``metadata`` as the
-    extra file ``metadata.json``.
-    """
-    # Tracing records the computation for an example, without this package's classes.
-    buffer = io.BytesIO()
-    traced = th.jit.trace(network, network.examples)  # type: ignore[no-untyped-call]
-    th.jit.save(traced, buffer, _extra_files={"metadata.json": json.dumps(metadata)})
-    return buffer.getvalue()
 
 
 def write_onnx(network: Network, metadata: StrDict) -> bytes:

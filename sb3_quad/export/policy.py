@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-import warnings
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,27 +16,25 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.envs.simulation.observation import FEATURES, GROUPS
-from sb3_quad.envs.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
+from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle, load_vehicle
 from sb3_quad.export import crazyflie, load, px4
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, TrainedPolicy, compare
 from sb3_quad.export.cost import cost_of
 from sb3_quad.export.crazyflie import plan_app
-from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
+from sb3_quad.export.network import Network, build_network, write_onnx
 from sb3_quad.export.px4 import load_px4, motor_order, write_px4
 
 # Formats, with the suffixes of their files or folders
-FORMATS = {
-    "onnx": ".onnx",
-    "torchscript": ".pt",
-    "c": ".h",
-    "crazyflie": "_crazyflie",
-    "px4": "_px4",
-}
+FORMATS = {"onnx": ".onnx", "c": ".h", "crazyflie": "_crazyflie", "px4": "_px4"}
 # Formats that are folders, with the file that contains the policy
 FOLDERS = {"crazyflie": "src/policy.h", "px4": "control_net.tflite"}
 # The other files in them; the template of FILE is FORMAT.FILE.j2, with . for /.
 FILES = {"crazyflie": crazyflie.FILES, "px4": px4.FILES}
+
+Write = Callable[[Network, StrDict], bytes]
+Read = Callable[[bytes, int], tuple[load.Call, str]]
 
 
 class Export(NamedTuple):
@@ -57,10 +55,9 @@ def export_policy(
     vehicle: VehicleSource | None = None,
     name: str | None = None,
     n_observations: int = N_OBSERVATIONS,
-    half: bool = False,
 ) -> Export:
-    """Export an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, APG; ``MlpPolicy``) as a
-    self-contained policy file.
+    """Export an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, APG; ``MlpPolicy``) as a self-contained
+    policy file.
 
     The file takes the features of an observation in physical units, see
     ``metadata["observation"]``, relative to a moving reference, see ``metadata["reference"]``. It
@@ -69,15 +66,13 @@ def export_policy(
     given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it. If
     it finds none, the vehicle must be given, and the scaling is that of Table A.2.
 
-    :param file_format: ``onnx``, ``torchscript``, ``c``, ``crazyflie``, which is an app around the
-        C header, or ``px4``; ``output``: ``thrusts`` or ``speeds``.
+    :param file_format: ``onnx``, ``c``, ``crazyflie``, which is an app around the C header, or
+        ``px4``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: the vehicle whose body frame, order of rotors, thrust limits and, for speeds, kF
         the file uses.
     :param name: the C function is called ``NAME_policy``; None: the name of the zip.
     :param n_observations: maximum number of observations of the check, see
         :func:`~sb3_quad.export.check.compare`.
-    :param half: round the weights to half precision, for ``c``. The check compares the file with
-        the policy with rounded weights.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are
         not the quadcopter's or whose policy is not an ``MlpPolicy``; one that flies any vehicle or
         does not say which, and none is given; a vehicle whose rotors cannot be turned to the layout
@@ -92,71 +87,75 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     refuse_unknown("format", [file_format], FORMATS)
-    if half and file_format != "c":
-        raise ConfigError(f"--half: is for --format c; --format {file_format} keeps float32")
     if file_format in FOLDERS and output != "thrusts":
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
-    # The zip says how its agent flies, unless another vehicle is given.
     model = load_model(path)
-    if half:
-        model.policy.half().float()
     settings, source = agent_settings(path, model)
     if vehicle is None:
-        if source is None:
-            raise ConfigError(
-                f"model {path}: does not say how its agent flies; if no wrapper of observations or"
-                " actions lay over its environment, name its vehicle with --vehicle"
-            )
-        if settings.vehicles is not None:
-            raise ConfigError(
-                f"model {path}: flies any vehicle; "
-                "say with --vehicle which one's thrusts the file is to give"
-            )
-        vehicle = settings.vehicle
+        vehicle = _own_vehicle(f"model {path}", settings, source)
     flown = first_vehicle(vehicle)
     if file_format == "crazyflie":
         # Axes and rotors as the firmware has them.
         flown = flown.in_layout_of(load_vehicle("crazyflie"))
     trained = TrainedPolicy(model, settings, flown, output)
-    # Each format has a writer, and a reader for the check.
-    header = (partial(write_header, name=prefix, half=half), partial(load.load_header, name=prefix))
-    formats: StrDict = {
-        "onnx": (write_onnx, load.load_onnx),
-        "torchscript": (write_torchscript, load.load_torchscript),
-        "px4": (write_px4, partial(load_px4, vehicle=flown)),
-    }
-    network = build_network(trained, f"model {path}", "px4" if file_format == "px4" else "body")
-    write, read = formats.get(file_format, header)
-    cost = None
-    # The cost of conversions from half precision was not measured.
-    if write is header[0] and not half:
-        cost = cost_of(network)
-    plan = {}
-    if file_format == "crazyflie":
-        plan = plan_app(network)
-    metadata = _describe(Path(path), network, cost=cost, plan=plan)
-    with warnings.catch_warnings():
-        # torch calls TorchScript deprecated, but it still loads everywhere, even where
-        # torch.export's files do not.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        # The file is checked, then written again with the result of the check in it.
-        call, by = read(write(network, metadata), network.state_size)
-        error, n_compared = compare(trained, call, by, n_observations, relates=write is header[0])
-        metadata["check"] = (
-            f"largest error {error:.2g} {network.unit} "
-            f"in {n_compared} observations of flights ({by})"
+    features = "px4" if file_format == "px4" else "body"
+    network = build_network(trained, f"model {path}", features)
+    is_header = file_format in ("c", "crazyflie")
+    facts: StrDict = {"cost": cost_of(network) if is_header else None}
+    facts["plan"] = plan_app(network) if file_format == "crazyflie" else {}
+    metadata = _describe(Path(path), network, **facts)
+    # The file is checked, then written again with the result of the check in it.
+    write, read = _writer_and_reader(file_format, prefix, flown)
+    call, by = read(write(network, metadata), network.state_size)
+    error, n_compared = compare(trained, call, by, n_observations, relates=is_header)
+    metadata["check"] = (
+        f"largest error {error:.2g} {network.unit} in {n_compared} observations of flights ({by})"
+    )
+    content = write(network, metadata)
+    files = None
+    if file_format in FOLDERS:
+        words = {"name": prefix, "metadata": metadata, "vehicle": flown, **facts["plan"]}
+        files = _folder(file_format, content, words)
+    if file_format == "px4" and files is not None:
+        metadata["parameters"] = "; ".join(files[px4.PARAMETERS].decode().splitlines())
+    return Export(content, metadata, error, network.unit, source, files)
+
+
+def _own_vehicle(where: str, settings: FlightSettings, source: Path | None) -> VehicleSource:
+    """Return the vehicle that an agent was trained for.
+
+    :raises ConfigError: it flies any vehicle, or does not say which.
+    """
+    if source is None:
+        raise ConfigError(
+            f"{where}: does not say how its agent flies; if no wrapper of observations or"
+            " actions lay over its environment, name its vehicle with --vehicle"
         )
-        content = write(network, metadata)
-    if file_format not in FOLDERS:
-        return Export(content, metadata, error, network.unit, source, None)
-    words = {"name": prefix, "metadata": metadata, "vehicle": flown, "content": content, **plan}
+    if settings.vehicles is not None:
+        raise ConfigError(
+            f"{where}: flies any vehicle; say with --vehicle which one's thrusts the file is to"
+            " give"
+        )
+    vehicle: VehicleSource = settings.vehicle
+    return vehicle
+
+
+def _writer_and_reader(file_format: str, prefix: str, flown: Vehicle) -> tuple[Write, Read]:
+    """Return what writes files of a format, and what reads them for the check."""
+    if file_format == "onnx":
+        return write_onnx, load.load_onnx
+    if file_format == "px4":
+        return write_px4, partial(load_px4, vehicle=flown)
+    return partial(write_header, name=prefix), partial(load.load_header, name=prefix)
+
+
+def _folder(file_format: str, content: bytes, words: StrDict) -> dict[str, bytes]:
+    """Return all files of a folder around a policy, by their paths in it."""
     files = {FOLDERS[file_format]: content}
     for file in FILES[file_format]:
         template = f"{file_format}.{file.replace('/', '.')}.j2"
-        files[file] = render("sb3_quad.export", template, **words).encode()
-    if file_format == "px4":
-        metadata["parameters"] = "; ".join(files[px4.PARAMETERS].decode().splitlines())
-    return Export(content, metadata, error, network.unit, source, files)
+        files[file] = render("sb3_quad.export", template, content=content, **words).encode()
+    return files
 
 
 def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:

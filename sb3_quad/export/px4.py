@@ -149,7 +149,7 @@ def motor_order(vehicle: Vehicle) -> list[int]:
 
 def load_px4(content: bytes, state_size: int, vehicle: Vehicle) -> tuple[Call, str]:
     """Load the file with TensorFlow Lite Micro, in an arena of the module's size, with the module's
-    own processing before and after it; see :func:`.load.load_torchscript`.
+    own processing before and after it; see :func:`.load.load_onnx`.
 
     :raises ConfigError: tflite-micro is not installed; the network needs a larger arena.
     """

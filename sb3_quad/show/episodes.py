@@ -9,20 +9,17 @@ import numpy as np
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
 from sb3_quad.envs.rendering.camera import DOWN, ON_PATH, broadside
-from sb3_quad.envs.rendering.picture import Trail
-from sb3_quad.envs.rendering.scene import MARKER, Pose
-from sb3_quad.envs.simulation.checks import per_row
+from sb3_quad.envs.rendering.scene import MARKER, Trail
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.simulation.state import WRENCH_SIZE, QuadcopterState
-from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
+from sb3_quad.envs.simulation.state import QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
 
-# The path of a target has the colour of its hoops.
+# The path of a target has the colour of its ball.
 TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()
-WRENCH_SECONDS = 0.4  # a wrench is shown for this long, so that a short hit can be seen
 
 
 class Recording(Hook):
@@ -30,7 +27,7 @@ class Recording(Hook):
 
     :ivar results: the metrics of this one flight; to be set once it has been flown.
 
-    :param colour: colour of its trail and its heading, #rrggbb.
+    :param colour: colour of its trail and its name, #rrggbb.
     """
 
     results: Flights
@@ -42,16 +39,6 @@ class Recording(Hook):
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self._states = [state.copy()]
-        self._wrenches = [np.zeros(WRENCH_SIZE)]
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        self._wrenches.append(wrench[0].copy())
 
     def after_step(
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
@@ -62,13 +49,6 @@ class Recording(Hook):
     def state(self) -> QuadcopterState:
         """The true state before the first step and after each one, T + 1."""
         return QuadcopterState.concatenate(self._states)
-
-    @cached_property
-    def wrench(self) -> FloatArray:
-        """The wrench in the step before each state, (T + 1, 12): force in the world and in the body
-        frame, N; torques likewise, N m.
-        """
-        return np.stack(self._wrenches)
 
     @property
     def lost(self) -> str:
@@ -81,18 +61,6 @@ class Recording(Hook):
     def times(self) -> FloatArray:
         """Seconds since the start, (T + 1,)."""
         return np.arange(self.state.n, dtype=np.float64) * self.vehicle.control_step
-
-    @cached_property
-    def rotor_angles(self) -> FloatArray:
-        """Angles by which the rotors have turned, (T + 1, 4), rad."""
-        return np.cumsum(self.state.rotor_speeds, axis=0) * self.vehicle.control_step
-
-    @property
-    def targets(self) -> FloatArray:
-        """The targets flown to, one after the other, (k, 3), world frame, m."""
-        # The first target counts as a change, from NaN.
-        target = self.state.target
-        return target[np.diff(target, axis=0, prepend=np.nan).any(axis=1)]
 
     @property
     def follows(self) -> bool:
@@ -113,56 +81,23 @@ class Recording(Hook):
         end = self.lost or f"{self.state.distance[-1]:.3f} m from its target"
         return f"{end} after {self.times[-1]:.2f} s"
 
-    @property
-    def disturbances(self) -> list[int]:
-        """The steps after which a wrench has begun to act."""
-        # A wrench begins to act in a step if it did not act in the one before.
-        acts = self.wrench.any(axis=1).astype(int)
-        return (np.flatnonzero(np.diff(acts) > 0) + 1).tolist()
-
-    def until(self, step: int) -> "Recording":
-        """The same flight, but as if it had ended in ``step``."""
-        part = Recording(self.name, self.colour)
-        part.vehicle = self.vehicle
-        part.results = self.results
-        part._states = self._states[: step + 1]
-        part._wrenches = self._wrenches[: step + 1]
-        return part
-
     def at(self, seconds: float | FloatArray) -> Any:
         """The index of the last state not later than ``seconds``, a number or an array."""
         return np.searchsorted(self.times, seconds + 1e-9, side="right") - 1
-
-    def wrench_around(self, step: int, seconds: float = WRENCH_SECONDS) -> FloatArray:
-        """The largest force and torque, (12,), of the last ``seconds`` before ``step``."""
-        first = max(0, step - round(seconds / self.vehicle.control_step))
-        recent = self.wrench[first : step + 1]
-        return np.asarray(recent[np.linalg.norm(recent, axis=1).argmax()])
-
-    def pose(self, step: int, seconds: float = WRENCH_SECONDS) -> Pose:
-        """The vehicle to draw, with the wrench of the last ``seconds``."""
-        return Pose(
-            self.state.array[:, step], self.wrench_around(step, seconds), self.rotor_angles[step]
-        )
 
 
 # The flights of all controllers with one seed
 Episode: TypeAlias = Sequence[Recording]
 
 
-def landmarks(recordings: Episode) -> FloatArray:
-    """Return the points and targets of flights, from which a camera is chosen, (n, 3), m."""
-    points = []
-    for recording in recordings:
-        points += [recording.state.position, recording.targets]
-    return np.concatenate(points)
-
-
 def outlook(recordings: Episode) -> FloatArray:
     """Return the direction in which cameras look at flights, (3,), from higher up if targets move
     along paths.
     """
-    return broadside(landmarks(recordings), ON_PATH if recordings[0].follows else DOWN)
+    points = []
+    for recording in recordings:
+        points += [recording.state.position, recording.state.target]
+    return broadside(np.concatenate(points), ON_PATH if recordings[0].follows else DOWN)
 
 
 class Setting(NamedTuple):
@@ -175,21 +110,9 @@ class Setting(NamedTuple):
     own: StrMapping = {}
 
 
-def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = None) -> Setting:
-    """Episodes of some settings.
-
-    :param target: r_T of all of them, (3,), m; None: each episode has its own.
-    :raises ConfigError: an unknown vehicle, a target below ground.
-    """
-    start = {}
-    least = first_vehicle(settings.vehicle).collision_radius
-    if target is not None:
-        start["target"] = per_row("--target", target, 1, 3).T
-        if target[2] <= least:
-            raise ConfigError(
-                f"--target {list(target)}: lies below ground; z must exceed {least:g} m"
-            )
-    return Setting(settings.vehicle, settings, lambda seed: Plan(start))
+def fixed_setting(settings: FlightSettings) -> Setting:
+    """Episodes of some settings, each with a target of its own."""
+    return Setting(settings.vehicle, settings, lambda seed: Plan({}))
 
 
 def scenario_setting(text: str, own: Any = None, vehicle: str | None = None) -> Setting:
@@ -214,7 +137,6 @@ def fly_all(
     seed: int,
     n_timesteps: int | None,
     deterministic: bool = True,
-    n_envs: int = 1,
 ) -> Iterator[Episode]:
     """Fly episodes one after the other, each with all controllers.
 
@@ -223,40 +145,36 @@ def fly_all(
     :param n_timesteps: control steps after which no new episode begins; each episode counts with
         its longest flight. None: one episode.
     :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
-    :param n_envs: number of episodes, with consecutive seeds, that each controller flies side by
-        side.
     :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
     # Without n_timesteps, fly one whole episode.
     longest = setting.settings.longest_episode
     left = n_timesteps or longest
+    colours = colours_of([*controllers])
     while left > 0:
         settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
-        episode: list[Recording] = []
-        colours = colours_of([*controllers])
-        # All controllers fly the same seeds, each with the observations that it was trained on.
+        episode = []
+        # All controllers fly the same seed, each with the observations that it was trained on.
         for name, controller in controllers.items():
             own = settings.with_changes(**setting.own.get(name, {}))
-            for episode_seed in range(seed, seed + n_envs):
-                label = name if n_envs == 1 else f"seed {episode_seed}, {name}"
-                recording = Recording(label, colours[name])
-                try:
-                    recording.results = fly_settings(
-                        controller,
-                        own,
-                        [episode_seed],
-                        "pybullet",
-                        hooks=[recording],
-                        plan=setting.plan(episode_seed),
-                        deterministic=deterministic,
-                    )
-                except ControllerError as error:
-                    raise ControllerError(f"controller {label}: {error}") from error
-                episode.append(recording)
+            recording = Recording(name, colours[name])
+            try:
+                recording.results = fly_settings(
+                    controller,
+                    own,
+                    [seed],
+                    "pybullet",
+                    hooks=[recording],
+                    plan=setting.plan(seed),
+                    deterministic=deterministic,
+                )
+            except ControllerError as error:
+                raise ControllerError(f"controller {name}: {error}") from error
+            episode.append(recording)
         yield episode
         if n_timesteps is None:
             return
         # The longest flight counts, since the others wait for it.
         left -= max(len(recording.times) - 1 for recording in episode)
-        seed += n_envs
+        seed += 1

@@ -26,7 +26,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 import sb3_quad.cli.closing
 import sb3_quad.evaluation.evaluate
 import sb3_quad.evaluation.offset_correction
-import sb3_quad.report.results_page
+import sb3_quad.evaluation.report
 import sb3_quad.training.snapshots
 import sb3_quad.training.tune
 from sb3_quad.cli import main

@@ -52,14 +52,12 @@ SUITE = {
 SETTINGS: dict[str, Any] = {"n_timesteps": 20, "n_envs": 2, "n_steps": 10, "batch_size": 20}
 SETTINGS |= {"policy_kwargs": {"net_arch": [4]}}
 BASES = {
-    "benchmark": "--no-training --seconds 0.001 --sizes 2 --n-envs 1",
     "check-vehicle": "itm -n 1",
     "demo": "pid",
     "enjoy": "pid --no-render -n 3",
     "evaluate": "pid --suite suite.yaml --no-report",
-    "export": "itm-recovery --format torchscript",
+    "export": "itm-recovery --format onnx",
     "plot": "a=no_run",
-    "report": "no_results",
     "sweep": "sweep.yaml --dry-run",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",
     "tune": "--algo dagger --conf-file settings.yml -n 20 --n-trials 1 --eval-episodes 1 "

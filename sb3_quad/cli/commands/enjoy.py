@@ -1,4 +1,4 @@
-r"""Watch controllers fly, in a window, as a film or as one picture.
+r"""Watch controllers fly, in a window or as a film.
 
 Several controllers fly the same episodes side by side.
 
@@ -10,11 +10,10 @@ examples:
   # a film with a panel for each of three controllers
   sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery \
     --seed 13 -o recovery.mp4
-  # a scenario as poses in one picture, and another one in slow motion
-  sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
+  # a scenario in slow motion
   sb3-quad enjoy agent.zip --scenario thesis:side_hit -o hit.mp4 --speed 0.5
   # along a curve, drawn in green
-  sb3-quad enjoy itm-robust --reference figure_eight -o eight.mp4
+  sb3-quad enjoy itm-robust --env-kwargs reference:figure_eight -o eight.mp4
   # your own vehicle without noise, printed only
   sb3-quad enjoy geometric --vehicle my_vehicle.yaml --env-kwargs noise:0 \
     -n 3000 --no-render
@@ -28,20 +27,16 @@ corrected_model.zip, else best_model.zip, else <Env>.zip.
 
 import sys
 from argparse import ArgumentTypeError, Namespace
-from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.files import refuse_existing, replacing
-from sb3_quad.base.literals import parse_value
+from sb3_quad.base.files import refuse_existing
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     OVERWRITE,
     PAIRS,
-    PROGRESS,
-    SEVERAL,
     SWITCH,
     TRUST,
     Flags,
@@ -54,7 +49,6 @@ from sb3_quad.cli.parser import (
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.training.options import DEFAULT_ENV
 
-PICTURE = ".png"
 # Width and height of the only panel, and of one of several, pixels.
 SINGLE = (640, 480)
 PANEL = (480, 480)
@@ -88,10 +82,6 @@ FLAGS: Flags = {
         "--task": "a task such as target_tracking, instead of --env",
         "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
     },
-    "actions": {
-        "--deterministic": (SWITCH, "fly the mean of a policy's actions (default)"),
-        "--stochastic": (SWITCH, "sample a policy's actions"),
-    },
     "controllers CONTROLLER": (
         {"nargs": "*"},
         "controllers to fly, in addition to the agent of --algo",
@@ -100,71 +90,50 @@ FLAGS: Flags = {
         positive,
         "control steps, in as many episodes as needed (one episode)",
     ),
-    "--n-envs N": (positive, 1, "number of parallel episodes, with consecutive seeds (1)"),
+    "--stochastic": (SWITCH, "sample a policy's actions instead of flying their mean"),
     "--seed N": (natural, 0, "seed of the first episode; later ones count up (0)"),
-    "--env-kwargs": (PAIRS, {}, "environment keywords, such as noise:0"),
+    "--env-kwargs": (
+        PAIRS,
+        {},
+        "environment keywords, such as noise:0 or reference:figure_eight",
+    ),
     "--vehicle": "vehicle, by name or YAML file (the scenario's, else the first agent's own)",
-    "--target": (
-        {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")},
-        "target to fly to, m",
-    ),
-    "--reference X": (
-        parse_value,
-        "what the target does: a curve such as figure_eight, fields such as "
-        "dict(curve='circle',speed=3), or the path of a .csv file",
-    ),
     "--no-render": (SWITCH, "only fly and print the results"),
-    "-o --output FILE": (
-        SEVERAL,
-        [],
-        "write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
-    ),
+    "-o --output FILE": "write a film of all episodes (.mp4, .webp or .gif)",
     "--size WxH": (_size, "size of one controller's panel, pixels"),
     "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
     **TRUST,
     **OVERWRITE,
-    **PROGRESS,
 }
 
 
 def run(options: Namespace) -> int:
     """Fly, print the results, show the flights. Returns the exit code."""
-    from PIL import Image
     from rich.console import Console
 
     from sb3_quad.show.episodes import fly_all
-    from sb3_quad.show.film import show_in_window
-    from sb3_quad.show.sequence import sequence
+    from sb3_quad.show.film import film_frames, show_in_window, write_film
 
     window = not (options.no_render or options.output)
     _check(options, window)
     setting, controllers = _setting(options)
-    with Console(file=sys.stderr).status("flying"):
+    console = Console(file=sys.stderr)
+    with console.status("flying"):
         episodes = list(
-            fly_all(
-                controllers,
-                setting,
-                options.seed,
-                options.n_timesteps,
-                not options.stochastic,
-                options.n_envs,
-            )
+            fly_all(controllers, setting, options.seed, options.n_timesteps, not options.stochastic)
         )
     for number, episode in enumerate(episodes, 1):
         for flight in episode:
             prefix = f"episode {number}, " if len(episodes) > 1 else ""
             print(f"{prefix}{flight.name}: {flight.end}, reward {flight.results.reward[0]:.2f}")
-    width, height = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
-    for file in options.output:
-        if file.lower().endswith(PICTURE):
-            picture = Image.fromarray(sequence(episodes[0], width, height))
-            with replacing(file) as stream:
-                picture.save(stream, format="png", optimize=True)
-        else:
-            _write_film(file, episodes, width, height, options)
-        print("saved", file)
+    width, height = options.size or (PANEL if len(controllers) > 1 else SINGLE)
     if window:
         show_in_window(episodes, width, height, options.speed)
+    elif options.output:
+        with console.status("drawing"):
+            frames = (film_frames(episode, width, height, options.speed) for episode in episodes)
+            write_film(Path(options.output), chain.from_iterable(frames))
+        print("saved", options.output)
     return 0
 
 
@@ -185,7 +154,7 @@ def _check(options: Namespace, window: bool) -> None:
         for name in given(options, *AGENT_OF_RUN):
             flag = name.replace("_", "-")
             raise ConfigError(f"--{flag} chooses a run's agent, so it needs --algo; remove it")
-    for name in given(options, "vehicle", "reference", "task").keys() & options.env_kwargs.keys():
+    for name in given(options, "vehicle", "task").keys() & options.env_kwargs.keys():
         raise ConfigError(f"{name}: given by --{name} and by --env-kwargs; remove one of them")
     env_id = options.env or DEFAULT_ENV
     if env_id not in ENVIRONMENTS:
@@ -194,10 +163,9 @@ def _check(options: Namespace, window: bool) -> None:
         )
     if options.size:
         check_size(*options.size)
-    for file in options.output:
-        if not file.lower().endswith(PICTURE):
-            check_film(Path(file))
-        refuse_existing(file, options.overwrite)
+    if options.output:
+        check_film(Path(options.output))
+        refuse_existing(options.output, options.overwrite)
     if window and not has_display():
         raise ConfigError(
             "no display to open a window on (DISPLAY is not set); "
@@ -220,11 +188,9 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     # The settings of the first agent hold for all.
     first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
-        setting = fixed_setting(_flight_settings(options, first), options.target)
-    elif options.env_kwargs or options.target or options.reference:
-        raise ConfigError(
-            "--scenario describes a whole flight; remove --env-kwargs, --target and --reference"
-        )
+        setting = fixed_setting(_flight_settings(options, first))
+    elif options.env_kwargs:
+        raise ConfigError("--scenario describes a whole flight; remove --env-kwargs")
     else:
         setting = scenario_setting(options.scenario, first and first.vehicle, options.vehicle)
     controllers = {}
@@ -249,7 +215,7 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
 
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)
-    changes = given(options, "vehicle", "reference")
+    changes = given(options, "vehicle")
     # With --algo, --env names the environment of the run rather than the task.
     task = options.task or (options.env and not options.algo and env_task)
     if task and task != settings.task:
@@ -284,23 +250,3 @@ def _agent_of_run(options: Namespace) -> tuple[str, str]:
         zips = sorted(file.name for file in run.path.glob("*.zip"))
         raise ConfigError(f"{path}: no such file; the run holds {', '.join(zips)}")
     return f"{options.algo} {path.name}", str(path)
-
-
-def _write_film(
-    file: str, episodes: Sequence[Sequence[Any]], width: int, height: int, options: Namespace
-) -> None:
-    from sb3_quad.cli.output import progress_bar
-    from sb3_quad.show.film import film_frames, frame_times, write_film
-
-    total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
-    images = chain.from_iterable(
-        film_frames(episode, width, height, options.speed) for episode in episodes
-    )
-
-    def frames() -> Iterator[Any]:
-        for done, image in enumerate(images, 1):
-            yield image
-            show(done, total, "frames")
-
-    with progress_bar(options.progress) as show:
-        write_film(Path(file), frames())

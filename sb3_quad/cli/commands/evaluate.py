@@ -69,7 +69,7 @@ FLAGS: Flags = {
     "--reward MODULE:FUNCTION": (
         "show the mean of a reward of your own, function(state, actions) per control step"
     ),
-    "--report": (YES_OR_NO, True, "update report.html and its plots (yes)"),
+    "--report": (YES_OR_NO, True, "write report.md and its plots (yes)"),
     **TRUST,
     **PROGRESS,
 }
@@ -77,7 +77,6 @@ FLAGS: Flags = {
 
 def run(options: Namespace) -> int:
     """Fly, print the table and the failures. Returns the exit code."""
-    from sb3_quad.cli.commands.report import report
     from sb3_quad.cli.output import console, progress_bar, warn
     from sb3_quad.evaluation.controllers import parse_controllers
     from sb3_quad.evaluation.evaluate import evaluate
@@ -103,7 +102,10 @@ def run(options: Namespace) -> int:
         console().print(*overview(results, flown))
         print(f"results in {folder}: results.json, episodes.csv, flights/")
         if options.report:
-            report(folder, overwrite=True)
+            # Matplotlib takes a second.
+            from sb3_quad.evaluation.report import write_report
+
+            print("report in", write_report(folder))
     for failure in results.failures:
         print(
             f"failed: {failure.controller}, {failure.scenario or 'every scenario'}: "

@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX, TorchScript, C, or for a flight controller.
+"""Write a trained policy as ONNX, C, or for a flight controller.
 
 The exported policy takes 18 numbers in physical units: position relative to the
 target, m, world frame; rotation matrix from world to body, row by row;
@@ -16,14 +16,14 @@ examples:
   # defines agent_policy(observation, thrust)
   sb3-quad export agent.zip --format c -o firmware/agent.h --name agent
   # rotor speeds instead of thrusts, rad/s
-  sb3-quad export agent.zip --format torchscript --output speeds
+  sb3-quad export agent.zip --format onnx --output speeds
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
   sb3-quad export x500-px4 --format px4
   # a folder that the Crazyflie's firmware builds
   sb3-quad export crazyflie-robust --format crazyflie -o my_app
 
-ONNX: pip install '.[export]' from a clone; PX4: pip install
-'.[px4]'. The check of a C header needs a C compiler.
+ONNX: pip install '.[export]' from a clone; PX4: pip install '.[px4]'. The check
+of a C header needs a C compiler.
 """
 
 from argparse import Namespace
@@ -34,7 +34,6 @@ from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import (
     OVERWRITE,
-    SWITCH,
     TRUST,
     Flags,
 )
@@ -45,10 +44,10 @@ FLAGS: Flags = {
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC or TD3): "
         "a zip, a run folder, or a name such as itm-recovery",
     ),
-    "--format": ({"required": True}, "onnx, torchscript, c, crazyflie or px4"),
+    "--format": ({"required": True}, "onnx, c, crazyflie or px4"),
     "-o FILE": (
         {"dest": "file"},
-        "file to write, or a folder for it (MODEL.onnx, .pt or .h in this folder); "
+        "file to write, or a folder for it (MODEL.onnx or .h in this folder); "
         "for crazyflie and px4 the folder of all files (MODEL_crazyflie, MODEL_px4)",
     ),
     "--output KIND": (
@@ -57,7 +56,6 @@ FLAGS: Flags = {
         "result of the policy: thrusts (N, default) or speeds (rad/s)",
     ),
     "--vehicle": "vehicle, by name or YAML file (that of the zip or its run folder)",
-    "--half": (SWITCH, "weights in half precision, in half the flash (--format c)"),
     "--name": "call the C function NAME_policy (the name of the file)",
     **TRUST,
     **OVERWRITE,
@@ -92,9 +90,7 @@ def run(options: Namespace) -> int:
         raise ConfigError(f"--name {name}: only a C header has one (--format c)")
     if options.vehicle:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))
-    exported = export_policy(
-        model, options.format, options.output, options.vehicle, name=name, half=options.half
-    )
+    exported = export_policy(model, options.format, options.output, options.vehicle, name)
     files = exported.files or {"": exported.content}
     for path in files:
         refuse_existing(file / path, options.overwrite)

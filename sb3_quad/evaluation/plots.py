@@ -1,0 +1,172 @@
+"""Plots of flights, of what a scenario varies, and of learning curves, in one style."""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import write_bytes
+from sb3_quad.base.types import StrDict
+from sb3_quad.evaluation.flightlog import Track
+from sb3_quad.evaluation.learning_curves import Curve
+from sb3_quad.evaluation.metrics import Metrics
+from sb3_quad.evaluation.results import colours_of
+
+# Inches of a panel
+WIDTH = 5.0
+HEIGHT = 3.3
+DPI = 150
+SHOWN_FLIGHTS = 4  # of a controller, from above and from the side
+LINE_POINTS = 200  # maximum number of points of a flight
+TARGET = "#1a9a45"
+POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
+STYLE = matplotlib.rc_params_from_file(
+    Path(__file__).with_name("plots.mplstyle"), use_default_template=False
+)
+styled = matplotlib.rc_context(STYLE)
+
+Colours = Mapping[str, str]  # #rrggbb by the controllers' labels
+Flights = Mapping[str, Sequence[Track]]  # likewise
+
+
+@styled
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure; the ending of its name says as what.
+
+    :raises ConfigError: a folder that cannot be written, a full disk.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix[1:], dpi=DPI, bbox_inches="tight")
+    write_bytes(path, buffer.getvalue())
+
+
+@styled
+def arrivals_plot(metrics: Mapping[str, Metrics], colours: Colours) -> Figure:
+    """Draw the mean times to each tolerance, cf. Figs. 4.6 and 4.7, with 95 % intervals."""
+    figure, axes = new_axes("tolerance (m)", "time (s)")
+    for label, measured in metrics.items():
+        # There is no point if no flight arrives.
+        means = [dict(arrival.time or {}) for arrival in measured.arrivals]
+        tolerances = [arrival.tolerance for arrival in measured.arrivals]
+        times = pd.DataFrame(means, tolerances, ["value", "low", "high"], np.float64)
+        band(axes, colours[label], label, times, **POINTS)
+    axes.set_ylim(bottom=0.0)
+    legend(figure)
+    return figure
+
+
+@styled
+def paths_plot(flights: Flights, colours: Colours) -> Figure:
+    """Draw the first flights of each controller from above and from the side, with their targets.
+
+    A cross marks where a flight is lost.
+    """
+    figure = Figure(figsize=(2 * WIDTH, HEIGHT), layout="constrained")
+    for axes, (i, j) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
+        axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal")
+        axes.set_adjustable("datalim")
+        for label, tracks in flights.items():
+            for track in tracks[:SHOWN_FLIGHTS]:
+                path = track.position[:, [i, j]]
+                stride = -(-len(path) // LINE_POINTS)
+                axes.plot(*path[::stride].T, color=colours[label], label=label, linewidth=1.8)
+                # A target that rests is a point, one that moves is a line.
+                target = track.targets[:, [i, j]]
+                axes.plot(*target.T, ".-", color=TARGET, label="target", zorder=1)
+                if track.lost:
+                    axes.plot(*path[-1], "X", color=colours[label], markersize=9)
+    legend(figure)
+    return figure
+
+
+@styled
+def success_plot(cells: pd.DataFrame, key: str, title: str, colours: Colours) -> Figure:
+    """Draw success over a quantity that a scenario varies: the mean over the other quantities, in a
+    band from the least to the greatest.
+
+    :param cells: success of each controller, a column by its label, over the varied quantities.
+    :param key: the quantity; ``title``: of its axis.
+    """
+    figure, axes = new_axes(title, "success")
+    for label in cells:
+        shares = cells[label].dropna().groupby(key).agg(["mean", "min", "max"])
+        band(axes, colours[str(label)], str(label), shares, **POINTS)
+    axes.set_ylim(-0.03, 1.03)
+    legend(figure)
+    return figure
+
+
+@styled
+def plot_curves(groups: Mapping[str, Sequence[Curve]], show: Sequence[str] = ()) -> Figure:
+    """Draw learning curves over timesteps, a panel for each of ``show`` (Figs. 4.3 and 4.4).
+
+    :param groups: the curves of an agent's seeds, by its name; their mean is drawn, with their
+        range around it.
+    :param show: what the evaluations hold: ``success``, ``survival``, ``reward`` or a loss; by
+        default success, if the runs have it, and reward.
+    :raises ConfigError: a panel that no curve has values for.
+    """
+    measures: StrDict = {}
+    for runs in groups.values():
+        for run in runs:
+            measures.update(run.measures)
+    if not show:
+        show = [name for name in ("success", "reward") if name in measures]
+    for name in show:
+        if name not in measures:
+            raise ConfigError(f"{name}: the runs hold none; they hold {', '.join(measures)}")
+    figure = Figure(figsize=(WIDTH * len(show), HEIGHT), layout="constrained")
+    panels = figure.subplots(1, len(show), squeeze=False)[0]
+    colours = colours_of([*groups])
+    for panel, name in zip(panels, show, strict=True):
+        panel.set(xlabel="timesteps in millions", ylabel=name.replace("_", " "))
+        for label, runs in groups.items():
+            seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
+            band(panel, colours[label], label + seeds, _mean_and_range(runs, name), **POINTS)
+    legend(figure)
+    return figure
+
+
+def _mean_and_range(runs: Sequence[Curve], name: str) -> pd.DataFrame:
+    """The mean, the lowest and the highest value of the runs over millions of timesteps.
+
+    A run is interpolated between its evaluations. There is no line where a run has no values.
+    """
+    lines = [pd.Series(run.values(name), run.timesteps / 1e6).dropna() for run in runs]
+    table = pd.concat(lines, axis="columns").sort_index()
+    table = table.interpolate("index", limit_area="inside").dropna()
+    # pandas cannot aggregate an empty table: a run has no values, or no two runs overlap.
+    if table.empty:
+        return pd.DataFrame(columns=["mean", "min", "max"], dtype=np.float64)
+    return table.agg(["mean", "min", "max"], axis="columns")
+
+
+def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
+    """Return a figure of one panel, and its axes."""
+    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xlabel=x_label, ylabel=y_label)
+    return figure, axes
+
+
+def band(axes: Axes, colour: str, label: str, table: pd.DataFrame, **style: Any) -> None:
+    """Draw a line and the band around it over the index of a table: value, low and high."""
+    middle, low, high = table.to_numpy().T
+    axes.plot(table.index, middle, color=colour, label=label, **style)
+    axes.fill_between(table.index, low, high, color=colour, alpha=0.16, linewidth=0)
+
+
+def legend(figure: Figure) -> None:
+    """Write every name in the figure once, above its axes."""
+    handles: StrDict = {}
+    for axes in figure.axes:
+        drawn, names = axes.get_legend_handles_labels()
+        handles.update(zip(names, drawn, strict=True))
+    figure.legend([*handles.values()], [*handles], loc="outside upper left", ncols=2)
