@@ -29,9 +29,8 @@ from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
-from sb3_quad.evaluation.results import colours_of
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.evaluation.tables import Column, Table, colours_of
 from sb3_quad.report.scenario_plots import arrivals_plot
 
 POSITION = GROUPS["position"]
@@ -112,14 +111,16 @@ def main() -> None:
         help="scenario of the suite thesis (tracking)",
     )
     parser.add_argument(
-        "--episodes", type=int, metavar="N", help="instead of the scenario's own number"
+        "-n", "--n-episodes", type=int, metavar="N", help="instead of the scenario's own number"
     )
     parser.add_argument(
         "-o", "--output", metavar="FILE", help="picture of the times to each tolerance, .png"
     )
     options = parser.parse_args()
 
-    (scenario,) = load_suite("thesis").with_changes([options.scenario], options.episodes).scenarios
+    (scenario,) = (
+        load_suite("thesis").with_changes([options.scenario], options.n_episodes).scenarios
+    )
     plain = {}
     adapted = {}
     for spec in parse_controllers(options.controllers):

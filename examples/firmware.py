@@ -18,13 +18,15 @@ from stable_baselines3 import PPO
 from sb3_quad import env_kwargs, fly
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
-from sb3_quad.evaluation.flights import Flights, Hook
+from sb3_quad.evaluation.flights import Flights
+from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.evaluation.supervisor import (
     FREE_FALL,
     LOW,
     LOW_TIME,
     UPSIDE_DOWN,
     UPSIDE_DOWN_TIME,
+    Supervisor,
 )
 
 TASKS = ("state_recovery", "target_tracking")
@@ -133,12 +135,14 @@ def print_supervisor(arguments) -> None:
     for agent in arguments.agents:
         for task in TASKS:
             firmware = Firmware()
-            flights = flown(arguments, agent, task, [firmware])
+            supervisor = Supervisor()
+            flights = flown(arguments, agent, task, [firmware, supervisor])
+            watched = supervisor.results()
             print(
                 f"{agent}, {task}: {flights.success.sum()} succeed, settling time"
                 f" {np.nanmean(flights.settling_time[0.1]):.2f} s,"
-                f" {flights.cut_by_supervisor.sum()} of {flights.n} cut, longest"
-                f" {1000 * np.nanmax(flights.low_force_time):.0f} ms below 0.5 g; filtered and at"
+                f" {watched['cut_by_supervisor'].sum()} of {flights.n} cut, longest"
+                f" {1000 * watched['low_force_time'].max():.0f} ms below 0.5 g; filtered and at"
                 f" 25 Hz, by phase: {firmware.cut.sum(axis=1).tolist()}",
                 flush=True,
             )
@@ -158,12 +162,14 @@ def print_battery(arguments) -> None:
     for agent in arguments.agents:
         for task in TASKS:
             for name, changes in conditions.items():
-                flights = flown(arguments, agent, task, **changes)
+                supervisor = Supervisor()
+                flights = flown(arguments, agent, task, [supervisor], **changes)
+                cut = supervisor.results()["cut_by_supervisor"].sum()
                 settling = flights.settling_time[0.1]
                 print(
                     f"{agent}, {task}, {name}: {100 * flights.success.mean():.2f} % succeed,"
                     f" {np.isfinite(settling).mean() * 100:.2f} % settle, after"
-                    f" {np.nanmean(settling):.2f} s, {flights.cut_by_supervisor.sum()} cut",
+                    f" {np.nanmean(settling):.2f} s, {cut} cut",
                     flush=True,
                 )
 

@@ -69,7 +69,7 @@ def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> N
     bottom.set_yscale("log")
     bottom.set_ylim(0.8 * LEAST_ERROR, 10.0)
     bottom.yaxis.set_major_formatter("{x:g}")
-    bottom.set_xlabel(axis_label(key, cells[0]))
+    bottom.set_xlabel(axis_label(key))
     for axes in (top, bottom):
         axes.grid(color="#e4e7ec")
         axes.spines[["top", "right"]].set_visible(False)

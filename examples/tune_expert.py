@@ -27,7 +27,8 @@ from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
-from sb3_quad.evaluation.flights import Flights, Hook, fly, fly_settings
+from sb3_quad.evaluation.flights import Flights, fly, fly_settings
+from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.experts.geometric import GeometricExpert
 
 NEAR = 0.1  # m

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from sb3_quad.cli.app import make_parser
-from sb3_quad.evaluation.results import COLOURS, colours_of
+from sb3_quad.evaluation.tables import COLOURS, colours_of
 from sb3_quad.show.demo.page import DEFAULT_AGENTS
 
 ROOT = Path(__file__).resolve().parent.parent

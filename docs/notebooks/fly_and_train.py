@@ -28,7 +28,7 @@ from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.results import COLOURS, colours_of
+from sb3_quad.evaluation.tables import COLOURS, colours_of
 from sb3_quad.report.plots import STYLE
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})

@@ -49,23 +49,23 @@ name: outside
 scenarios:
   - name: mass
     title: another mass
-    target: {{distance: 10}}
+    task: target_tracking
     duration: 12
-    vary: {{vehicle_changes.mass: [0.7, 0.85, 1.0, 1.15, 1.3]}}
-    episodes: {EPISODES}
+    vary: {{randomize.mass: [0.7, 0.85, 1.0, 1.15, 1.3]}}
+    n_episodes: {EPISODES}
   - name: force
     title: a constant force
-    target: {{distance: 10}}
+    task: target_tracking
     duration: 12
     wrenches: [{{force: {{magnitude: 0}}}}]
     vary: {{wrenches.0.force.magnitude: [0, 1, 2, 3, 4, 5]}}
-    episodes: {EPISODES}
+    n_episodes: {EPISODES}
   - name: delay
     title: a longer delay
-    target: {{distance: 10}}
+    task: target_tracking
     duration: 12
-    vary: {{vehicle_changes.delay: [0, 1, 2, 3, 4, 6]}}
-    episodes: {EPISODES}
+    vary: {{randomize.delay: [0, 1, 2, 3, 4, 6]}}
+    n_episodes: {EPISODES}
 """,
     where="this notebook",
 )
@@ -117,7 +117,7 @@ def plot_grid(results):
             top.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
             bottom.plot(x, np.maximum(error, 1e-3), "o-", color=colour, markersize=4)
         top.set_title(cells[0].title.split(":")[0].capitalize(), loc="left", fontweight="bold")
-        bottom.set(xlabel=axis_label(key, cells[0]), yscale="log")
+        bottom.set(xlabel=axis_label(key), yscale="log")
         bottom.yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set(ylabel="success (%)", ylim=(-4, 104))
     axes[1, 0].set(ylabel="median final error (m)")
@@ -146,12 +146,13 @@ tumbling = parse_suite(
 name: tumbling
 scenarios:
   - name: starts
-    start: {{attitude: {{tilt: 0}}, body_rates: {{magnitude: 0}}, velocity: {{magnitude: 6}}}}
+    task: state_recovery
+    start: {{tilt: 0, body_rates: {{magnitude: 0}}, velocity: {{magnitude: 6}}}}
     vary:
-      start.attitude.tilt: [0, 45, 90, 135, 180]
+      start.tilt: [0, 45, 90, 135, 180]
       start.body_rates.magnitude: [0, 4, 8, 12]
     duration: 6
-    episodes: {EPISODES}
+    n_episodes: {EPISODES}
 """,
     where="this notebook",
 )

@@ -3,32 +3,30 @@ folder.
 """
 
 import hashlib
+import multiprocessing
+import os
+import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import as_completed
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_quad.agents.agent_settings import settings_of_model
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
+from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays
+from sb3_quad.base.process import ignore_interrupts
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.envs import registration
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
-from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
+from sb3_quad.evaluation.controllers import ControllerSpec, controller_record
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
-from sb3_quad.evaluation.flights import (
-    Flights,
-    Hook,
-    OwnReward,
-    Reward,
-    fly_settings,
-    reward_name,
-)
+from sb3_quad.evaluation.flights import Flights, fly_settings
+from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
     FLIGHTS,
@@ -42,9 +40,9 @@ from sb3_quad.evaluation.results import (
     load_results,
     write_episodes,
 )
+from sb3_quad.evaluation.reward import OwnReward, Reward, load_reward, reward_name
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
-from sb3_quad.executors import start_executor
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
 # The number of flights whose trajectories are kept: of a scenario that is the same each time, and
@@ -80,8 +78,6 @@ def evaluate(
     overwrite: bool = False,
     progress: Progress = lambda done, total, name: None,
     report: Report = lambda line: None,
-    executor: str = "local",
-    address: str | None = None,
     reward: OwnReward = None,
 ) -> Results:
     """Fly all scenarios of a suite with all controllers, on the same episodes.
@@ -91,17 +87,16 @@ def evaluate(
     if there is a reward of your own, fly again, since their code may have changed.
 
     :param folder: folder of the results; it is not made if no controller can be loaded.
-    :param workers: processes that fly at the same time; with one, and no Ray, this process flies.
+    :param workers: processes that fly at the same time; with one, this process flies.
     :param overwrite: remove the results in the folder, instead of refusing it, and start from
         scratch.
     :param report: gets a line for each agent that flies another vehicle than it was trained on, or
         does not say on which.
-    :param executor: executor of the workers, see :func:`~sb3_quad.executors.start_executor`, as for
-        ``address``.
     :param reward: a reward of your own, see :func:`~sb3_quad.evaluation.flights.fly`, or
         ``package.module:function``.
     :raises ConfigError: an unknown backend; a reward that cannot be imported; a folder that holds
         results of another call, that cannot be written, or that another process is writing to.
+    :raises SB3QuadError: a worker process ended; the same call resumes.
     """
     refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
@@ -136,7 +131,7 @@ def evaluate(
         make_folder(place, "results folder", "-o")
         with locked(place, "folder"):
             results.entries.extend(_resume(place, results.digest, jobs, overwrite))
-            return _fly_missing(place, results, jobs, workers, progress, executor, address)
+            return _fly_missing(place, results, jobs, workers, progress)
     return results
 
 
@@ -172,33 +167,25 @@ def _load_controllers(
 
 
 def _fly_missing(
-    place: Path,
-    results: Results,
-    jobs: Sequence[Job],
-    workers: int,
-    progress: Progress,
-    executor: str,
-    address: str | None,
+    place: Path, results: Results, jobs: Sequence[Job], workers: int, progress: Progress
 ) -> Results:
     """Fly the jobs without an entry, and write everything into the folder."""
-    # Workers finish in any order; the entries are in that of the suite.
-    order = [job.name for job in jobs]
     done = {entry.name for entry in results.entries}
     missing = [job for job in jobs if job.name not in done]
     progress(len(done), len(jobs), "")
-    # Closed, so that the workers end at once if an outcome cannot be written.
-    with closing(_fly_jobs(missing, workers, executor, address)) as flown:
-        for number, (job, outcome) in enumerate(flown, len(done) + 1):
-            if isinstance(outcome, Failure):
-                results.failures.append(outcome)
-            else:
-                entry, arrays = outcome
-                write_arrays(place / entry.flights, compressed=True, **arrays)
-                results.entries.append(entry)
-                results.entries.sort(key=lambda entry: order.index(entry.name))
-                # Write after each job, so that an interrupted evaluation can resume.
-                results.write(place, finished=False)
-            progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
+    for number, (job, outcome) in enumerate(_fly_jobs(missing, workers), len(done) + 1):
+        if isinstance(outcome, Failure):
+            results.failures.append(outcome)
+        else:
+            entry, arrays = outcome
+            write_arrays(place / entry.flights, compressed=True, **arrays)
+            results.entries.append(entry)
+            # Write after each job, so that an interrupted evaluation can resume.
+            results.write(place, finished=False)
+        progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
+    # A resumed evaluation may have flown a failed job last.
+    order = [job.name for job in jobs]
+    results.entries.sort(key=lambda entry: order.index(entry.name))
     if results.entries:
         write_episodes(place, results.entries)
         results.write(place, finished=True)
@@ -222,7 +209,7 @@ def fly_scenario(
     :raises ControllerError: a controller or reward that fails in flight.
     """
     seeds = scenario.episode_seeds()
-    settings = scenario.flown_as.with_changes(**(own or {}))
+    settings = scenario.settings.with_changes(**(own or {}))
     parts = []
     size = PART_SIZES.get(backend, 1)
     for first in range(0, len(seeds), size):
@@ -279,24 +266,35 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
 
 
 def _fly_jobs(
-    jobs: Sequence[Job], workers: int, executor: str, address: str | None
-) -> Generator[tuple[Job, Any], None, None]:
-    """Fly jobs and yield each when it is done: in this process, or in an executor's workers.
-
-    A job whose worker process ends, by a crash or too little memory, becomes a :class:`Failure`.
-    """
-    if executor == "local" and min(workers, len(jobs)) <= 1:
+    jobs: Sequence[Job], workers: int
+) -> Iterator[tuple[Job, tuple[Entry, Arrays] | Failure]]:
+    """Fly jobs, in this process or in workers, and yield them in their order."""
+    if min(workers, len(jobs)) <= 1:
         for job in jobs:
             yield job, fly_job(job)
         return
-    with start_executor(executor, workers, address) as pool:
-        submitted = {pool.submit(fly_job, job): job for job in jobs}
-        for future in as_completed(submitted):
-            job = submitted[future]
-            try:
-                yield job, future.result()
-            except WorkerDied as error:
-                yield job, _failure(job.name, error)
+    context = multiprocessing.get_context("spawn")
+    try:
+        with ProcessPoolExecutor(workers, context, _begin_worker) as pool:
+            yield from zip(jobs, pool.map(fly_job, jobs), strict=True)
+    except BrokenProcessPool:
+        raise SB3QuadError(
+            "a worker process ended unexpectedly (out of memory?); repeat the command with fewer"
+            " --workers, and it continues where it stopped"
+        ) from None
+
+
+def _begin_worker() -> None:
+    """Leave Ctrl-C to the process that started this worker, and end with it."""
+    ignore_interrupts()
+    threading.Thread(target=_end_with_starter, daemon=True).start()
+
+
+def _end_with_starter() -> None:
+    starter = multiprocessing.parent_process()
+    assert starter is not None
+    starter.join()
+    os._exit(1)
 
 
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:

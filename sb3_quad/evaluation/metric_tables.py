@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.evaluation.flights import TOLERANCES, arrival_tolerance
+from sb3_quad.evaluation.flights import TOLERANCES
 from sb3_quad.evaluation.following import FOLLOWED
+from sb3_quad.evaluation.hooks import arrival_tolerance
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_values
@@ -18,8 +19,6 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 # The rows, without their cells:
 SUCCESS = Row("success", "%")
 SURVIVAL = Row("survival", "%")
-CUT = Row("cut by the supervisor", "%")
-LOW_FORCE = Row("longest time below 0.5 g", "s")
 REWARD = Row("mean reward")
 OWN_REWARD = Row("mean own reward")
 FLOWN = Row("time flown", "s")
@@ -46,8 +45,6 @@ COURSE_TIME = Row("time of the course", "s", verb="complete")
 ROWS = {
     "success": SUCCESS,
     "survival": SURVIVAL,
-    "cut_by_supervisor": CUT,
-    "low_force_time": LOW_FORCE,
     "reward": REWARD,
     "own_reward": OWN_REWARD,
     "flown": FLOWN,
@@ -262,9 +259,9 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 
 def _rows_of(scenario: Scenario) -> list[Row]:
     """The rows that have a meaning in a scenario."""
-    shares = [SUCCESS, SURVIVAL, CUT, LOW_FORCE]
+    shares = [SUCCESS, SURVIVAL]
     rewards = [REWARD, OWN_REWARD]
-    if scenario.target.waypoints is not None:
+    if scenario.waypoints:
         return [*shares, OWN_REWARD, REACHED, COMPLETED, COURSE_TIME]
     if len(scenario.cell) > 1:
         return [SUCCESS, OWN_REWARD]
@@ -272,8 +269,8 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         return [*shares, *rewards, *FOLLOWING]
     if scenario.group is not None:
         return [*shares, OWN_REWARD, MEDIAN]
-    if scenario.target.distance == 0.0:
-        # An episode that starts at its target does not fly to it.
+    # An episode that starts at its target does not fly to it.
+    if not scenario.has_way:
         flown = [FLOWN] if scenario.is_fixed else []
         return [*shares, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = {*scenario.tolerances}

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.learning_curves import Curve
-from sb3_quad.evaluation.results import colours_of
+from sb3_quad.evaluation.tables import colours_of
 from sb3_quad.report.plots import POINTS, band, legend, styled
 
 # By measure: the label of its axis and the factor of its values.

@@ -101,7 +101,7 @@ def _flights_section(
     # Conditions that differ between the cells are left out.
     conditions = []
     for scenario in scenarios:
-        flown = f"{scenario.episodes} flights of each controller"
+        flown = f"{scenario.n_episodes} flights of each controller"
         if first.group is not None:
             flown += f" in each of {len(scenarios)} cells"
         conditions.append(
@@ -122,9 +122,7 @@ def _flights_section(
         if len(first.cell) == 1:
             (key,) = first.cell
             cells = [(f"{scenario.cell[key]:g}", [scenario]) for scenario in scenarios]
-            tables.append(
-                _share_table(SUCCESS, results, cells, f"{axis_label(key, first)}: success (%)")
-            )
+            tables.append(_share_table(SUCCESS, results, cells, f"{axis_label(key)}: success (%)"))
         plots = group_plots(results, scenarios)
     return Section(
         first.group or first.name,
@@ -148,7 +146,7 @@ def _scenario_plots(results: Results, scenario: Scenario, folder: Path) -> list[
     if not flights:
         return []
     plots = [paths_plot(scenario, flights, results.colours)]
-    has_way = scenario.target.waypoints is None and scenario.target.distance != 0.0
+    has_way = scenario.has_way and not scenario.waypoints
     if has_way and scenario.reference is None and len(scenario.tolerances) > 2:
         plots.append(arrivals_plot(scenario, metrics, results.colours))
     return [*plots, errors_plot(scenario, flights, results.colours)]

@@ -139,7 +139,7 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
     is_single = len(keys) == 1
     plots = []
     for number, key in enumerate(keys):
-        figure, axes = new_axes(axis_label(key, scenarios[0]), "success (%)")
+        figure, axes = new_axes(axis_label(key), "success (%)")
         for label, flown in controllers:
             cells = flown.groupby(key)
             if is_single:
@@ -156,7 +156,7 @@ def group_plots(results: Results, scenarios: Sequence[Scenario]) -> list[Plot]:
             caption = "Success, with 95 % intervals."
         plots.append(Plot(name, caption, figure))
     if is_single:
-        figure, axes = new_axes(axis_label(keys[0], scenarios[0]), "final error (m)")
+        figure, axes = new_axes(axis_label(keys[0]), "final error (m)")
         for label, flown in controllers:
             errors = flown.set_index(keys[0])["error"].dropna().sort_index().clip(lower=LEAST_ERROR)
             axes.plot(errors, color=results.colours[label], label=label, **POINTS)

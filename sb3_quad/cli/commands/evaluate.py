@@ -19,9 +19,8 @@ examples:
     --suite thesis -o evaluations/mine
   # a quick look, in less than a minute
   sb3-quad evaluate pid agent.zip --suite quick
-  # in two processes, or on a Ray cluster
+  # in two processes
   sb3-quad evaluate agent.zip --suite robustness --workers 2
-  sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
   # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
   # the mean of your own reward next to the task's
@@ -41,7 +40,6 @@ import sys
 from argparse import Namespace
 
 from sb3_quad.cli.parser import (
-    EXECUTOR,
     PROGRESS,
     SEVERAL,
     SWITCH,
@@ -62,7 +60,7 @@ FLAGS: Flags = {
     ),
     "-o --output FOLDER": "folder for the results (evaluations/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
-    "--episodes N": (whole, "episodes of each scenario (the suite's number)"),
+    "-n --n-episodes N": (whole, "episodes of each scenario (the suite's number)"),
     "--seed N": (whole, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
     "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
@@ -72,7 +70,6 @@ FLAGS: Flags = {
         "show the mean of a reward of your own, function(state, actions) per control step"
     ),
     "--report": (YES_OR_NO, True, "update report.html and its plots (yes)"),
-    **EXECUTOR,
     **TRUST,
     **PROGRESS,
 }
@@ -88,7 +85,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.evaluation.scenarios.load import load_suite
 
     suite = load_suite(options.suite).with_changes(
-        options.scenario, options.episodes, options.seed, options.vehicle
+        options.scenario, options.n_episodes, options.seed, options.vehicle
     )
     folder = options.output or f"evaluations/{suite.name}"
     with progress_bar(options.progress) as show:
@@ -98,7 +95,7 @@ def run(options: Namespace) -> int:
             folder,
             progress=show,
             report=warn,
-            **given(options, "backend", "workers", "overwrite", "executor", "address", "reward"),
+            **given(options, "backend", "workers", "overwrite", "reward"),
         )
     # Each controller once, in the order of the command line.
     flown = list(dict.fromkeys(entry.controller for entry in results.entries))
