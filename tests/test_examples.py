@@ -207,7 +207,7 @@ def test_adaptive_scaling(run, tmp_path):
         "    return lambda observation: expert.predict(observation)[0]\n"
     )
     printed = run(
-        "adaptive_scaling.py", "pid", "agent=observing:make", "--episodes", "2", "-o", "times.png"
+        "adaptive_scaling.py", "pid", "agent=observing:make", "-n", "2", "-o", "times.png"
     )
     found = [float(x) for x in re.search(r"agent: offset μ = \((.+)\) m", printed)[1].split(",")]
     assert found == pytest.approx((-0.15, 0.0, 0.0), abs=0.01)

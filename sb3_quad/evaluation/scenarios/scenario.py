@@ -123,6 +123,8 @@ class Scenario(Frozen):
     @model_validator(mode="after")
     def _check_flight(self) -> "Scenario":
         vehicle = self.nominal_vehicle()
+        if self.steps < 1:
+            raise ValueError(f"duration: must be at least a step, {vehicle.control_step:g} s")
         # The settings check their own fields. Of a distribution, the least capable vehicle decides.
         settings = self.settings
         if settings.vehicles is not None:
@@ -133,8 +135,6 @@ class Scenario(Frozen):
                 raise ValueError(
                     "randomize: force and torque do not go with wrenches, which replace them"
                 )
-        if self.steps < 1:
-            raise ValueError(f"duration: must be at least a step, {vehicle.control_step:g} s")
         for number, wrench in enumerate(self.wrenches):
             acts = wrench.steps(vehicle.control_step, self.steps)
             # It begins and ends between two control steps.
