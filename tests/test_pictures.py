@@ -9,7 +9,6 @@ from PIL import Image
 
 from sb3_quad.cli.app import make_parser
 from sb3_quad.evaluation.tables import COLOURS, colours_of
-from sb3_quad.show.demo.page import DEFAULT_AGENTS
 
 ROOT = Path(__file__).resolve().parent.parent
 SPEC = importlib.util.spec_from_file_location("pictures", ROOT / "docs/pictures.py")
@@ -64,19 +63,9 @@ def test_an_unknown_picture_is_named(monkeypatch, capsys):
     assert "sarts.png" in capsys.readouterr().err
 
 
-def test_a_controller_has_one_colour_everywhere():
-    labels = [spec.partition("=")[0] for spec in DEFAULT_AGENTS]
-    demo = colours_of(labels)
-    assert [*demo.values()] == [*COLOURS[: len(labels)]]
-    for others in (["PID expert", "our agent (itm-robust)"], ["RL-agent", "mine", "PID"]):
-        colours = colours_of(others)
-        assert len({*colours.values()}) == len(others)
-        assert colours["PID expert" if "PID expert" in others else "PID"] == demo["pid"]
-    assert colours["RL-agent"] == demo["RL agent"]
-    # Labels of others, and the ninth of them.
+def test_eight_controllers_have_colours_of_their_own():
     many = colours_of([f"agent {number}" for number in range(9)])
     assert [*many.values()] == [*COLOURS, COLOURS[0]]
-    assert colours_of(["privileged_geometric"])["privileged_geometric"] == COLOURS[0]
 
 
 def test_a_frame_of_a_film_is_a_picture(tmp_path):

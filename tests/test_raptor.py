@@ -28,8 +28,8 @@ def tilted(axis, degrees):
     """A suite's scenario: a metre from its target, tilted about a body axis."""
     half = np.deg2rad(degrees) / 2
     quaternion = np.array([np.cos(half), *(np.sin(half) * np.array(axis))]).tolist()
-    start = f"{{attitude: {{quaternion: {quaternion}}}}}"
-    entry = f"{{name: s, start: {start}, target: [1, 0, 15], duration: 10, episodes: 4}}"
+    start = f"{{quaternion: {quaternion}}}"
+    entry = f"{{name: s, start: {start}, target: [1, 0, 15], duration: 10, n_episodes: 4}}"
     return parse_suite(f"{{name: one, scenarios: [{entry}]}}", "x").scenarios[0]
 
 

@@ -30,41 +30,46 @@ source: paper
 description: "A <small> suite & its tags"
 scenarios:
   - name: tracking
-    target: {distance: 3}
+    task_kwargs: {target_distance: 3}
     duration: 6
     tolerances: [0.5, 0.7, 0.8, 0.9, 1.0, 1.5, 2.0]
-    episodes: 5
+    n_episodes: 5
     published: {expert: {success: 0.5, time_to: {0.8: 1.25, 1.0: null}, path: [2, 3]}}
   - name: course
-    target: {waypoints: [[0, 0, 15.5], [0, 0.5, 15.5]], radius: 0.4}
+    waypoints: [[0, 0, 15.5], [0, 0.5, 15.5]]
+    waypoint_radius: 0.4
     duration: 2
-    episodes: 2
+    n_episodes: 2
   - name: upside_down
-    start: {attitude: {quaternion: [0, 1, 0, 0]}, position: [0, 0, 1.5]}
+    task_kwargs: {target_distance: 0, start_position: [0, 0, 1.5]}
+    start: {quaternion: [0, 1, 0, 0]}
     duration: 2
-    episodes: 2
+    n_episodes: 2
   - name: hit
     target: [1, 1, 16]
     wrenches: [{start: 0.5, duration: 0.02, force: [-20, -20, 0], torque: [-5, -5, -5]}]
     duration: 2
-    episodes: 2
+    n_episodes: 2
   - name: noise
+    task_kwargs: {target_distance: 0}
     vary: {noise: [0, 0.1]}
     duration: 0.5
-    episodes: 2
+    n_episodes: 2
   - name: drop
-    start: {position: [0, 0, 1.3], velocity: [0, 0, -1.5]}
-    vary: {vehicle_changes.delay: [0, 90]}
+    task_kwargs: {target_distance: 0, start_position: [0, 0, 1.3]}
+    start: {velocity: [0, 0, -1.5]}
+    vary: {randomize.delay: [0, 90]}
     duration: 3
-    episodes: 2
+    n_episodes: 2
   - name: starts
+    task: state_recovery
     start: {velocity: {magnitude: 0}, body_rates: {magnitude: 0}}
     vary:
-      start.attitude.tilt: [0, 90]
+      start.tilt: [0, 90]
       start.body_rates.magnitude: [0, 4]
       start.velocity.magnitude: [0, 3]
     duration: 0.5
-    episodes: 2
+    n_episodes: 2
 """
 LABEL = '<b>g</b> "2" </script>'
 
@@ -239,7 +244,7 @@ def test_of_several_quantities_each_has_the_mean_over_the_others(folder, parts):
             cells = [
                 each.name
                 for each in results.scenarios
-                if each.group == "starts" and each.cell["start.attitude.tilt"] == tilt
+                if each.group == "starts" and each.cell["start.tilt"] == tilt
             ]
             metrics = [results.entry(line.get_label(), name).metrics for name in cells]
             shares = [each.success.value for each in metrics]

@@ -86,9 +86,7 @@ def test_both_backends_fly_the_same(entry, controller):
 
 def test_gusts_push_and_the_suite_of_changes_flies():
     calm = fly_scenario(PIDExpert(), scenario("task_kwargs: {target_distance: 0}, duration: 4"))
-    gusty = scenario(
-        "task_kwargs: {target_distance: 0}, duration: 4, randomize: {gusts: {std: 3}}"
-    )
+    gusty = scenario("task_kwargs: {target_distance: 0}, duration: 4, randomize: {gusts: {std: 3}}")
     assert calm.final_error.max() < 1e-3
     assert fly_scenario(PIDExpert(), gusty).final_error.min() > 0.01
     for each in load_suite("robustness").with_changes(n_episodes=2).scenarios[-40:]:
@@ -167,9 +165,7 @@ def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_
 
 def specified(name: str, n_episodes: int = 1):
     flown = load_suite("thesis").scenario(name)
-    return summarise(
-        fly_scenario(PIDExpert(), flown.model_copy(update={"n_episodes": n_episodes}))
-    )
+    return summarise(fly_scenario(PIDExpert(), flown.model_copy(update={"n_episodes": n_episodes})))
 
 
 def test_the_expert_reaches_the_specified_metrics():

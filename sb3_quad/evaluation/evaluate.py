@@ -45,10 +45,7 @@ from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
-# The number of flights whose trajectories are kept: of a scenario that is the same each time, and
-# of others
-RECORDED_FIXED = 24
-RECORDED_RANDOM = 8
+RECORDED = 8  # flights of each job whose trajectories are kept
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, the last one done
 
 
@@ -246,7 +243,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         known = settings_of_model(controller)
         if known is not None:
             observed = known.carried
-        recorder = Recorder(RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM)
+        recorder = Recorder(RECORDED)
         reward = load_reward(job.reward)
         flights = fly_scenario(controller, scenario, job.backend, [recorder], observed, reward)
     except SB3QuadError as error:

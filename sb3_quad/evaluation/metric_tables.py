@@ -198,28 +198,9 @@ def overview(results: Results, labels: Sequence[str]) -> list[Table]:
     """
     tables = []
     for heading, scenarios in scenario_groups(results):
-        table = group_table(results, labels, heading, scenarios)
-        tables.append(_narrowed(table, len(labels)))
+        tables.append(group_table(results, labels, heading, scenarios))
     tables[-1] = tables[-1]._replace(caption=CAPTION)
     return tables
-
-
-def _narrowed(table: Table, count: int) -> Table:
-    """Return a table with its columns after the first ``count``, the published ones, merged into
-    one.
-    """
-    others = table.columns[count:]
-    if not others:
-        return table
-    rows = []
-    for row in table.rows:
-        words = []
-        for column, cell in zip(others, row.cells[count:], strict=True):
-            if cell != NOTHING:
-                words.append(f"{column.name} {cell._replace(note='').text}")
-        rows.append(row._replace(cells=[*row.cells[:count], Cell(words="; ".join(words))]))
-    columns = [*table.columns[:count], Column(others[0].source, align="left")]
-    return table._replace(columns=columns, rows=rows)
 
 
 def group_table(
@@ -271,8 +252,7 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         return [*shares, OWN_REWARD, MEDIAN]
     # An episode that starts at its target does not fly to it.
     if not scenario.has_way:
-        flown = [FLOWN] if scenario.is_fixed else []
-        return [*shares, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
+        return [*shares, FLOWN, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = {*scenario.tolerances}
     if len(tolerances) > MOST_TOLERANCES:
         # Only the main and the published ones; a plot shows the others.

@@ -11,6 +11,7 @@ A number that does not exist is None, never NaN.
 
 import re
 from collections.abc import Iterable
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, read_record
-from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import colours_of
@@ -31,12 +31,25 @@ EPISODES = "episodes.csv"
 FLIGHTS = "flights"
 # Files that are removed together with the results; a report writes the last two.
 WRITTEN = (RESULTS, EPISODES, "report.html", "report.md")
-# Columns of episodes.csv: arrays of one column each, and those of several numbers
-_FLOWN = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
-_COLUMNS = (*_FLOWN, *FOLLOWED)
-_AXES = {
-    "target": "x y z",
-    "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",
+# Names of the columns of episodes.csv, for arrays of several numbers
+_PARTS = {
+    "target": "xyz",
+    "final_offset": "xyz",
+    "start": [
+        "x",
+        "y",
+        "z",
+        "qw",
+        "qx",
+        "qy",
+        "qz",
+        "vx",
+        "vy",
+        "vz",
+        "rate_x",
+        "rate_y",
+        "rate_z",
+    ],
 }
 
 
@@ -159,19 +172,18 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
             "scenario": entry.scenario,
             "episode": range(entry.metrics.n),
         }
-        for name in _COLUMNS:
-            columns[name] = arrays[f"episode_{name}"]
+        tolerances = [f"{tolerance:g}" for tolerance in arrays.pop("episode_tolerances")]
+        parts = {**_PARTS, "time_to": tolerances, "settling_time": tolerances}
         waypoints = arrays["episode_waypoints"]
         columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
-        # Arrays of several numbers become a column for each of them.
-        tolerances = " ".join(map("{:g}".format, arrays["episode_tolerances"]))
-        titles = {**_AXES, "time_to": tolerances, "settling_time": tolerances}
-        for name, parts in titles.items():
-            for part, values in zip(parts.split(), arrays[f"episode_{name}"].T, strict=True):
-                columns[f"{name}_{part}"] = values
-        columns["overshoot"] = arrays["episode_overshoot"]
-        for number, values in enumerate(waypoints.T, 1):
-            columns[f"waypoint_{number}"] = values
+        for key, values in arrays.items():
+            name = key.removeprefix("episode_")
+            if values.ndim == 1:
+                columns[name] = values
+                continue
+            # An array of several numbers becomes a column for each of them.
+            for part, column in zip(parts.get(name, count(1)), values.T, strict=False):
+                columns[f"{name}_{part}"] = column
         tables.append(pd.DataFrame(columns))
     # Scenarios differ in tolerances and waypoints, and so in their columns.
     # Nine digits tell any two float32 apart.

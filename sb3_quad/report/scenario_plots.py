@@ -18,7 +18,7 @@ FORCE = "#db1a24"
 TARGET = "#1a9a45"
 LEAST_ERROR = 1e-3  # m; smaller ones are drawn at this value of the logarithmic axis
 LINE_POINTS = 200  # maximum number of points of a flight
-SHOWN_FLIGHTS = 4  # of a controller, if episodes differ
+SHOWN_FLIGHTS = 4  # of a controller
 
 
 @styled
@@ -54,7 +54,6 @@ def paths_plot(
 
     :param flights: flights by the controllers' labels, like ``colours``.
     """
-    count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
     follows = scenario.reference is not None
     # Place the views one above the other, so that they can be read on a telephone.
     figure = Figure(figsize=(WIDTH, 2.2 * HEIGHT), layout="constrained")
@@ -62,14 +61,13 @@ def paths_plot(
         axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal")
         axes.set_adjustable("datalim")
         for label, tracks in flights.items():
-            for track in tracks[:count]:
+            for track in tracks[:SHOWN_FLIGHTS]:
                 _draw_path(axes, track, label, colours[label], [i, j], follows)
     legend(figure)
-    flights_shown = "flight" if count == 1 else f"{count} flights"
     return Plot(
         f"{scenario.name}_paths",
-        f"The first {flights_shown} of each controller, from above and from the side. A cross marks"
-        " where a flight is lost; red arrows show the direction of a disturbance force.",
+        f"The first {SHOWN_FLIGHTS} flights of each controller, from above and from the side. A"
+        " cross marks where a flight is lost; red arrows show the direction of a force.",
         figure,
     )
 

@@ -111,7 +111,7 @@ def test_the_trial_of_a_search_that_was_killed_is_tried_again(tmp_path, monkeypa
 SUITE = """
 name: one
 source: paper
-scenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]
+scenarios: [{name: near, task_kwargs: {target_distance: 1}, duration: 2, n_episodes: 2}]
 """
 codes = []
 

@@ -153,7 +153,7 @@ def run(options: Namespace) -> int:
     for number, episode in enumerate(episodes, 1):
         for flight in episode:
             prefix = f"episode {number}, " if len(episodes) > 1 else ""
-            print(f"{prefix}{flight.name}: {flight.end}, reward {flight.results.reward[0]:.2f}")
+            print(f"{prefix}{flight.name}: {flight.end}, reward {flight.flights.reward[0]:.2f}")
     width, height = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
         if file.lower().endswith(PICTURE):

@@ -17,7 +17,7 @@ from sb3_quad.envs.simulation.settings import FlightSettings, Noise
 from sb3_quad.envs.simulation.tasks import T, Task, resolve_tasks
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
-from sb3_quad.evaluation.scenarios.events import RandomDirection, Start, Vector, Wrench
+from sb3_quad.evaluation.scenarios.events import Start, Vector, Wrench
 
 # m: the tolerances of Figs. 4.6 and 4.7, and a tighter one
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -252,27 +252,6 @@ class Scenario(Frozen):
         if changed or 0.1 not in self.tolerances or not np.array_equal(tasks, known):
             return None
         return (self.nominal_vehicle().time_optimal or {}).get(distance)
-
-    @property
-    def is_fixed(self) -> bool:
-        """Whether all episodes have one start, target and wrench, and differ only in noise."""
-        tasks, _ = resolve_tasks(self.task, self.task_kwargs)
-        random: list[Any] = [self.start.tilt, self.randomize, self.vehicles]
-        vectors: list[Any] = [self.start.velocity, self.start.body_rates]
-        for wrench in self.wrenches:
-            vectors += [wrench.force, wrench.torque]
-        random += [isinstance(vector, RandomDirection) for vector in vectors]
-        # What the task samples, unless an event replaces it
-        if not self.targets:
-            random.append(tasks[:, T.target_distance].any())
-        if not self.start.sets_attitude:
-            random.append(tasks[:, T.random_attitude].any())
-        if self.start.velocity is None:
-            random.append(tasks[:, T.velocity_std].any())
-        if self.start.body_rates is None:
-            random.append(tasks[:, [T.body_rates_std, T.hit_rates_std]].any())
-        random.append(self.reference and self.reference.curve == "random_smooth")
-        return len(tasks) == 1 and not any(random)
 
 
 class Suite(Frozen):
