@@ -7,16 +7,20 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import torch
 
 from sb3_quad.agents.agent_settings import settings_of_model
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
+from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays
 from sb3_quad.base.process import ignore_interrupts
 from sb3_quad.base.types import Arrays, Report, StrMapping
@@ -93,7 +97,7 @@ def evaluate(
         ``package.module:function``.
     :raises ConfigError: an unknown backend; a reward that cannot be imported; a folder that holds
         results of another call, that cannot be written, or that another process is writing to.
-    :raises SB3QuadError: a worker process ended; the same call resumes.
+    :raises WorkerDied: a worker that ended before its task; what the others have flown is written.
     """
     refuse_unknown("backend", [backend], FLEETS)
     if backend == "pybullet":
@@ -164,25 +168,31 @@ def _load_controllers(
 
 
 def _fly_missing(
-    place: Path, results: Results, jobs: Sequence[Job], workers: int, progress: Progress
+    place: Path,
+    results: Results,
+    jobs: Sequence[Job],
+    workers: int,
+    progress: Progress,
 ) -> Results:
     """Fly the jobs without an entry, and write everything into the folder."""
+    # Workers finish in any order; the entries are in that of the suite.
+    order = [job.name for job in jobs]
     done = {entry.name for entry in results.entries}
     missing = [job for job in jobs if job.name not in done]
     progress(len(done), len(jobs), "")
-    for number, (job, outcome) in enumerate(_fly_jobs(missing, workers), len(done) + 1):
-        if isinstance(outcome, Failure):
-            results.failures.append(outcome)
-        else:
-            entry, arrays = outcome
-            write_arrays(place / entry.flights, compressed=True, **arrays)
-            results.entries.append(entry)
-            # Write after each job, so that an interrupted evaluation can resume.
-            results.write(place, finished=False)
-        progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
-    # A resumed evaluation may have flown a failed job last.
-    order = [job.name for job in jobs]
-    results.entries.sort(key=lambda entry: order.index(entry.name))
+    # Closed, so that the workers end at once if an outcome cannot be written.
+    with closing(_fly_jobs(missing, workers)) as flown:
+        for number, (job, outcome) in enumerate(flown, len(done) + 1):
+            if isinstance(outcome, Failure):
+                results.failures.append(outcome)
+            else:
+                entry, arrays = outcome
+                write_arrays(place / entry.flights, compressed=True, **arrays)
+                results.entries.append(entry)
+                results.entries.sort(key=lambda entry: order.index(entry.name))
+                # Write after each job, so that an interrupted evaluation can resume.
+                results.write(place, finished=False)
+            progress(number, len(jobs), f"{job.spec.label}: {job.scenario.heading}")
     if results.entries:
         write_episodes(place, results.entries)
         results.write(place, finished=True)
@@ -264,33 +274,45 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
 
 def _fly_jobs(
     jobs: Sequence[Job], workers: int
-) -> Iterator[tuple[Job, tuple[Entry, Arrays] | Failure]]:
-    """Fly jobs, in this process or in workers, and yield them in their order."""
+) -> Generator[tuple[Job, tuple[Entry, Arrays] | Failure], None, None]:
+    """Fly jobs and yield each when it is done: in this process, or in workers.
+
+    :raises WorkerDied: a worker that ended by a crash, or because memory was short.
+    """
     if min(workers, len(jobs)) <= 1:
         for job in jobs:
             yield job, fly_job(job)
         return
+    # Threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
+    alive, end = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(workers, context, _begin_worker, (alive,))
+    submitted = {pool.submit(fly_job, job): job for job in jobs}
     try:
-        with ProcessPoolExecutor(workers, context, _begin_worker) as pool:
-            yield from zip(jobs, pool.map(fly_job, jobs), strict=True)
+        for future in as_completed(submitted):
+            yield submitted[future], future.result()
     except BrokenProcessPool:
-        raise SB3QuadError(
-            "a worker process ended unexpectedly (out of memory?); repeat the command with fewer"
-            " --workers, and it continues where it stopped"
+        raise WorkerDied(
+            "a worker process ended unexpectedly (out of memory?); "
+            "repeat the command with fewer --workers to fly what is left"
         ) from None
+    finally:
+        end.close()
+        pool.shutdown(cancel_futures=True)
 
 
-def _begin_worker() -> None:
-    """Leave Ctrl-C to the process that started this worker, and end with it."""
+def _begin_worker(alive: Connection) -> None:
+    """Prepare a worker, which ends when the other end of ``alive`` is closed: by the process that
+    started it, or because that was killed.
+    """
     ignore_interrupts()
-    threading.Thread(target=_end_with_starter, daemon=True).start()
+    torch.set_num_threads(1)
+    threading.Thread(target=_end_with_starter, args=[alive], daemon=True).start()
 
 
-def _end_with_starter() -> None:
-    starter = multiprocessing.parent_process()
-    assert starter is not None
-    starter.join()
+def _end_with_starter(alive: Connection) -> None:
+    with suppress(EOFError):
+        alive.recv()
     os._exit(1)
 
 

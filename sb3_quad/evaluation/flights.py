@@ -241,9 +241,10 @@ def fly_settings(
         )
         following = Following(fleet.moves)
         measuring = [course, Arrivals(tolerances, course), Motion(), following, OwnRewards(reward)]
-        watching = [*measuring, *hooks]
+        given = list(hooks)
         if record is not None:
-            watching.append(demonstrations)
+            given.append(demonstrations)
+        watching = [*measuring, *given]
         control_step = fleet.vehicle_list[0].control_step
         observation = fleet.begin(plan.start)
         # The state is a live view: copy what later steps need.
@@ -266,9 +267,9 @@ def fly_settings(
             except ControllerError as error:
                 time = (step - 1) * control_step
                 raise ControllerError(f"{error}, after {time:.2f} s") from error
-            wrench = fleet.total_wrench().T
-            for hook in watching:
-                hook.before_step(state, observation, wrench, flying)
+            # What measures sees only the state after a step.
+            for hook in given:
+                hook.before_step(state, observation, fleet.total_wrench().T, flying)
             observation, rewards, _ = fleet.step(actions)
             state = fleet.true_state()
             # This step also counts for the flights that it has ended.

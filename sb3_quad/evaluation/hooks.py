@@ -76,6 +76,8 @@ class Course(Hook):
     def after_step(
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
     ) -> None:
+        if self._count == 0:
+            return
         # This step was still flown to the target before.
         self.on_last = self._next >= self._count - 1
         near = flying & (state.distance <= self._radius)
