@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_quad import env_kwargs, load_pretrained
+from sb3_quad import load_pretrained
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.simulation.settings import FlightSettings
@@ -212,35 +212,6 @@ def test_the_conventions_give_the_specified_metrics():
     assert metrics.path.value == pytest.approx(10.42, rel=0.02)
     assert metrics.reward.value == pytest.approx(-8.10, rel=0.02)
     assert metrics.success.value == 1.0
-
-
-def test_times_to_stay_and_overshoot_are_those_of_the_distances():
-    class Distances(Hook):
-        def on_start(self, state, vehicle):
-            self.seen = [state.distance.copy()]
-
-        def after_step(self, step, state, actions, flying):
-            self.seen.append(state.distance.copy())
-
-    distances = Distances()
-    flights = fly(
-        load_pretrained("itm-robust"),
-        n_episodes=24,
-        max_episode_steps=700,
-        hooks=[distances],
-        **env_kwargs("itm-robust"),
-    )
-    leaves = []
-    for row, seen in enumerate(np.array(distances.seen).T):
-        within = seen <= 0.1
-        first = int(np.argmax(within))
-        last = len(seen) - int(np.argmin(within[::-1]))
-        assert flights.time_to[0.1][row] == pytest.approx(first * 0.01)
-        assert flights.settling_time[0.1][row] == pytest.approx(last * 0.01)
-        assert flights.overshoot[row] == pytest.approx(seen[first:].max())
-        leaves.append(first != last)
-    assert 0 < sum(leaves) < 24 or all(flights.overshoot <= 0.1)
-    assert summarise(flights).arrivals[0].overshoot_rate.value == np.mean(leaves)
 
 
 @pytest.mark.parametrize("suite", ["thesis", "robustness", "trajectories"])

@@ -49,7 +49,8 @@ def test_it_recovers_about_each_axis_and_flies_a_metre_to_its_target(axis, vehic
 
 @pytest.mark.parametrize("vehicle", ["itm", "crazyflie"])
 def test_it_follows_what_it_sees_relative_to_a_moving_target(vehicle):
-    entry = "{name: s, reference: {curve: figure_eight, speed: 1}, duration: 10, episodes: 2}"
+    entry = "{name: s, task_kwargs: {target_distance: 0}, duration: 10, n_episodes: 2,"
+    entry += " reference: {curve: figure_eight, speed: 1}}"
     scenario = parse_suite(f"{{name: one, scenarios: [{entry}]}}", "x").scenarios[0]
     scenario = scenario.model_copy(update={"vehicle": vehicle})
     flights = fly_scenario(resolve_expert("raptor:Raptor", vehicle), scenario)

@@ -257,7 +257,7 @@ def test_paths_and_distances_are_the_flights(folder, parts):
     for label in ("pid", LABEL):
         track = read_tracks(folder / results.entry(label, "hit").flights)[0]
         for axes, columns in ((above, [0, 1]), (side, [0, 2])):
-            (line,) = (line for line in axes.lines if line.get_label() == label)
+            line = next(line for line in axes.lines if line.get_label() == label)
             np.testing.assert_array_equal(line.get_xydata()[0], track.position[0, columns])
             (force,) = {
                 tuple(np.round([u, v], 6))

@@ -34,7 +34,7 @@ class Supervisor(Hook):
     >>> from sb3_quad.evaluation.supervisor import Supervisor
     >>> supervisor = Supervisor()
     >>> flights = fly("pid", n_episodes=2, vehicle="crazyflie", hooks=[supervisor])
-    >>> supervisor.results()["cut_by_supervisor"].sum()
+    >>> int(supervisor.results()["cut_by_supervisor"].sum())
     0
 
     ``cut_by_supervisor`` (n,) says which flights were cut, and ``low_force_time`` (n,) is the
