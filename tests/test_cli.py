@@ -227,7 +227,7 @@ def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, ca
     agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
     for line, more, made in zip(
         lines,
-        ([], [], ["--episodes", "2", "--no-report"], ["-o", "agent.pt"]),
+        ([], [], ["-n", "2", "--no-report"], ["-o", "agent.pt"]),
         (
             f"dagger_{ENV}_1.png",
             f"dagger_{ENV}_1.html",
@@ -385,7 +385,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(
         "quick",
         "--scenario",
         "recovery",
-        "--episodes",
+        "-n",
         "2",
         "--no-report",
         "-o",
@@ -612,7 +612,7 @@ def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
 def test_closed_streams_cost_nothing(tmp_path, monkeypatch):
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
-    arguments = "evaluate pid --suite quick --scenario tracking --episodes 2 --no-report -o"
+    arguments = "evaluate pid --suite quick --scenario tracking -n 2 --no-report -o"
     assert main([*arguments.split(), str(tmp_path)]) == 0
     assert (tmp_path / "results.json").is_file()
 

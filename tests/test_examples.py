@@ -313,7 +313,7 @@ def test_robustness_plot(run, tmp_path):
         "robustness",
         "--scenario",
         "mass",
-        "--episodes",
+        "-n",
         "2",
         "-o",
         "results",

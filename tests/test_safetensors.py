@@ -95,7 +95,7 @@ def test_all_commands_take_it(zips, tmp_path, monkeypatch, capsys):
     (spec,) = parse_controllers([agent])
     assert (spec.label, spec.kind) == ("itm-recovery", "model")
     assert resolve_expert(agent).num_timesteps is not None
-    shown = ["--scenario", "tracking", "--episodes", "2", "-o", "results"]
+    shown = ["--scenario", "tracking", "-n", "2", "-o", "results"]
     assert main(["evaluate", agent, zip_file, *shown]) == 0
     assert main(["enjoy", agent, "-n", "3", "-o", "flight.npz"]) in (0, 2)
     assert main(["export", agent, "--format", "torchscript", "-o", "again.pt"]) == 0

@@ -24,7 +24,14 @@ from sb3_quad.agents.controller import Controller, warn_of_vehicle
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, FloatArray, IntArray, StrDict, StrPath
+from sb3_quad.base.types import (
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    StrDict,
+    StrPath,
+)
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
 from sb3_quad.envs.simulation.batch import MAX_ROWS
@@ -213,6 +220,7 @@ def episode_seeds(seed: int, n_episodes: int) -> list[int]:
     return row_seeds(whole_number("seed", seed, 0, LARGEST_SEED), n)
 
 
+# It is long because its parts would share the arrays that each step changes.
 def fly_settings(
     controller: Any,
     settings: FlightSettings,
@@ -262,11 +270,7 @@ def fly_settings(
             # Disturbances of the plan begin and end between two control steps.
             if step - 1 in plan.wrenches:
                 fleet.wrench[:] = plan.wrenches[step - 1].T
-            try:
-                actions = pilot.actions(observation, flying)
-            except ControllerError as error:
-                time = (step - 1) * control_step
-                raise ControllerError(f"{error}, after {time:.2f} s") from error
+            actions = _ask(pilot, observation, flying, (step - 1) * control_step)
             # What measures sees only the state after a step.
             for hook in given:
                 hook.before_step(state, observation, fleet.total_wrench().T, flying)
@@ -288,9 +292,7 @@ def fly_settings(
 
         if record is not None:
             demonstrations.write(record)
-        measured: StrDict = {}
-        for hook in measuring:
-            measured |= hook.results()
+        measured = _results(measuring)
         # Neither a course nor a moving target has a straight line to deviate from.
         measured["cross_track_error"][following.moves | (plan.waypoints.size > 0)] = np.nan
         offset = state.position - state.target
@@ -307,3 +309,20 @@ def fly_settings(
             target=start.target,
             **measured,
         )
+
+
+def _ask(
+    pilot: Controller, observation: Float32Array, flying: BoolArray, time: float
+) -> Float32Array:
+    """Return the actions, (n, 4); an error says when it came, s."""
+    try:
+        return pilot.actions(observation, flying)
+    except ControllerError as error:
+        raise ControllerError(f"{error}, after {time:.2f} s") from error
+
+
+def _results(hooks: Sequence[Hook]) -> StrDict:
+    results: StrDict = {}
+    for hook in hooks:
+        results |= hook.results()
+    return results

@@ -162,10 +162,10 @@ def test_no_class_is_changed(content, capsys, dagger_run):
 @pytest.mark.parametrize(
     ("command", "key"),
     [
-        ("evaluate foreign.zip --suite quick --episodes 1 --no-report", "policy_kwargs"),
+        ("evaluate foreign.zip --suite quick -n 1 --no-report", "policy_kwargs"),
         pytest.param(
             *(
-                "evaluate foreign.zip pid --suite quick --episodes 1 --no-report --workers 2",
+                "evaluate foreign.zip pid --suite quick -n 1 --no-report --workers 2",
                 "policy_kwargs",
             ),
             marks=pytest.mark.slow,
