@@ -52,7 +52,6 @@ from sb3_quad.evaluation.metric_tables import (
 )
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.results import file_name
-from sb3_quad.evaluation.scenarios.parts import Target
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.export.network import check_policy
@@ -236,8 +235,12 @@ def write_card(
     vehicles = settings.get("vehicles")
     rows = []
     for task, metrics in measured.items():
-        target = Target(distance=TARGETS.get(task, 0.0))
-        scenario = Scenario(name="card", target=target, vehicle=vehicle, vehicles=vehicles)
+        scenario = Scenario(
+            name="card",
+            task_kwargs={"target_distance": TARGETS.get(task, 0.0)},
+            vehicle=vehicle,
+            vehicles=vehicles,
+        )
         cells = {**metric_cells(metrics), LIMIT: Cell(scenario.physical_limit, words="–")}
         # These begin at their targets, so times to them are meaningless.
         if task not in TARGETS:

@@ -218,8 +218,8 @@ def results_folder(tmp_path_factory):
     suite.write_text(
         "name: small\n"
         "scenarios:\n"
-        "- {name: hover, duration: 0.5, episodes: 3}\n"
-        "- {name: far, target: [1, 0, 15], duration: 1, episodes: 2}\n"
+        "- {name: hover, task: state_recovery, duration: 0.5, n_episodes: 3}\n"
+        "- {name: far, target: [1, 0, 15], duration: 1, n_episodes: 2}\n"
     )
     out = folder / "out"
     command = ["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out)]

@@ -389,7 +389,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(
         "quick",
         "--scenario",
         "recovery",
-        "--episodes",
+        "-n",
         "2",
         "--no-report",
         "-o",
@@ -595,7 +595,7 @@ def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
 def test_closed_streams_cost_nothing(tmp_path, monkeypatch):
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
-    arguments = "evaluate pid --suite quick --scenario tracking --episodes 2 --no-report -o"
+    arguments = "evaluate pid --suite quick --scenario tracking -n 2 --no-report -o"
     assert main([*arguments.split(), str(tmp_path)]) == 0
     assert (tmp_path / "results.json").is_file()
 

@@ -244,7 +244,7 @@ def test_the_worked_expert_flies_to_targets(module_folder):
 # What the walk below adds to lines, so that they are short and need no screen.
 SHORTER = {
     "check-vehicle": ["-n", "2"],
-    "evaluate": ["--episodes", "2", "--no-report"],
+    "evaluate": ["-n", "2", "--no-report"],
     "enjoy": ["-n", "20", "--no-render"],
 }
 INSTALLS = ("make install", ". .venv/bin/activate")

@@ -44,7 +44,7 @@ CONTINUED = re.compile(r"\\\n\s*")
 EVALUATED = ["--eval-env-kwargs", "max_episode_steps:100", "--no-progress"]
 # Flags that a command gets in addition to its own. Reports are written for the lines of `report`.
 SHORTER = {
-    "evaluate": ["--episodes", "2", "--overwrite", "--no-report"],
+    "evaluate": ["-n", "2", "--overwrite", "--no-report"],
     "enjoy": ["-n", "20", "--overwrite"],
     "export": ["--overwrite"],
     "sweep": ["--dry-run"],
@@ -185,7 +185,7 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
     if command == "enjoy" and "-o" not in arguments and "--no-render" not in arguments:
         screen = ["--no-render"]
     if command == "report":
-        flags = ["--suite", "quick", "--episodes", "2", "-o", arguments[0], "--overwrite"]
+        flags = ["--suite", "quick", "-n", "2", "-o", arguments[0], "--overwrite"]
         main(["evaluate", "pid", *flags])
         if "--overwrite" not in arguments:
             arguments.append("--overwrite")

@@ -25,7 +25,8 @@ from sb3_quad.envs.simulation.state import (
 )
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
-from sb3_quad.evaluation.flights import Hook, fly
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.geometric_gains import derived_gains
 from sb3_quad.experts.pid import PIDExpert

@@ -150,7 +150,7 @@ def test_a_suite_flown_by_another_vehicle(here, capsys):
         "quick",
         "--scenario",
         "tracking",
-        "--episodes",
+        "-n",
         "4",
         "--no-report",
     ]

@@ -8,6 +8,8 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
+from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import pretrained_path
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli import main

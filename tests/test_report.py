@@ -25,20 +25,22 @@ source: paper
 description: "A <small> suite & its tags"
 scenarios:
   - name: tracking
-    target: {distance: 3}
+    task_kwargs: {target_distance: 3}
     duration: 4
     tolerances: [0.5, 0.7, 1.0]
-    episodes: 3
+    n_episodes: 3
     published: {expert: {success: 0.5, time_to: {1.0: null}}}
   - name: upside_down
-    start: {attitude: {quaternion: [0, 1, 0, 0]}, position: [0, 0, 1.5]}
+    task_kwargs: {target_distance: 0, start_position: [0, 0, 1.5]}
+    start: {quaternion: [0, 1, 0, 0]}
     duration: 2
-    episodes: 2
+    n_episodes: 2
   - name: drop
-    start: {position: [0, 0, 1.3], velocity: [0, 0, -1.5]}
-    vary: {vehicle_changes.delay: [0, 90]}
+    task_kwargs: {target_distance: 0, start_position: [0, 0, 1.3]}
+    start: {velocity: [0, 0, -1.5]}
+    vary: {randomize.delay: [0, 90]}
     duration: 3
-    episodes: 2
+    n_episodes: 2
 """
 LABEL = '<b>g</b> "2"'
 
@@ -97,7 +99,7 @@ def test_plots_are_of_the_flights(folder):
 def test_success_is_drawn_over_what_varies(folder):
     results = load_results(folder)
     cells = _cells(results, [each for each in results.scenarios if each.group == "drop"])
-    figure = success_plot(cells, "vehicle_changes.delay", "delay", results.colours)
+    figure = success_plot(cells, "randomize.delay", "delay", results.colours)
     for line, label in zip(figure.axes[0].lines, ("pid", LABEL), strict=True):
         metrics = [results.entry(label, f"drop.{delay}").metrics for delay in (0, 90)]
         np.testing.assert_allclose(line.get_ydata(), [each.success.value for each in metrics])

@@ -51,7 +51,7 @@ def test_a_recording_is_the_flight_of_the_environment():
         np.testing.assert_array_equal(recording.state.array[:, step], env.true_state().array[:, 0])
         total += env.step(expert.actions(env.true_state())[0])[1]
     np.testing.assert_array_equal(recording.state.array[:, 40], env.true_state().array[:, 0])
-    assert recording.results.reward[0] == pytest.approx(total) and recording.lost == ""
+    assert recording.flights.reward[0] == pytest.approx(total) and recording.lost == ""
     env.close()
 
 

@@ -29,7 +29,7 @@ from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.offset_correction import correct_offset
 from sb3_quad.evaluation.plots import STYLE
-from sb3_quad.evaluation.results import COLOURS, colours_of
+from sb3_quad.evaluation.tables import COLOURS, colours_of
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 

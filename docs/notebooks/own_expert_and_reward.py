@@ -30,7 +30,7 @@ from sb3_quad.envs.simulation.state import TARGET, QuadcopterState
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.plots import STYLE
-from sb3_quad.evaluation.results import colours_of
+from sb3_quad.evaluation.tables import colours_of
 from sb3_quad.experts.protocol import Expert
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})

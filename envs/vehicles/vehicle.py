@@ -142,8 +142,6 @@ class Vehicle(Frozen):
     """if a low battery (randomize) cannot provide a commanded speed, each: this rotor turns as fast
     as it can; shared: the missing speed is subtracted from all four, as in Crazyflie's firmware
     """
-    supervisor: Literal["crazyflie"] | None = None
-    """whose firmware decides whether a flight would be cut, see evaluation/supervisor.py"""
     physics_step: PositiveFloat = Field(default=MAX_PHYSICS_STEP, le=MAX_PHYSICS_STEP)
     """s; at most 0.0025"""
     control_step: PositiveFloat = 0.01
@@ -296,10 +294,8 @@ class Vehicle(Frozen):
         return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
-        """Whether both have the same parameters; names, an expert's gains and the supervisor do not
-        matter.
-        """
-        unlike = {"name", "supervisor", *_FOUND}
+        """Whether both have the same parameters; names and an expert's gains do not matter."""
+        unlike = {"name", *_FOUND}
         return self.model_dump(exclude=unlike) == other.model_dump(exclude=unlike)
 
     @property

@@ -16,9 +16,8 @@ from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.envs.simulation.settings import FlightSettings, levels
 from sb3_quad.envs.simulation.tasks import Task, in_words
 from sb3_quad.envs.vehicles.vehicle import first_vehicle, load_vehicle
-from sb3_quad.evaluation.controllers import ControllerSpec, load_reward
+from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.flights import (
-    OwnReward,
     episode_seeds,
     fly_settings,
     refuse_several_limits,
@@ -26,6 +25,7 @@ from sb3_quad.evaluation.flights import (
 )
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
+from sb3_quad.evaluation.reward import OwnReward, load_reward
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite

@@ -1,4 +1,4 @@
-"""The controllers and the reward that a command line names: labels, records, and how agents fly."""
+"""The controllers that a command line names: labels, records, and how agents fly."""
 
 import hashlib
 from collections.abc import Sequence
@@ -12,11 +12,9 @@ from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.resolve import EXPERTS, import_factory
 from sb3_quad.agents.zips import saved_algorithm
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.imports import import_name
 from sb3_quad.base.types import StrDict
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vehicles.vehicle import VehicleSource, load_vehicle
-from sb3_quad.evaluation.flights import OwnReward, Reward
 from sb3_quad.evaluation.results import ControllerRecord, file_name
 
 
@@ -126,17 +124,3 @@ def controller_record(spec: ControllerSpec) -> ControllerRecord:
         algorithm=saved_algorithm(path),
         content=hashlib.sha256(path.read_bytes()).hexdigest(),
     )
-
-
-def load_reward(reward: OwnReward) -> Reward | None:
-    """Return a user's reward.
-
-    :param reward: a function, returned as it is; or ``package.module:function``.
-    :raises ConfigError: it cannot be imported, or is not a function.
-    """
-    if not isinstance(reward, str):
-        return reward
-    function = import_name(reward, "reward")
-    if not callable(function):
-        raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
-    return function  # type: ignore[no-any-return]

@@ -26,17 +26,11 @@ from sb3_quad.base.process import ignore_interrupts
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.envs import registration
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
-from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, load_reward
+from sb3_quad.evaluation.controllers import ControllerSpec, controller_record
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
-from sb3_quad.evaluation.flights import (
-    Flights,
-    Hook,
-    OwnReward,
-    Reward,
-    fly_settings,
-    reward_name,
-)
+from sb3_quad.evaluation.flights import Flights, fly_settings
+from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
     FLIGHTS,
@@ -50,14 +44,12 @@ from sb3_quad.evaluation.results import (
     load_results,
     write_episodes,
 )
+from sb3_quad.evaluation.reward import OwnReward, Reward, load_reward, reward_name
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes flown at the same time
-# The number of flights whose trajectories are kept: of a scenario that is the same each time, and
-# of others
-RECORDED_FIXED = 24
-RECORDED_RANDOM = 8
+RECORDED = 8  # flights of each job whose trajectories are kept
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, the last one done
 
 
@@ -224,7 +216,7 @@ def fly_scenario(
     :raises ControllerError: a controller or reward that fails in flight.
     """
     seeds = scenario.episode_seeds()
-    settings = scenario.flown_as.with_changes(**(own or {}))
+    settings = scenario.settings.with_changes(**(own or {}))
     parts = []
     size = PART_SIZES.get(backend, 1)
     for first in range(0, len(seeds), size):
@@ -261,7 +253,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         known = settings_of_model(controller)
         if known is not None:
             observed = known.carried
-        recorder = Recorder(RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM)
+        recorder = Recorder(RECORDED)
         reward = load_reward(job.reward)
         flights = fly_scenario(controller, scenario, job.backend, [recorder], observed, reward)
     except SB3QuadError as error:

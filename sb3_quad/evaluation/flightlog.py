@@ -19,9 +19,9 @@ from sb3_quad.envs.simulation.state import (
     QuadcopterState,
 )
 from sb3_quad.envs.vehicles.vehicle import Vehicle
-from sb3_quad.evaluation.flights import Flights, Hook
+from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.following import FOLLOWED
-from sb3_quad.evaluation.supervisor import SUPERVISED
+from sb3_quad.evaluation.hooks import Hook
 
 SAMPLE_RATE = 50.0  # Hz
 OUTCOMES = ("success", "missed", "collision", "out_of_range")
@@ -40,7 +40,6 @@ EPISODES = (
     "recovery_time",
     "cross_track_error",
     *FOLLOWED,
-    *SUPERVISED,
     "overshoot",
 )
 

@@ -7,14 +7,13 @@ whole episode of 15 s, not only of the way until arrival.
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.agents.agent_settings import (
     settings_of_model,
@@ -24,40 +23,32 @@ from sb3_quad.agents.agent_settings import (
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.controller import Controller
 from sb3_quad.algorithms.labelling import warn_of_vehicle
-from sb3_quad.base.errors import ConfigError, ControllerError, raised_as, refuse_unknown, unknown
-from sb3_quad.base.files import write_arrays
+from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
+from sb3_quad.base.types import (
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    StrDict,
+    StrPath,
+)
 from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
 from sb3_quad.envs.simulation.batch import MAX_ROWS
 from sb3_quad.envs.simulation.checks import per_row, whole_number
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.simulation.state import TARGET, QuadcopterState
+from sb3_quad.envs.simulation.state import TARGET
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.following import Following
+from sb3_quad.evaluation.hooks import Arrivals, Course, Demonstrations, Hook, Motion
+from sb3_quad.evaluation.reward import OwnRewards, Reward
 from sb3_quad.evaluation.scenarios.sample import Plan
-from sb3_quad.evaluation.supervisor import Supervisor
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
-NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance if it is not among them
 ACTIONS = quadcopter_spaces()[1]
-# A vehicle is stable while its tilt (rad) and its rate of roll and pitch together (rad/s) are below
-# these for at least HOLD (s).
-TILT = np.radians(45.0)
-RATE = 2.0
-HOLD = 0.2
 LARGEST_SEED = 2**53  # Seeds that the package itself makes are smaller.
-
-Reward: TypeAlias = Callable[[QuadcopterState, Float32Array], npt.ArrayLike]
-"""A reward of your own: a function from the state after a control step and the actions (n, 4) that
-led to it to rewards (n,).
-"""
-
-
-OwnReward: TypeAlias = str | Reward | None
-"""A reward of your own as it is given: a function or ``package.module:function``; None: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +69,8 @@ class Flights:
     #: By tolerance (m): time after which |r - r_T| stays within it to the end, s, (n,); NaN if the
     #: flight ended outside or was lost.
     settling_time: Mapping[float, FloatArray]
-    #: (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
+    #: (n,), largest |r - r_T| since it was first within 0.1 m, or the tightest tolerance, m;
+    #: NaN if it never was
     overshoot: FloatArray
     path_length: FloatArray  #: (n,), m, over the whole episode
     final_error: FloatArray  #: (n,), |r - r_T| at the end, m
@@ -95,10 +87,6 @@ class Flights:
     path_error: FloatArray  #: (n,), root mean square of its part across the target's velocity, m
     lag: FloatArray  #: (n,), how late the flight is on its path, s, see Following
     heading_error: FloatArray  #: (n,), root mean square, degrees; NaN if none is commanded
-    cut_by_supervisor: BoolArray  #: (n,), whether the firmware would have cut it, see Supervisor
-    #: (n,), longest time that the specific force along body z stayed below 0.5 g, s; NaN if the
-    #: vehicle has no supervisor
-    low_force_time: FloatArray
     #: (n, W), time until each waypoint was reached, s; NaN if it never was; W = 0 without waypoints
     waypoint_times: FloatArray
     #: (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
@@ -125,41 +113,6 @@ def _joined(parts: Sequence[Any]) -> Any:
     for key in parts[0]:
         joined[key] = _joined([part[key] for part in parts])
     return joined
-
-
-def arrival_tolerance(tolerances: Iterable[float]) -> float:
-    """Return the tolerance, m, by which overshoot and the settling time are judged."""
-    return min(tolerances, key=lambda tolerance: (tolerance != NEAR, tolerance))
-
-
-class Hook:
-    """Called during a flight; a subclass overrides the methods that it needs."""
-
-    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        """See the state in which the flights start."""
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        """See the state before a control step.
-
-        :param observation: (n, observation size).
-        :param wrench: (n, WRENCH_SIZE), that acts during the step.
-        :param flying: (n,), the flights that are still in the air.
-        """
-
-    def after_step(
-        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
-    ) -> None:
-        """See the state after control step ``step``.
-
-        :param actions: (n, 4), that led to this state.
-        :param flying: (n,), the flights that continue.
-        """
 
 
 def fly(
@@ -268,7 +221,7 @@ def episode_seeds(seed: int, n_episodes: int) -> list[int]:
     return row_seeds(whole_number("seed", seed, 0, LARGEST_SEED), n)
 
 
-# It is long because its parts would share a dozen arrays that each step changes.
+# It is long because its parts would share the arrays that each step changes.
 def fly_settings(
     controller: Any,
     settings: FlightSettings,
@@ -288,258 +241,89 @@ def fly_settings(
     """
     refuse_unknown("backend", [backend], FLEETS)
     plan = plan or Plan()
-    if isinstance(reward, type):
-        # A stateful reward, for example of changing actions, is instantiated afresh for these
-        # episodes.
-        reward = reward()
+    course = Course(plan.waypoints, plan.radius)
+    demonstrations = Demonstrations()
     with closing(FLEETS[backend](seeds, settings)) as fleet:
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
             controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic
         )
-        vehicle = fleet.vehicle_list[0]
+        following = Following(fleet.moves)
+        measuring = [course, Arrivals(tolerances, course), Motion(), following, OwnRewards(reward)]
+        given = list(hooks)
+        if record is not None:
+            given.append(demonstrations)
+        watching = [*measuring, *given]
+        control_step = fleet.vehicle_list[0].control_step
         observation = fleet.begin(plan.start)
         # The state is a live view: copy what later steps need.
         state = fleet.true_state()
         start = state.copy()
-        position = start.position
         fleet.clear_outcome()
         # The outcome of the flights so far; for a lost flight it no longer changes.
         outcome = fleet.outcome.copy()
-        distance = outcome["distance"]
         flying = outcome["truncated"].copy()  # a flight survives until it is lost
-        course = Waypoints(plan, fleet.n)
-        arrivals = Arrivals(tolerances, course.to_last(distance))
-        motion = Motion(start, vehicle.control_step)
-        following = Following(fleet.n, vehicle.control_step)
-        supervisor = Supervisor(fleet.vehicle_list)
         total = np.zeros(fleet.n)
-        own_total = np.full(fleet.n, np.nan if reward is None else 0.0)
-        path_length = np.zeros(fleet.n)
-        observed = []  # for ``record``, as is ``acted``
-        acted = []
-        for hook in hooks:
-            hook.on_start(state, vehicle)
+        for hook in watching:
+            hook.on_start(state, fleet.vehicle_list[0])
 
         for step in range(1, settings.longest_episode + 1):
-            time = step * vehicle.control_step
             # Disturbances of the plan begin and end between two control steps.
             if step - 1 in plan.wrenches:
                 fleet.wrench[:] = plan.wrenches[step - 1].T
-            try:
-                actions = pilot.actions(observation, flying)
-            except ControllerError as error:
-                before = time - vehicle.control_step
-                raise ControllerError(f"{error}, after {before:.2f} s") from error
-            for hook in hooks:
+            actions = _ask(pilot, observation, flying, (step - 1) * control_step)
+            # What measures sees only the state after a step.
+            for hook in given:
                 hook.before_step(state, observation, fleet.total_wrench().T, flying)
-            if record is not None:
-                observed.append(observation[flying])
-                # Clip them as the environment does.
-                acted.append(actions[flying].clip(-1.0, 1.0))
             observation, rewards, _ = fleet.step(actions)
             state = fleet.true_state()
-
             # This step also counts for the flights that it has ended.
             outcome[flying] = fleet.outcome[flying]
             total += np.where(flying, rewards, 0.0)
-            if reward is not None:
-                own_total += _ask_reward(reward, state, actions, flying)
-            way = np.linalg.norm(state.position - position, axis=1)
-            path_length += np.where(flying, way, 0.0)
-            position = state.position.copy()
-            arrivals.update(time, course.to_last(distance))
-
-            # From here on, only the flights that continue count.
             flying = outcome["truncated"].copy()
-            motion.update(step, state, flying)
-            supervisor.update(state, flying)
-            if fleet.moves:
-                following.update(step, state, flying)
-            for hook in hooks:
+            for hook in watching:
                 hook.after_step(step, state, actions, flying)
-            # The outcome of the last step refers to the target until then.
-            on_last = course.on_last
             if not flying.any():
                 break
             # Rows that have reached a waypoint see the next one from the next step on.
-            onward = course.update(time, distance, flying)
+            onward, targets = course.next_targets()
             if onward.size and step < settings.longest_episode:
-                fleet.state[TARGET, onward] = plan.waypoints[course.next[onward]].T
+                fleet.state[TARGET, onward] = targets.T
                 observation = fleet.observe()
 
         if record is not None:
-            write_arrays(
-                record, observations=np.concatenate(observed), actions=np.concatenate(acted)
-            )
-        # A lost flight has no time after which it stays at its target.
-        settling_time = np.where(flying, arrivals.settling_time, np.nan)
-        offset = state.position - state.target
+            demonstrations.write(record)
+        measured = _results(measuring)
         # Neither a course nor a moving target has a straight line to deviate from.
-        has_no_line = following.moves | (plan.waypoints.size > 0)
+        measured["cross_track_error"][following.moves | (plan.waypoints.size > 0)] = np.nan
+        offset = state.position - state.target
         return Flights(
-            success=outcome["success"] & on_last,
+            success=outcome["success"] & course.on_last,
             survival=flying,
             collision=outcome["collision"],
             reward=total,
-            own_reward=own_total,
             length=outcome["length"],
-            flown=outcome["length"] * vehicle.control_step,
-            time_to=dict(zip(tolerances, arrivals.time_to, strict=True)),
-            settling_time=dict(zip(tolerances, settling_time, strict=True)),
-            overshoot=arrivals.overshoot,
-            path_length=path_length,
-            final_error=distance,
+            flown=outcome["length"] * control_step,
+            final_error=outcome["distance"],
             final_offset=np.where(flying[:, None], offset, np.nan),
-            recovery_time=motion.recovery_time,
-            cross_track_error=np.where(has_no_line, np.nan, motion.cross_track_error),
-            **following.errors(flying),
-            cut_by_supervisor=supervisor.cut,
-            low_force_time=supervisor.longest,
-            waypoint_times=course.times,
             start=start.array[:13].T,
             target=start.target,
+            **measured,
         )
 
 
-def _ask_reward(
-    reward: Reward, state: QuadcopterState, actions: Float32Array, flying: BoolArray
-) -> FloatArray:
-    """Return the rewards of a user's function, which may do anything, as (n,) numbers.
-
-    :param flying: (n,), the flights whose rewards count; the others get 0.
-    """
-    name = f"reward {reward_name(reward)}"
-    with raised_as(ControllerError, f"{name}: fails"):
-        values = np.asarray(reward(state, actions), dtype=np.float64)
-    if values.shape != (state.n,):
-        raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
-    wrong = np.flatnonzero(flying & ~np.isfinite(values))
-    if wrong.size:
-        raise ControllerError(f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite")
-    return np.where(flying, values, 0.0)
+def _ask(
+    pilot: Controller, observation: Float32Array, flying: BoolArray, time: float
+) -> Float32Array:
+    """Return the actions, (n, 4); an error says when it came, s."""
+    try:
+        return pilot.actions(observation, flying)
+    except ControllerError as error:
+        raise ControllerError(f"{error}, after {time:.2f} s") from error
 
 
-def reward_name(reward: OwnReward) -> str:
-    """Return the name of a reward of your own; empty if there is none."""
-    if reward is None or isinstance(reward, str):
-        return reward or ""
-    # Instances of a class have no ``__name__``.
-    return str(getattr(reward, "__name__", type(reward).__name__))
-
-
-class Arrivals:
-    """Tracks when n flights come within T tolerances of their targets.
-
-    ``time_to`` (T, n): time until |r - r_T| is first within each tolerance, s. ``settling_time``
-    (T, n): time since when it has stayed within it, s. ``overshoot`` (n,): the largest |r - r_T|,
-    m, since it was first within :func:`arrival_tolerance`. NaN if that has not happened.
-
-    :param tolerances: m.
-    :param distance: |r - r_T| at the start, (n,), m; infinite before the last waypoint.
-    """
-
-    def __init__(self, tolerances: Sequence[float], distance: FloatArray) -> None:
-        self._limits = np.array(tolerances)[:, None]
-        self.time_to = np.full((len(tolerances), len(distance)), np.nan)
-        self.settling_time = self.time_to.copy()
-        self.overshoot = np.full(len(distance), np.nan)
-        self._first = self.overshoot.copy()
-        if tolerances:
-            # A view, which shows later arrivals.
-            self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
-        self.update(0.0, distance)
-
-    def update(self, time: float, distance: FloatArray) -> None:
-        """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s.
-
-        For a lost flight, it is the last value.
-        """
-        inside = distance <= self._limits
-        np.fmin(self.time_to, np.where(inside, time, np.nan), out=self.time_to)
-        self.settling_time = _since(self.settling_time, inside, time)
-        arrived = np.isfinite(self._first)
-        np.fmax(self.overshoot, distance, out=self.overshoot, where=arrived)
-
-
-def _since(times: FloatArray, holds: BoolArray, time: float) -> FloatArray:
-    """Return the time since when a condition has held, given whether it ``holds`` now; otherwise
-    NaN.
-    """
-    return np.where(holds, np.fmin(times, time), np.nan)
-
-
-class Waypoints:
-    """The waypoints of n flights: which of them each has reached, and when.
-
-    ``times`` (n, W): time until each of W waypoints was reached, s; NaN: not yet. ``next`` (n,):
-    the number of the present one.
-    """
-
-    def __init__(self, plan: Plan, n: int) -> None:
-        self._radius = plan.radius
-        self._count = len(plan.waypoints)
-        self.next = np.zeros(n, dtype=np.int64)
-        self.times = np.full((n, self._count), np.nan)
-
-    def update(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
-        """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
-        near = flying & (distance <= self._radius)
-        reached = np.flatnonzero(near & (self.next < self._count))
-        self.times[reached, self.next[reached]] = time
-        self.next[reached] += 1
-        return reached[self.next[reached] < self._count]
-
-    @property
-    def on_last(self) -> BoolArray:
-        """Whether the present target is the last one, (n,); always without waypoints."""
-        return self.next >= self._count - 1
-
-    def to_last(self, distance: FloatArray) -> FloatArray:
-        """Return |r - r_T|, (n,), m, of the flights on the way to their last target; inf for the
-        others.
-        """
-        return np.where(self.on_last, distance, np.inf)
-
-
-class Motion:
-    """Tracks when n flights become stable, and how far they deviate from their straight line.
-
-    ``recovery_time`` (n,), s: the beginning of the first 0.2 s in which the tilt stays below 45°
-    and the body rate of roll and pitch together below 2 rad/s; NaN if there is none. The thesis
-    reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from the
-    straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1; NaN
-    if both are the same point.
-
-    :param state: state at the start.
-    :param control_step: s.
-    """
-
-    def __init__(self, state: QuadcopterState, control_step: float) -> None:
-        way = state.target - state.position
-        length = np.linalg.norm(way, axis=1, keepdims=True)
-        self._control_step = control_step
-        self._start = state.position
-        self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
-        self._stable_since = np.zeros(state.n)  # NaN while it is not stable
-        self.recovery_time = np.full(state.n, np.nan)
-        self.cross_track_error = np.where(length[:, 0] > 0.0, 0.0, np.nan)
-        self.update(0, state, np.ones(state.n, bool))
-
-    def update(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
-        """See the state after control step ``step``; only the flights (n,) that continue count."""
-        time = step * self._control_step
-        # The cosine of the tilt is the z-z element of the rotation matrix.
-        x, y = state.quaternion.T[1:3]
-        upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
-        stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
-        self._stable_since = _since(self._stable_since, stable, time)
-        # Allow half a step, since times are multiples of steps only up to rounding.
-        held = flying & (time - self._stable_since > HOLD - 0.5 * self._control_step)
-        np.fmin(self.recovery_time, self._stable_since, out=self.recovery_time, where=held)
-        # The part of the way flown that lies across the line.
-        flown = state.position - self._start
-        along = (flown * self._direction).sum(axis=1, keepdims=True) * self._direction
-        across = np.linalg.norm(flown - along, axis=1)
-        error = self.cross_track_error
-        np.maximum(error, across, out=error, where=flying)
+def _results(hooks: Sequence[Hook]) -> StrDict:
+    results: StrDict = {}
+    for hook in hooks:
+        results |= hook.results()
+    return results

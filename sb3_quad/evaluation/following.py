@@ -1,16 +1,21 @@
 """How well flights follow references that move or turn."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
-from sb3_quad.base.types import BoolArray, FloatArray
+from sb3_quad.base.types import BoolArray, Float32Array
 from sb3_quad.envs.simulation.state import QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import Vehicle
+from sb3_quad.evaluation.hooks import Hook
 
 SETTLED = 2.0  # time after which errors count, s
 FOLLOWED = ("rms_error", "greatest_error", "path_error", "heading_error", "lag")
 
 
-class Following:
-    """Tracks how far n flights are from references that move or turn.
+class Following(Hook):
+    """How far n flights are from references that move or turn.
 
     With the error e = r - r_T and the reference's velocity v, over all that is flown after the
     first 2 s: ``rms_error`` is the root mean square of the length of e, ``greatest_error`` its
@@ -19,19 +24,29 @@ class Following:
     fits the flight best, as long as it is short. ``heading_error`` is the root mean square of the
     angle between the body's x axis, seen from above, and the commanded heading, degrees.
 
+    All are NaN if a flight was lost or its target rested.
+
     ``moves`` (n,) says whose reference has moved or had a heading.
 
-    :param control_step: s.
+    :param any_moves: whether any may move; otherwise nothing is measured.
     """
 
-    def __init__(self, n: int, control_step: float) -> None:
-        self._first = SETTLED / control_step
-        self.moves = np.zeros(n, bool)
-        self._greatest = np.full(n, np.nan)
-        self._sums = np.zeros((7, n))
+    def __init__(self, any_moves: bool) -> None:
+        self._any_moves = any_moves
 
-    def update(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
-        """See the state after control step ``step``; only the flights (n,) that continue count."""
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self._first = SETTLED / vehicle.control_step
+        self.moves = np.zeros(state.n, bool)
+        self._flying = np.ones(state.n, bool)
+        self._greatest = np.full(state.n, np.nan)
+        self._sums = np.zeros((7, state.n))
+
+    def after_step(
+        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
+    ) -> None:
+        self._flying = flying
+        if not self._any_moves:
+            return
         velocity = state.target_velocity
         speed = np.linalg.norm(velocity, axis=1)
         cosine, sine = state.target_heading.T
@@ -54,11 +69,7 @@ class Following:
         counted = np.ones_like(along), squared, across, along, speed**2, commanded, turns
         self._sums += np.where(flying, counted, 0.0)
 
-    def errors(self, survival: BoolArray) -> dict[str, FloatArray]:
-        """Return the errors by name, (n,) each; NaN if a flight was lost or its target rested.
-
-        :param survival: (n,).
-        """
+    def results(self) -> Mapping[str, Any]:
         steps, squares, across, along, speeds, commanded, turns = self._sums
         with np.errstate(divide="ignore", invalid="ignore"):
             errors = (
@@ -68,4 +79,4 @@ class Following:
                 np.degrees(np.sqrt(turns / commanded)),
                 -along / speeds,
             )
-        return dict(zip(FOLLOWED, np.where(survival & self.moves, errors, np.nan), strict=True))
+        return dict(zip(FOLLOWED, np.where(self._flying & self.moves, errors, np.nan), strict=True))

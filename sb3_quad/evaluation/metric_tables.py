@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.evaluation.flights import TOLERANCES, arrival_tolerance
+from sb3_quad.evaluation.flights import TOLERANCES
 from sb3_quad.evaluation.following import FOLLOWED
+from sb3_quad.evaluation.hooks import arrival_tolerance
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_values
@@ -18,8 +19,6 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 # The rows, without their cells:
 SUCCESS = Row("success", "%")
 SURVIVAL = Row("survival", "%")
-CUT = Row("cut by the supervisor", "%")
-LOW_FORCE = Row("longest time below 0.5 g", "s")
 REWARD = Row("mean reward")
 OWN_REWARD = Row("mean own reward")
 FLOWN = Row("time flown", "s")
@@ -46,8 +45,6 @@ COURSE_TIME = Row("time of the course", "s", verb="complete")
 ROWS = {
     "success": SUCCESS,
     "survival": SURVIVAL,
-    "cut_by_supervisor": CUT,
-    "low_force_time": LOW_FORCE,
     "reward": REWARD,
     "own_reward": OWN_REWARD,
     "flown": FLOWN,
@@ -201,28 +198,9 @@ def overview(results: Results, labels: Sequence[str]) -> list[Table]:
     """
     tables = []
     for heading, scenarios in scenario_groups(results):
-        table = group_table(results, labels, heading, scenarios)
-        tables.append(_narrowed(table, len(labels)))
+        tables.append(group_table(results, labels, heading, scenarios))
     tables[-1] = tables[-1]._replace(caption=CAPTION)
     return tables
-
-
-def _narrowed(table: Table, count: int) -> Table:
-    """Return a table with its columns after the first ``count``, the published ones, merged into
-    one.
-    """
-    others = table.columns[count:]
-    if not others:
-        return table
-    rows = []
-    for row in table.rows:
-        words = []
-        for column, cell in zip(others, row.cells[count:], strict=True):
-            if cell != NOTHING:
-                words.append(f"{column.name} {cell._replace(note='').text}")
-        rows.append(row._replace(cells=[*row.cells[:count], Cell(words="; ".join(words))]))
-    columns = [*table.columns[:count], Column(others[0].source, align="left")]
-    return table._replace(columns=columns, rows=rows)
 
 
 def group_table(
@@ -262,9 +240,9 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 
 def _rows_of(scenario: Scenario) -> list[Row]:
     """The rows that have a meaning in a scenario."""
-    shares = [SUCCESS, SURVIVAL, CUT, LOW_FORCE]
+    shares = [SUCCESS, SURVIVAL]
     rewards = [REWARD, OWN_REWARD]
-    if scenario.target.waypoints is not None:
+    if scenario.waypoints:
         return [*shares, OWN_REWARD, REACHED, COMPLETED, COURSE_TIME]
     if len(scenario.cell) > 1:
         return [SUCCESS, OWN_REWARD]
@@ -272,10 +250,9 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         return [*shares, *rewards, *FOLLOWING]
     if scenario.group is not None:
         return [*shares, OWN_REWARD, MEDIAN]
-    if scenario.target.distance == 0.0:
-        # An episode that starts at its target does not fly to it.
-        flown = [FLOWN] if scenario.is_fixed else []
-        return [*shares, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
+    # An episode that starts at its target does not fly to it.
+    if not scenario.has_way:
+        return [*shares, FLOWN, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = {*scenario.tolerances}
     if len(tolerances) > MOST_TOLERANCES:
         # Only the main and the published ones; a plot shows the others.

@@ -8,7 +8,7 @@ from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.following import FOLLOWED
-from sb3_quad.evaluation.statistics import Estimate, Statistic, bootstrap, mean, share
+from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
 
 
 class Moment(Frozen):
@@ -90,10 +90,6 @@ class Metrics(Frozen):
     """mean delay along the path, s"""
     heading_error: Estimate | None
     """mean root mean square of the heading error, degrees; None: no heading is commanded"""
-    cut_by_supervisor: Estimate | None = None
-    """share that the firmware would have cut, see Supervisor; None: no supervisor"""
-    low_force_time: float | None = None
-    """longest time of any flight that the specific force along body z stayed below 0.5 g, s"""
     course: Course | None
     """only for scenarios with waypoints"""
 
@@ -102,7 +98,6 @@ def summarise(flights: Flights) -> Metrics:
     """Return the metrics of some flights, at least one."""
     survived = flights.survival
     error = flights.final_error[survived]
-    cut = flights.cut_by_supervisor[np.isfinite(flights.low_force_time)]
     course = None
     if flights.waypoint_times.shape[1] > 0:
         reached = np.isfinite(flights.waypoint_times)
@@ -121,16 +116,14 @@ def summarise(flights: Flights) -> Metrics:
         own_reward=mean(flights.own_reward),
         flown=bootstrap(flights.flown),
         arrivals=[_arrival(flights, tolerance) for tolerance in sorted(flights.time_to)],
-        overshoot=_one(flights.overshoot),
+        overshoot=_median(flights.overshoot),
         path=mean(flights.path_length[survived]),
         final_error=mean(error),
-        final_error_median=_one(error),
+        final_error_median=_median(error),
         final_error_95=mean(error, partial(np.quantile, q=0.95)),
         recovery_time=_moment(flights.recovery_time),
         cross_track_error=mean(flights.cross_track_error[survived]),
         **{name: mean(getattr(flights, name)) for name in FOLLOWED},
-        cut_by_supervisor=share(cut) if cut.size else None,
-        low_force_time=_one(flights.low_force_time, np.max),
         course=course,
     )
 
@@ -151,6 +144,6 @@ def _moment(times: FloatArray) -> Moment:
     return Moment(share=share(np.isfinite(times)), time=mean(times))
 
 
-def _one(values: FloatArray, statistic: Statistic = np.median) -> float | None:
+def _median(values: FloatArray) -> float | None:
     finite = values[np.isfinite(values)]
-    return float(statistic(finite)) if finite.size else None
+    return float(np.median(finite)) if finite.size else None

@@ -17,7 +17,7 @@ from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.learning_curves import Curve
 from sb3_quad.evaluation.metrics import Metrics
-from sb3_quad.evaluation.results import colours_of
+from sb3_quad.evaluation.tables import colours_of
 
 # Inches of a panel
 WIDTH = 5.0

@@ -69,7 +69,7 @@ def _figures(
     if first.group is not None:
         cells = _cells(results, scenarios)
         for number, key in enumerate(first.cell):
-            title = axis_label(key, first)
+            title = axis_label(key)
             yield f"{first.group}_{number}", success_plot(cells, key, title, results.colours)
         return
     metrics = {}
@@ -84,7 +84,7 @@ def _figures(
         return
     yield f"{first.name}_paths", paths_plot(flights, results.colours)
     # An episode that starts at its target does not fly to it.
-    has_way = first.target.waypoints is None and first.target.distance != 0.0
+    has_way = first.has_way and not first.waypoints
     if has_way and first.reference is None and len(first.tolerances) > 2:
         yield f"{first.name}_times", arrivals_plot(metrics, results.colours)
 

@@ -10,8 +10,8 @@ A number that does not exist is None, never NaN.
 """
 
 import re
-from collections.abc import Iterable, Sequence
-from itertools import cycle
+from collections.abc import Iterable
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -22,53 +22,36 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Frozen, read_record
-from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.evaluation.supervisor import SUPERVISED
+from sb3_quad.evaluation.tables import colours_of
 
 RESULTS = "results.json"
 EPISODES = "episodes.csv"
 FLIGHTS = "flights"
+# Files that are removed together with the results; a report writes the last two.
 REPORT = "report.md"
-# Files that are removed together with the results.
 WRITTEN = (RESULTS, EPISODES, REPORT)
-# Columns of episodes.csv: arrays of one column each, and those of several numbers
-_FLOWN = ("seed", "outcome", "flown", "reward", "own_reward", "path", "final_error")
-_COLUMNS = (*_FLOWN, *FOLLOWED, *SUPERVISED)
-_AXES = {
-    "target": "x y z",
-    "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z",
+# Names of the columns of episodes.csv, for arrays of several numbers
+_PARTS = {
+    "target": "xyz",
+    "final_offset": "xyz",
+    "start": [
+        "x",
+        "y",
+        "z",
+        "qw",
+        "qx",
+        "qy",
+        "qz",
+        "vx",
+        "vy",
+        "vz",
+        "rate_x",
+        "rate_y",
+        "rate_z",
+    ],
 }
-
-
-# The colours that tell controllers apart, the same in every plot and picture. It is Okabe and Ito's
-# palette for the colour-blind, without black and yellow, which are hard to see on dark or light
-# paper, and without green, which marks targets. A few are shifted.
-COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8A5A3B", "#7F7F7F")
-# Labels of well-known controllers, a group for each colour in turn.
-NAMED = re.compile(
-    r"""
-    (pid(?:.expert)?) | (geometric(?:.expert)?) | (itm-robust | our.agent.\(itm-robust\))
-    | (rl.agent(?:,.second.half)? | itm-recovery | thesis-recovery) | (any.quadcopter)
-    | (il.agent | imitation.agent | itm-imitation | thesis-imitation) | (raptor | ppo.only.*)
-    """,
-    re.IGNORECASE | re.VERBOSE,
-)
-
-
-def colours_of(names: Sequence[str]) -> dict[str, str]:
-    """Return a colour, ``#rrggbb``, for each label of a controller.
-
-    A well-known controller has the same one everywhere. The others take the remaining ones in
-    order, and share colours if more than eight fly.
-    """
-    colours = dict.fromkeys(names, "")
-    for name in names:
-        if known := NAMED.fullmatch(name):
-            colours[name] = COLOURS[(known.lastindex or 1) - 1]
-    free = cycle([colour for colour in COLOURS if colour not in colours.values()] or COLOURS)
-    return {name: colour or next(free) for name, colour in colours.items()}
 
 
 class ControllerRecord(Frozen):
@@ -123,7 +106,7 @@ class Failure(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[7] = 7
+    schema_version: Literal[8] = 8
     suite: str
     description: str
     source: str = "published"
@@ -190,19 +173,18 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
             "scenario": entry.scenario,
             "episode": range(entry.metrics.n),
         }
-        for name in _COLUMNS:
-            columns[name] = arrays[f"episode_{name}"]
+        tolerances = [f"{tolerance:g}" for tolerance in arrays.pop("episode_tolerances")]
+        parts = {**_PARTS, "time_to": tolerances, "settling_time": tolerances}
         waypoints = arrays["episode_waypoints"]
         columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
-        # Arrays of several numbers become a column for each of them.
-        tolerances = " ".join(map("{:g}".format, arrays["episode_tolerances"]))
-        titles = {**_AXES, "time_to": tolerances, "settling_time": tolerances}
-        for name, parts in titles.items():
-            for part, values in zip(parts.split(), arrays[f"episode_{name}"].T, strict=True):
-                columns[f"{name}_{part}"] = values
-        columns["overshoot"] = arrays["episode_overshoot"]
-        for number, values in enumerate(waypoints.T, 1):
-            columns[f"waypoint_{number}"] = values
+        for key, values in arrays.items():
+            name = key.removeprefix("episode_")
+            if values.ndim == 1:
+                columns[name] = values
+                continue
+            # An array of several numbers becomes a column for each of them.
+            for part, column in zip(parts.get(name, count(1)), values.T, strict=False):
+                columns[f"{name}_{part}"] = column
         tables.append(pd.DataFrame(columns))
     # Scenarios differ in tolerances and waypoints, and so in their columns.
     # Nine digits tell any two float32 apart.

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from html import escape as escape_html
+from itertools import cycle
 from typing import Literal, NamedTuple
 
 import rich.console
@@ -11,6 +12,10 @@ from rich.text import Text
 
 Align = Literal["left", "right"]
 WIDTH = 200  # maximum characters in a line of a table as plain text
+# The colours that tell controllers apart, the same in every table, plot and picture. It is Okabe
+# and Ito's palette for the colour-blind, without black and yellow, which are hard to see on dark or
+# light paper, and without green, which marks targets. A few are shifted.
+COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8A5A3B", "#7F7F7F")
 
 
 class Cell(NamedTuple):
@@ -175,3 +180,10 @@ def text_table(
     for name, *texts in rows:
         filled.append(Row(name, "", [Cell(words=text) for text in texts]))
     return Table([Column(name, align=align) for name in names], filled, corner, title)
+
+
+def colours_of(names: Iterable[str]) -> dict[str, str]:
+    """Return a colour, ``#rrggbb``, for each label of a controller, in their order; more than eight
+    share colours.
+    """
+    return dict(zip(names, cycle(COLOURS), strict=False))

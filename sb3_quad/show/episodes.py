@@ -13,10 +13,11 @@ from sb3_quad.envs.rendering.scene import MARKER, Trail
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.vehicle import Vehicle
-from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
-from sb3_quad.evaluation.results import colours_of
+from sb3_quad.evaluation.flights import Flights, fly_settings
+from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
+from sb3_quad.evaluation.tables import colours_of
 
 # The path of a target has the colour of its ball.
 TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()
@@ -25,12 +26,12 @@ TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()
 class Recording(Hook):
     """A flight of T control steps, recorded as it is flown.
 
-    :ivar results: the metrics of this one flight; to be set once it has been flown.
+    :ivar flights: the metrics of this one flight; to be set once it has been flown.
 
     :param colour: colour of its trail and its name, #rrggbb.
     """
 
-    results: Flights
+    flights: Flights
 
     def __init__(self, name: str, colour: str) -> None:
         self.name = name
@@ -53,9 +54,9 @@ class Recording(Hook):
     @property
     def lost(self) -> str:
         """How it was lost; empty if it was not."""
-        if self.results.collision[0]:
+        if self.flights.collision[0]:
             return "crashed"
-        return "" if self.results.survival[0] else "out of range"
+        return "" if self.flights.survival[0] else "out of range"
 
     @cached_property
     def times(self) -> FloatArray:
@@ -127,7 +128,7 @@ def scenario_setting(text: str, own: Any = None, vehicle: str | None = None) -> 
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).with_changes(vehicle=vehicle).scenario(name).flown_by(own)
     return Setting(
-        scenario.nominal_vehicle(), scenario.flown_as, lambda seed: sample_plan(scenario, [seed])
+        scenario.nominal_vehicle(), scenario.settings, lambda seed: sample_plan(scenario, [seed])
     )
 
 

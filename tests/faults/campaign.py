@@ -62,11 +62,11 @@ NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline)_\d+"
 SUITE = """
 name: one
 scenarios:
-  - {name: near, target: {distance: 1}, duration: 2, episodes: 400}
+  - {name: near, task_kwargs: {target_distance: 1}, duration: 2, n_episodes: 400}
   - name: thrown
-    start: {attitude: {distribution: uniform}, velocity: {std: 2}}
+    task: state_recovery
     duration: 2
-    episodes: 400
+    n_episodes: 400
 """
 STAGES = [
     {

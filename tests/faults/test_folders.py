@@ -14,7 +14,7 @@ from sb3_quad.evaluation.results import load_results
 SUITE = """
 name: one
 source: paper
-scenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]
+scenarios: [{name: near, task_kwargs: {target_distance: 1}, duration: 2, n_episodes: 2}]
 """
 codes = []
 

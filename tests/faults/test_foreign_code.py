@@ -149,7 +149,7 @@ def test_a_pickle_that_calls_a_function_is_refused(content):
 @pytest.mark.parametrize(
     ("command", "key"),
     [
-        ("evaluate foreign.zip --suite quick --episodes 1 --no-report", "policy_class"),
+        ("evaluate foreign.zip --suite quick -n 1 --no-report", "policy_class"),
         ("enjoy foreign.zip --no-render -n 1", "action_space"),
         ("export foreign.zip --format c", "observation_space"),
         ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "vec_normalize"),

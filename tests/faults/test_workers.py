@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 SUITE = """
 name: one
 source: paper
-scenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]
+scenarios: [{name: near, task_kwargs: {target_distance: 1}, duration: 2, n_episodes: 2}]
 """
 
 

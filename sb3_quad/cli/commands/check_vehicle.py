@@ -37,7 +37,7 @@ RPM = 60.0 / (2.0 * math.pi)
 
 FLAGS: Flags = {
     "vehicle VEHICLE": "name or YAML file",
-    "-n --episodes N": (
+    "-n --n-episodes N": (
         natural,
         480,
         "episodes of each task and expert, with the true state (480)",
@@ -78,12 +78,12 @@ def run(options: Namespace) -> int:
         from sb3_quad.evaluation.real_flights import error_table, read_logs
 
         console().print(error_table(read_logs(options.flights, vehicle.control_step), vehicle))
-    elif options.episodes:
+    elif options.n_episodes:
         controllers = {"PID": PIDExpert(vehicle), "geometric": GeometricExpert(vehicle)}
         console().print(
             compare(
                 controllers,
-                n_episodes=options.episodes,
+                n_episodes=options.n_episodes,
                 seed=seed_for("expert", options.seed),
                 vehicle=vehicle,
                 noise=0.0,

@@ -125,7 +125,7 @@ def run(options: Namespace) -> int:
     for number, episode in enumerate(episodes, 1):
         for flight in episode:
             prefix = f"episode {number}, " if len(episodes) > 1 else ""
-            print(f"{prefix}{flight.name}: {flight.end}, reward {flight.results.reward[0]:.2f}")
+            print(f"{prefix}{flight.name}: {flight.end}, reward {flight.flights.reward[0]:.2f}")
     width, height = options.size or (PANEL if len(controllers) > 1 else SINGLE)
     if window:
         show_in_window(episodes, width, height, options.speed)

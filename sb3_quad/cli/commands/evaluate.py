@@ -19,7 +19,7 @@ examples:
     --suite thesis -o evaluations/mine
   # a quick look, in less than a minute
   sb3-quad evaluate pid agent.zip --suite quick
-  # in two processes, or on a Ray cluster
+  # in two processes
   sb3-quad evaluate agent.zip --suite robustness --workers 2
   # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
@@ -60,7 +60,7 @@ FLAGS: Flags = {
     ),
     "-o --output FOLDER": "folder for the results (evaluations/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
-    "--episodes N": (whole, "episodes of each scenario (the suite's number)"),
+    "-n --n-episodes N": (whole, "episodes of each scenario (the suite's number)"),
     "--seed N": (whole, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
     "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
@@ -84,7 +84,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.evaluation.scenarios.load import load_suite
 
     suite = load_suite(options.suite).with_changes(
-        options.scenario, options.episodes, options.seed, options.vehicle
+        options.scenario, options.n_episodes, options.seed, options.vehicle
     )
     folder = options.output or f"evaluations/{suite.name}"
     with progress_bar(options.progress) as show:

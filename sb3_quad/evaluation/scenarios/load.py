@@ -8,6 +8,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
@@ -18,20 +19,19 @@ from sb3_quad.envs.vehicles.vehicle import VEHICLES
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 
 SUITES = YamlFolder("suite", "sb3_quad.evaluation.scenarios.suites")
-OF_VEHICLE = "× the vehicle's own"
+# The units of varied keys, by their short names
 UNITS = {
     "tilt": "deg",
     "velocity": "m/s",
     "body_rates": "rad/s",
     "force": "N",
     "torque": "N m",
-    "distance": "m",
-    "start": "s",
+    "target_distance": "m",
     "duration": "s",
     "factor": "× the wrench",
-    "mass": OF_VEHICLE,
-    "inertia": OF_VEHICLE,
-    "motor_gain": OF_VEHICLE,
+    "mass": "× the vehicle's own",
+    "inertia": "× the vehicle's own",
+    "motor_gain": "× the vehicle's own",
     "delay": "control steps",
     "thrust_to_weight": "greatest thrust by weight",
     "torque_to_inertia": "rad/s²",
@@ -42,8 +42,6 @@ UNITS = {
     "wind": "m/s",
     "wind_gusts": "std, m/s",
 }
-# The units of wrenches with `unit: weight`.
-WEIGHTS = {"force": "weights", "torque": "weights × arm length"}
 # The types that the values of an axis may have.
 NUMBERS = ({int}, {float}, {int, float})
 # Parts of a key that its short name does not need.
@@ -64,7 +62,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     """Read a suite from YAML text.
 
     :param where: what messages call the text.
-    :param folder: what the paths of vehicle files are relative to.
+    :param folder: what the paths of files are relative to.
     :raises ConfigError: see :func:`load_suite`.
     """
     data = parse_keys(content, where)
@@ -76,29 +74,20 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     scenarios = []
     for number, entry in enumerate(entries):
         place = f"{where}: scenario {entry.get('name', number)}"
-        if "vehicle" in entry:
-            entry["vehicle"] = _beside(folder, entry["vehicle"])
-        reference = entry.get("reference")
-        if isinstance(reference, dict) and "file" in reference:
-            entry["reference"] = {**reference, "file": folder / str(reference["file"])}
-        elif str(reference).endswith(".csv"):
-            entry["reference"] = folder / str(reference)
-        vehicles = entry.get("vehicles")
-        if isinstance(vehicles, dict) and "distribution" in vehicles:
-            distribution = _beside(folder, vehicles["distribution"])
-            entry["vehicles"] = {**vehicles, "distribution": distribution}
-        elif vehicles is not None:
-            entry["vehicles"] = _beside(folder, vehicles)
+        for key in entry.keys() & {"vehicle", "vehicles", "reference"}:
+            entry[key] = _beside(folder, entry[key])
         # A cell of a grid is a scenario like any other.
         scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)
 
 
-def _beside(folder: Path, source: object) -> object:
-    """Return the path of a file that is named relative to a folder; a name is returned as it is."""
-    if isinstance(source, str) and VEHICLES.is_path(source):
-        return str(folder / source)
-    return source
+def _beside(folder: Path, value: Any) -> Any:
+    """Return the value of a key, with paths of files relative to the folder."""
+    if isinstance(value, dict):
+        return {key: _beside(folder, part) for key, part in value.items()}
+    if isinstance(value, str) and (VEHICLES.is_path(value) or value.endswith(".csv")):
+        return str(folder / value)
+    return value
 
 
 def grid(entry: StrMapping, where: str) -> list[StrDict]:
@@ -106,7 +95,7 @@ def grid(entry: StrMapping, where: str) -> list[StrDict]:
 
     Without ``vary``, this is only the entry itself.
 
-    :param entry: as read from YAML; ``vary`` maps keys such as ``start.attitude.tilt`` to lists of
+    :param entry: as read from YAML; ``vary`` maps keys such as ``start.tilt`` to lists of
         numbers.
     :raises ConfigError: ``vary`` is not such a mapping, or a key of it is not in the entry.
     """
@@ -154,17 +143,8 @@ def axis_values(cell: Mapping[str, float]) -> list[str]:
     return [f"{axis_name(key)} {value:g}" for key, value in cell.items()]
 
 
-def axis_label(key: str, scenario: Scenario | None = None) -> str:
-    """Return the name of a varied key with its unit, for the axes of plots.
-
-    :param scenario: one of the cells, whose wrenches decide about the unit; None: SI.
-    """
+def axis_label(key: str) -> str:
+    """Return the name of a varied key with its unit, for the axes of plots."""
     name = axis_name(key)
-    unit = UNITS.get(name)
-    # The unit of a wrench may differ from scenario to scenario.
-    if scenario is not None and key.startswith("wrenches."):
-        wrench = scenario.wrenches[int(key.split(".")[1])]
-        if wrench.unit == "weight":
-            unit = WEIGHTS.get(name, unit)
     label = name.replace("_", " ")
-    return f"{label} ({unit})" if unit else label
+    return f"{label} ({UNITS[name]})" if name in UNITS else label

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_quad.base.seeds import SCENARIO_STREAM
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices
-from sb3_quad.evaluation.scenarios.parts import Attitude, VectorDistribution
+from sb3_quad.evaluation.scenarios.events import RandomDirection, Start, Vector
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 Generators = Sequence[np.random.Generator]  # one for each episode
@@ -39,42 +39,39 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     :param seeds: seeds of the episodes, (n,).
     """
     generators = [np.random.default_rng([SCENARIO_STREAM, seed]) for seed in seeds]
-    attitude = scenario.start.attitude
-    target = scenario.target
+    begun = scenario.start
     start = {}
-    # The task samples uniform attitudes and normal velocities itself.
-    if attitude.distribution is None:
-        start["quaternion"] = _quaternions(attitude, generators)
-    for name in ("velocity", "body_rates"):
-        distribution = getattr(scenario.start, name)
-        if distribution.std is None:
-            start[name] = _vectors(distribution, generators)
-    if scenario.start.velocity_frame == "body":
+    if begun.sets_attitude:
+        start["quaternion"] = _quaternions(begun, generators)
+    if begun.velocity is not None:
+        start["velocity"] = _vectors(begun.velocity, generators)
+    if begun.body_rates is not None:
+        start["body_rates"] = _vectors(begun.body_rates, generators)
+    if begun.velocity_frame == "body":
         rotation = rotation_matrices(start["quaternion"])
         start["velocity"] = np.einsum("nij,nj->ni", rotation, start["velocity"])
-    if target.points:
-        start["target"] = np.tile(target.points[0], (len(seeds), 1))
-    wrenches = sample_wrenches(scenario, generators)
-    return Plan(start, wrenches, np.array(target.waypoints or ()).reshape(-1, 3), target.radius)
+    if scenario.targets:
+        start["target"] = np.tile(scenario.targets[0], (len(seeds), 1))
+    return Plan(
+        start,
+        sample_wrenches(scenario, generators),
+        np.array(scenario.waypoints).reshape(-1, 3),
+        scenario.waypoint_radius,
+    )
 
 
 def sample_wrenches(scenario: Scenario, generators: Generators) -> dict[int, FloatArray]:
     """Add up the wrenches of a scenario over the time of n episodes, for a :class:`Plan`."""
-    vehicle = scenario.nominal_vehicle()
+    control_step = scenario.nominal_vehicle().control_step
     acting = []
     times = set[int]()
     for wrench in scenario.wrenches:
-        # A wrench acts for whole control steps.
-        first = round(wrench.start / vehicle.control_step)
-        last = first + scenario.steps
-        if wrench.duration is not None:
-            last = first + round(wrench.duration / vehicle.control_step)
-        newton, newton_metre = wrench.units(vehicle)
-        force = newton * _vectors(wrench.force, generators)
-        torque = newton_metre * _vectors(wrench.torque, generators)
+        when = wrench.steps(control_step, scenario.steps)
+        force = _vectors(wrench.force, generators)
+        torque = _vectors(wrench.torque, generators)
         values = make_wrench(force, torque, wrench.force_frame, wrench.torque_frame).T
-        acting.append((range(first, last), wrench.factor * values))
-        times |= {first, last}
+        acting.append((when, wrench.factor * values))
+        times |= {when.start, when.stop}
     # The sum changes only where a wrench begins or ends.
     sums = {}
     for time in sorted(times & {*range(scenario.steps)}):
@@ -85,36 +82,29 @@ def sample_wrenches(scenario: Scenario, generators: Generators) -> dict[int, Flo
     return sums
 
 
-def _vectors(distribution: VectorDistribution, generators: Generators) -> FloatArray:
-    if distribution.value is not None:
-        return np.tile(distribution.value, (len(generators), 1))
-    if distribution.std is not None:
-        return distribution.std * _normals(generators, 3)
+def _vectors(given: Vector | RandomDirection, generators: Generators) -> FloatArray:
+    if not isinstance(given, RandomDirection):
+        return np.tile(given, (len(generators), 1))
     # Nothing is drawn for a magnitude of zero.
-    if not distribution.magnitude:
+    if not given.magnitude:
         return np.zeros((len(generators), 3))
-    return distribution.magnitude * _directions(generators, 3)
+    return given.magnitude * _directions(generators, 3)
 
 
-def _quaternions(attitude: Attitude, generators: Generators) -> FloatArray:
+def _quaternions(start: Start, generators: Generators) -> FloatArray:
     n = len(generators)
-    if attitude.quaternion is not None:
-        quaternion = np.array(attitude.quaternion)
+    if start.quaternion is not None:
+        quaternion = np.array(start.quaternion)
         return np.tile(quaternion / np.linalg.norm(quaternion), (n, 1))
-    if not attitude.tilt:
+    if not start.tilt:
         return np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     # A turn by the tilt about a random horizontal axis.
-    half = np.deg2rad(attitude.tilt) / 2.0
+    half = np.deg2rad(start.tilt) / 2.0
     axis = _directions(generators, 2)
     return np.column_stack([np.full(n, np.cos(half)), np.sin(half) * axis, np.zeros(n)])
 
 
 def _directions(generators: Generators, size: int) -> FloatArray:
     """(n, size) vectors of length 1, uniform."""
-    normals = _normals(generators, size)
+    normals = np.stack([generator.standard_normal(size) for generator in generators])
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-
-
-def _normals(generators: Generators, size: int) -> FloatArray:
-    """(n, size) numbers of N(0, 1)."""
-    return np.stack([generator.standard_normal(size) for generator in generators])

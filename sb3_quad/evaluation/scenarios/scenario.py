@@ -14,10 +14,10 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.references import Reference
 from sb3_quad.envs.simulation.settings import FlightSettings, Noise
-from sb3_quad.envs.simulation.tasks import RECOVERED, Task
+from sb3_quad.envs.simulation.tasks import T, Task, resolve_tasks
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
-from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
+from sb3_quad.evaluation.scenarios.events import Start, Vector, Wrench
 
 # m: the tolerances of Figs. 4.6 and 4.7, and a tighter one
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -52,9 +52,13 @@ class Published(Frozen):
 
 
 class Scenario(Frozen):
-    """One way to judge a controller: the episodes, their number, and published metrics.
+    """One way to judge a controller: keywords of the environments, events, and the number of the
+    episodes.
 
-    Units m, s, rad, N, N m, kg.
+    ``task``, ``task_kwargs``, ``vehicle``, ``noise``, ``vehicles``, ``randomize`` and ``reference``
+    are those of :class:`~sb3_quad.envs.simulation.settings.FlightSettings`. ``start``, ``target``,
+    ``waypoints`` and ``wrenches`` are events, which come on top of what the task samples. Units m,
+    s, rad, N, N m, kg.
     """
 
     name: str = Field(pattern=NAME)
@@ -63,31 +67,37 @@ class Scenario(Frozen):
     """heading of tables and plots; default: the name"""
     description: str = ""
     """what it tests, and its source"""
-    start: Start = Start()
-    """where an episode starts; default: hovering at (0, 0, 15) m"""
-    target: Target = Target(distance=0.0)
-    """where to fly; default: to the start"""
+    task: str | Task | dict[str, float] = "target_tracking"
+    """name of a task or mixture, fields of Task, or mixture {name: weight}"""
+    task_kwargs: StrDict | None = None
+    """fields of the task to override, such as {target_distance: 15}"""
+    vehicle: str | Vehicle | None = None
+    """name, or path of a YAML file (relative to the suite's); default: the agent's own, or itm"""
+    noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
+    """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
+    vehicles: VehicleDistribution | None = None
+    """each episode has one of these, unknown to the controller, such as {distribution: raptor}"""
+    randomize: Randomization | None = None
+    """what differs from the vehicle, unknown to the controller, such as {mass: 1.3} or {gusts:
+    {std: 1}}
+    """
     reference: Reference | None = None
     """how the target moves from there: a curve's name, the path of a CSV file (relative to the
     suite's) or fields of Reference; default: it rests
     """
+    start: Start = Start()
+    """replaces the task's attitude, velocity or body rates"""
+    target: Vector | None = None
+    """r_T, world frame, m; default: the task's"""
+    waypoints: tuple[Vector, ...] = ()
+    """instead, targets one after the other, world frame, m"""
+    waypoint_radius: PositiveFloat = 0.5
+    """a waypoint counts as reached within this, m"""
     wrenches: tuple[Wrench, ...] = ()
     """external forces and torques"""
-    noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
-    """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
     duration: float = Field(default=15.0, gt=0, le=600)
     """length of an episode, s"""
-    max_distance: PositiveFloat = 30.0
-    """distance from the target beyond which an episode ends, m"""
-    vehicle: str | Vehicle | None = None
-    """name, or path of a YAML file (relative to the suite's); default: the agent's own, or itm"""
-    vehicle_changes: VehicleChanges = VehicleChanges()
-    """unknown to the controller"""
-    vehicles: VehicleDistribution | None = None
-    """each episode has one of these, unknown to the controller, such as {distribution: raptor}"""
-    randomize: Randomization | None = None
-    """what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"""
-    episodes: int = Field(default=240, ge=1, le=1_000_000)
+    n_episodes: int = Field(default=240, ge=1, le=1_000_000)
     """number of episodes"""
     seed: Seed = 0
     """each episode derives its own seed from it"""
@@ -112,50 +122,62 @@ class Scenario(Frozen):
 
     @model_validator(mode="after")
     def _check_flight(self) -> "Scenario":
-        vehicle = self.flown_vehicle()
-        # For a distribution, the least capable vehicle decides.
-        if self.vehicles is not None:
-            self._refuse_nominal()
-            vehicle = self.vehicles.hardest(vehicle)
-        self._check_way(vehicle)
-        # The task checks the ranges of its fields.
-        _ = self.task
-        if self.randomize is not None:
-            self.randomize.hardest(vehicle)
-            if self.randomize.sets_wrench and self.wrenches:
+        vehicle = self.nominal_vehicle()
+        if self.steps < 1:
+            raise ValueError(f"duration: must be at least a step, {vehicle.control_step:g} s")
+        # The settings check their own fields. Of a distribution, the least capable vehicle decides.
+        settings = self.settings
+        if settings.vehicles is not None:
+            vehicle = settings.vehicles.hardest(vehicle)
+        if settings.randomize is not None:
+            settings.randomize.hardest(vehicle)
+            if settings.randomize.sets_wrench and self.wrenches:
                 raise ValueError(
                     "randomize: force and torque do not go with wrenches, which replace them"
                 )
-        step = vehicle.control_step
-        if self.duration < step:
-            raise ValueError(f"duration: must be a control step, {step:g} s, or longer")
         for number, wrench in enumerate(self.wrenches):
-            is_short = wrench.duration is not None and wrench.duration < step * (1 - 1e-9)
+            acts = wrench.steps(vehicle.control_step, self.steps)
             # It begins and ends between two control steps.
-            if is_short or round(wrench.start / step) >= self.steps:
+            if acts.start >= min(acts.stop, self.steps):
                 raise ValueError(
                     f"wrenches.{number}: must start within the episode of {self.duration:g} s, and"
-                    f" last for a control step, {step:g} s, or longer"
+                    f" last for a control step, {vehicle.control_step:g} s"
                 )
+        self._check_way(vehicle)
         return self
 
-    def _refuse_nominal(self) -> None:
-        """Refuse changes of the nominal vehicle if each episode has another vehicle."""
-        # The delay is the nominal vehicle's in all episodes.
-        if self.vehicle_changes != VehicleChanges(delay=self.vehicle_changes.delay):
-            raise ValueError(
-                "vehicle_changes: mass, inertia and motor_gain are sampled by vehicles; give ranges"
-                " there, or factors in randomize"
-            )
-        for number, wrench in enumerate(self.wrenches):
-            if wrench.unit == "weight":
+    def _check_way(self, vehicle: Vehicle) -> None:
+        """Check that the way lies above ground, its targets within ``max_distance`` of each
+        other.
+        """
+        if self.target is not None and self.waypoints:
+            raise ValueError("waypoints: give them or target, not both")
+        tasks, _ = resolve_tasks(self.task, self.task_kwargs)
+        points = np.array([tasks[0, T.start_position :][:3], *self.targets])
+        lowest = {"start_position": points[0, 2], "target": points[:, 2].min()}
+        if self.reference is not None:
+            if self.waypoints or self.reference.function is not None:
                 raise ValueError(
-                    f"wrenches.{number}: unit: weight is that of one vehicle, and vehicles samples"
-                    " many; give randomize: {force: {magnitude: …, unit: weight}}"
+                    "reference: must be a curve or file, no function, and goes with no waypoints;"
+                    " the curve polynomial has waypoints of its own"
                 )
+            heights = self.reference.tracks(vehicle.control_step).table[:, 2]
+            lowest["reference"] = points[-1, 2] + heights.min()
+        for place, z in lowest.items():
+            if z <= vehicle.collision_radius:
+                raise ValueError(
+                    f"{place}: touches the ground at z = {z:.3g} m; z must exceed"
+                    f" {vehicle.collision_radius:g} m"
+                )
+        farthest = np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)
+        most = tasks[:, T.max_distance].min()
+        if farthest > most:
+            raise ValueError(
+                f"target: {farthest:.3g} m away, and an episode ends beyond max_distance {most:g} m"
+            )
 
     def nominal_vehicle(self) -> Vehicle:
-        """The vehicle before the changes: the one that experts are made for.
+        """The vehicle that experts are made for: ``randomize`` changes it unknown to them.
 
         :raises ConfigError: it cannot be loaded.
         """
@@ -179,16 +201,9 @@ class Scenario(Frozen):
             f"scenario {self.name}, flown by {vehicle.name}",
         )
 
-    def flown_vehicle(self) -> Vehicle:
-        """The vehicle that flies, changes included.
-
-        :raises ConfigError: a vehicle that cannot be loaded, or cannot fly once changed.
-        """
-        return self.vehicle_changes.apply(self.nominal_vehicle())
-
     def episode_seeds(self) -> list[int]:
         """The seeds of the episodes, for ``reset(seed=…)`` of one environment."""
-        return row_seeds(seed_for("suite", self.seed), self.episodes)
+        return row_seeds(seed_for("suite", self.seed), self.n_episodes)
 
     @property
     def heading(self) -> str:
@@ -201,29 +216,12 @@ class Scenario(Frozen):
         return round(self.duration / self.nominal_vehicle().control_step)
 
     @property
-    def task(self) -> Task:
-        """The task that samples random targets and attitudes, as in training."""
-        start = self.start
-        elsewhere = self.target.distance or {*self.target.points} - {start.position}
-        fields: StrDict = {
-            "name": "scenario",
-            "start_position": start.position,
-            "target_distance": self.target.distance or 0.0,
-            "random_attitude": start.attitude.distribution == "uniform",
-            "velocity_std": start.velocity.std or 0.0,
-            "body_rates_std": start.body_rates.std or 0.0,
-            "max_distance": self.max_distance,
-        }
-        if not elsewhere and self.reference is None:
-            fields |= RECOVERED
-        return validate(Task, fields, "start and target")
-
-    @property
-    def flown_as(self) -> FlightSettings:
+    def settings(self) -> FlightSettings:
         """The settings of the episodes."""
-        return FlightSettings(
+        return FlightSettings().with_changes(
             task=self.task,
-            vehicle=self.flown_vehicle(),
+            task_kwargs=self.task_kwargs,
+            vehicle=self.nominal_vehicle(),
             noise=self.noise,
             vehicles=self.vehicles,
             randomize=self.randomize,
@@ -232,53 +230,28 @@ class Scenario(Frozen):
         )
 
     @property
-    def physical_limit(self) -> float | None:
-        """The least possible mean settling time (0.1 m) of the vehicle, s; None: unknown."""
-        # It is known only for undisturbed flights from the start of the tasks.
-        changed = self.start != Start() or self.wrenches or self.randomize or self.vehicles
-        if changed or self.reference or 0.1 not in self.tolerances:
-            return None
-        return (self.flown_vehicle().time_optimal or {}).get(self.target.distance or 0.0)
+    def targets(self) -> tuple[Vector, ...]:
+        """The fixed targets, in order; none if the task samples them."""
+        return self.waypoints or tuple(filter(None, [self.target]))
 
     @property
-    def is_fixed(self) -> bool:
-        """Whether all episodes have one start, target and wrench, and differ only in noise."""
-        vectors = [self.start.velocity, self.start.body_rates]
-        for wrench in self.wrenches:
-            vectors += [wrench.force, wrench.torque]
-        random: list[Any] = [vector.std or vector.magnitude for vector in vectors]
-        attitude = self.start.attitude
-        random += [attitude.distribution, attitude.tilt, self.target.distance]
-        smooth = self.reference and self.reference.curve == "random_smooth"
-        return not any([*random, self.randomize, self.vehicles, smooth])
+    def has_way(self) -> bool:
+        """Whether the target is elsewhere than the start."""
+        tasks, _ = resolve_tasks(self.task, self.task_kwargs)
+        return bool(self.targets or tasks[:, T.target_distance].any())
 
-    def _check_way(self, vehicle: Vehicle) -> None:
-        """Check that the way lies above ground, its targets within ``max_distance`` of each
-        other.
-        """
-        points = np.array([self.start.position, *self.target.points])
-        lowest = {"start.position": points[0, 2], "target": points[:, 2].min()}
-        if self.reference is not None:
-            if self.target.waypoints or self.reference.function is not None:
-                raise ValueError(
-                    "reference: must be a curve or file, no function, and goes with no waypoints of"
-                    " the target; the curve polynomial has waypoints of its own"
-                )
-            heights = self.reference.tracks(vehicle.control_step).table[:, 2]
-            lowest["reference"] = points[-1, 2] + heights.min()
-        for place, z in lowest.items():
-            if z <= vehicle.collision_radius:
-                raise ValueError(
-                    f"{place}: touches the ground at z = {z:.3g} m; z must exceed"
-                    f" {vehicle.collision_radius:g} m"
-                )
-        ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        farthest = max(ways, default=self.target.distance or 0.0)
-        if farthest > self.max_distance:
-            raise ValueError(
-                f"target: {farthest:.3g} m away, and an episode ends beyond max_distance"
-                f" {self.max_distance:g} m"
-            )
+    @property
+    def physical_limit(self) -> float | None:
+        """The least possible mean settling time (0.1 m) of the vehicle, s; None: unknown."""
+        tasks, _ = resolve_tasks(self.task, self.task_kwargs)
+        distance = float(tasks[0, T.target_distance])
+        # It is known only for undisturbed flights from the start of this task.
+        known, _ = resolve_tasks("target_tracking", {"target_distance": distance})
+        events = self.start != Start() or self.targets or self.wrenches
+        changed = events or self.randomize or self.vehicles or self.reference
+        if changed or 0.1 not in self.tolerances or not np.array_equal(tasks, known):
+            return None
+        return (self.nominal_vehicle().time_optimal or {}).get(distance)
 
 
 class Suite(Frozen):
@@ -304,7 +277,7 @@ class Suite(Frozen):
     def with_changes(
         self,
         names: Sequence[str] = (),
-        episodes: int | None = None,
+        n_episodes: int | None = None,
         seed: int | None = None,
         vehicle: str | None = None,
     ) -> "Suite":
@@ -317,7 +290,7 @@ class Suite(Frozen):
         :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible
             for the vehicle.
         """
-        chosen: StrDict = {"episodes": episodes, "seed": seed, "vehicle": vehicle}
+        chosen: StrDict = {"n_episodes": n_episodes, "seed": seed, "vehicle": vehicle}
         changes = {key: value for key, value in chosen.items() if value is not None}
         flown_by = ""
         if vehicle is not None:

@@ -25,7 +25,7 @@ from sb3_quad.envs.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATIO
 from sb3_quad.envs.simulation.state import AHEAD, STATE, STATE_SIZE, X
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 from sb3_quad.evaluation.controllers import ControllerSpec
-from sb3_quad.evaluation.results import COLOURS, colours_of
+from sb3_quad.evaluation.tables import COLOURS, colours_of
 from sb3_quad.export.check import TrainedPolicy
 from sb3_quad.export.network import Network, build_network
 

@@ -1,0 +1,81 @@
+"""A reward of your own, which is measured next to the task's."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_quad.base.errors import ConfigError, ControllerError, raised_as
+from sb3_quad.base.imports import import_name
+from sb3_quad.base.types import BoolArray, Float32Array
+from sb3_quad.envs.simulation.state import QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import Vehicle
+from sb3_quad.evaluation.hooks import Hook
+
+Reward: TypeAlias = Callable[[QuadcopterState, Float32Array], npt.ArrayLike]
+"""A reward of your own: a function from the state after a control step and the actions (n, 4) that
+led to it to rewards (n,).
+"""
+
+
+OwnReward: TypeAlias = str | Reward | None
+"""A reward of your own as it is given: a function or ``package.module:function``; None: none."""
+
+
+def load_reward(reward: OwnReward) -> Reward | None:
+    """Return a user's reward.
+
+    :param reward: a function, returned as it is; or ``package.module:function``.
+    :raises ConfigError: it cannot be imported, or is not a function.
+    """
+    if not isinstance(reward, str):
+        return reward
+    function = import_name(reward, "reward")
+    if not callable(function):
+        raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
+    return function  # type: ignore[no-any-return]
+
+
+def reward_name(reward: OwnReward) -> str:
+    """Return the name of a reward of your own; empty if there is none."""
+    if reward is None or isinstance(reward, str):
+        return reward or ""
+    # Instances of a class have no ``__name__``.
+    return str(getattr(reward, "__name__", type(reward).__name__))
+
+
+class OwnRewards(Hook):
+    """The sum of a user's reward over each flight: ``own_reward``; NaN if there is none.
+
+    :param reward: a class is instantiated afresh, since its instances may remember.
+    """
+
+    def __init__(self, reward: Reward | None) -> None:
+        self._reward = reward() if isinstance(reward, type) else reward
+
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self._flying = np.ones(state.n, bool)
+        self._total = np.full(state.n, np.nan if self._reward is None else 0.0)
+
+    def after_step(
+        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
+    ) -> None:
+        if self._reward is None:
+            return
+        name = f"reward {reward_name(self._reward)}"
+        # The function may do anything.
+        with raised_as(ControllerError, f"{name}: fails"):
+            values = np.asarray(self._reward(state, actions), dtype=np.float64)
+        if values.shape != (state.n,):
+            raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
+        wrong = np.flatnonzero(self._flying & ~np.isfinite(values))
+        if wrong.size:
+            raise ControllerError(
+                f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite"
+            )
+        self._total += np.where(self._flying, values, 0.0)
+        self._flying = flying
+
+    def results(self) -> Mapping[str, Any]:
+        return {"own_reward": self._total}
