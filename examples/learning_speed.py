@@ -113,7 +113,7 @@ def train(
     algo, env_id, overrides, _ = METHODS[method]
     config = load_config(algo, env_id, overrides=overrides)
     env = make_environments(config, config.n_envs, seed_for("training", seed), staggered=True)
-    job = TrainingJob(config=config, seed=seed, trained_agent=clone)
+    job = TrainingJob(config=config, seed=seed, initial_policy=clone)
     begun = time.process_time()
     model = build_model(job, env)
     # The actor of SAC first imitates the clone, which takes time.

@@ -9,11 +9,11 @@ The callbacks that come with sb3_quad: docs/callbacks.md.
 
 import argparse
 
-from coefficient_schedule import CoefficientSchedule
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import DAgger, GeometricExpert
+from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 

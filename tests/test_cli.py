@@ -473,7 +473,7 @@ def test_an_agent_that_goes_on_with_a_vehicle_of_another_layout_knows_its_rotors
 def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
     quiet = {"report": lambda line: None}
     first = train(job(tmp_path, n_timesteps=400), **quiet)
-    start = {"trained_agent": str(first.run.model)}
+    start = {"initial_policy": str(first.run.model)}
     small = {"n_timesteps": 400, "learning_rate": 0.0}
     second = train(job(tmp_path, "ppo", **small).model_copy(update=start), **quiet)
     ours, theirs = second.model.policy.state_dict(), first.model.policy.state_dict()

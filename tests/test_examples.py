@@ -70,7 +70,6 @@ def shares(output):
         ("own_vehicle.py", ["agent"], 95.0),
         ("own_reward.py", ["agent after training"], 95.0),
         ("own_callback.py", ["agent"], 95.0),
-        ("coefficient_schedule.py", ["agent"], 95.0),
         ("flight_metrics.py", ["agent"], 95.0),
         ("trajectory_plots.py", ["agent"], 95.0),
     ],
@@ -232,10 +231,6 @@ def test_stop_on_signal(run):
     with pytest.raises(SystemExit) as left:
         run("stop_on_signal.py", *SHORT)
     assert left.value.code == 0
-
-
-def test_coefficient_schedule(run):
-    assert "beta 1.00" in run("coefficient_schedule.py", "--timesteps", "12000")
 
 
 def test_flight_metrics(run):

@@ -89,13 +89,13 @@ def test_settings_arguments_and_the_command_come_back(tmp_path, monkeypatch):
     monkeypatch.setattr(
         runs, "write_text", lambda path, text: written.append(path.name) or path.write_text(text)
     )
-    run.write_yaml({"n_envs": 3}, {"seed": 7, "trained_agent": None})
+    run.write_yaml({"n_envs": 3}, {"seed": 7, "initial_policy": None})
     assert {*written} == {"config.yml", "command.txt", "args.yml"} and written[
         -1
     ] == "args.yml"  # who has it lacks nothing
     assert run.command.read_text() == "sb3-quad train --expert 'my file.zip'\n"
     assert vars(open_run(run.path)) == vars(run)
-    assert run.read_yaml() == ({"n_envs": 3}, {"seed": 7, "trained_agent": None})
+    assert run.read_yaml() == ({"n_envs": 3}, {"seed": 7, "initial_policy": None})
     run.arguments.write_text("- no mapping")
     with pytest.raises(ConfigError, match=r"args\.yml"):
         run.read_yaml()

@@ -109,7 +109,7 @@ def test_the_runs_are_the_product_of_grid_and_seeds(noise, rate, seeds):
 
 
 def test_runs_from_an_agent_have_its_observation_and_networks():
-    keys = {"algo": "apg", "trained_agent": "itm-robust", "n_timesteps": 100}
+    keys = {"algo": "apg", "initial_policy": "itm-robust", "n_timesteps": 100}
     (run,) = make_runs(validate(SweepSpec, keys, "sweep"))
     settings = run.stages[0].settings
     assert settings["env_kwargs"]["history"] == [0, 1, 2, 4, 8, 16, 32, 96]

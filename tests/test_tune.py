@@ -189,7 +189,7 @@ def test_trials_are_evaluated_in_the_same_environment(tmp_path, name, value, set
 
 def test_the_command_that_trains_can_be_pasted():
     config = SimpleNamespace(algo="dagger", env_id=ENV)
-    job = SimpleNamespace(config=config, log_folder="my logs", trained_agent="my agent.zip")
+    job = SimpleNamespace(config=config, log_folder="my logs", initial_policy="my agent.zip")
     command = shlex.split(train_command(SimpleNamespace(job=job)))
     assert command[-3:] == [str(Path("my logs", "best.yml")), "-i", "my agent.zip"]
 

@@ -19,7 +19,7 @@ from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.training.config import TrainingJob, build_config, describe, load_config
-from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
+from sb3_quad.training.pipeline import load_pipeline, run_pipeline
 from sb3_quad.training.trainer import resume, train
 from sb3_quad.tuning.space import load_space
 
@@ -101,9 +101,7 @@ def test_a_pipeline_goes_on_from_an_imitation_by_values(tmp_path, short_clone):
     path.write_text(yaml.safe_dump({"stages": [one, two]}), encoding="utf-8")
     shared = {"n_envs": 8, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
     job = {"log_folder": str(tmp_path / "logs"), "eval_episodes": 4, "eval_freq": 0}
-    result = run_pipeline(
-        with_settings(load_pipeline(path), shared), job, "stages", lambda line: None
-    )
+    result = run_pipeline(load_pipeline(path, shared), job, "stages", lambda line: None)
     assert result.exit_code == 0 and saved_algorithm(result.stages["two"].agent) == "SACBC"
     assert [stage.algo for stage in load_pipeline("value_based/two_stage.yml").stages] == [
         "dagger",

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coefficient_schedule import CoefficientSchedule
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -16,6 +15,7 @@ import sb3_quad
 from sb3_quad import PPOBC, SACBC, DAgger, GeometricExpert, PIDExpert
 from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.agents.pretrained import pretrained_names
+from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.envs.vehicles.vehicle import load_vehicle

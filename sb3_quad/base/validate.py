@@ -1,19 +1,30 @@
 """Validated data: one base class for records and settings, and one-line errors."""
 
 import json
+import math
 import re
 import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrMapping
 
 Model = TypeVar("Model", bound=BaseModel)
+# What a value must be, by the kind of pydantic's error; None for its own words. The first that
+# applies is said: a union has an error for each of its types.
+_EXPECTED = {
+    "greater": None,
+    "less": None,
+    "callable": "a number or lin_<number>",
+    "float": "a number",
+    "int": "a whole number",
+}
+_CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 class Frozen(BaseModel):
@@ -49,6 +60,32 @@ def _kind(error: ValidationError) -> type[ConfigError]:
     if not kinds and issubclass(kind, ConfigError):
         return kind
     return ConfigError
+
+
+def check(kind: Any, value: Any, where: str) -> Any:
+    """Return ``value`` as the type ``kind``, which may be annotated with limits.
+
+    :param where: what the message calls the value.
+    :raises ConfigError: it is of another type or out of range; the message says what it must be.
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} is {value}, must be finite")
+    try:
+        # Strict for booleans, since True is not 1.
+        return TypeAdapter(kind, config=_CHECKS).validate_python(
+            value, strict=isinstance(value, bool)
+        )
+    except PydanticUserError:
+        # A type that pydantic cannot check.
+        return value
+    except ValidationError as error:
+        messages = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}
+    # rl_zoo3 imports classes by their names, so a string may stand for a class.
+    if isinstance(value, str) and "is" in messages:
+        return value
+    kind = next((kind for kind in _EXPECTED if kind in messages), next(iter(messages)))
+    expected = _EXPECTED.get(kind) or messages[kind].removeprefix("Input should be ")
+    raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 
 def read_record(path: Path, model: type[Model]) -> Model:

@@ -100,10 +100,10 @@ def _stages(configuration: Configuration) -> tuple[StrDict, list[Stage]]:
     """Return the job of a configuration's runs and their stages, with all settings."""
     job = configuration.given(RunOptions)
     # The agent that the training starts from, as a path that workers find.
-    if configuration.trained_agent is not None:
-        job["trained_agent"] = agent_path(configuration.trained_agent)
-        if not Path(job["trained_agent"]).is_file():
-            raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
+    if configuration.initial_policy is not None:
+        job["initial_policy"] = agent_path(configuration.initial_policy)
+        if not Path(job["initial_policy"]).is_file():
+            raise ConfigError(f"initial_policy {configuration.initial_policy}: no such file")
     changes = all_changes(configuration.hyperparams, configuration.given(SettingsOptions))
     if configuration.vehicle is not None:
         if "vehicle" in changes.get("env_kwargs", {}):

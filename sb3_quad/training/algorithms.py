@@ -4,14 +4,12 @@ These are the algorithms that can be trained, and a user's callbacks and wrapper
 """
 
 import inspect
-import math
 import pkgutil
 import typing
 from contextlib import suppress
 from typing import Any
 
 import gymnasium
-from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
@@ -21,6 +19,7 @@ from sb3_quad.base.errors import ConfigError, raised_as, refuse_unknown
 from sb3_quad.base.imports import import_name
 from sb3_quad.base.literals import parse_mapping, parse_value
 from sb3_quad.base.types import StrDict
+from sb3_quad.base.validate import check
 
 # Imported when first needed.
 ALGORITHMS = {
@@ -52,14 +51,6 @@ _SET_BY_JOB = (
     "seed",
 )
 _LINEAR = "lin_"
-EXPECTED = {
-    "greater": "at least 1",
-    "callable": "a number or lin_<number>",
-    "float": "a number",
-    "int": "a whole number",
-}
-"""What a value must be, by the kind of pydantic's error; the first that applies."""
-_CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 def get_algorithm(name: str) -> type[BaseAlgorithm]:
@@ -79,12 +70,16 @@ def takes_expert(algorithm: type[BaseAlgorithm]) -> bool:
 def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
     """Return the keywords of a constructor, an algorithm's or a policy's, that settings may give.
 
-    Each annotation is a type. It is Any where an annotation is missing or has a name that cannot be
-    resolved.
+    Each annotation is a type with its limits, if it has any. It is Any where an annotation is
+    missing or has a name that cannot be resolved.
     """
     # SB3's GymEnv contains "VecEnv" as a string, which only some of its modules can resolve.
     try:
-        types = typing.get_type_hints(algorithm.__init__, localns={"VecEnv": VecEnv})  # type: ignore[misc]
+        types = typing.get_type_hints(
+            algorithm.__init__,  # type: ignore[misc]
+            localns={"VecEnv": VecEnv},
+            include_extras=True,
+        )
     except NameError:
         types = {}
     parameters = {}
@@ -98,71 +93,27 @@ def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
     return parameters
 
 
-def convert(
-    value: Any,
-    parameter: inspect.Parameter,
-    where: str,
-    least: float = -math.inf,
-    most: float = math.inf,
-) -> Any:
-    """Convert ``value`` to what the constructor's ``parameter``, whose annotation is a type,
-    accepts.
+def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
+    """Convert ``value`` to what the constructor's ``parameter``, whose annotation is a type with
+    its limits, accepts.
 
     Strings become literals or, as ``lin_x``, SB3's ``LinearSchedule(x, 0, 1)``, which every SB3 can
     unpickle.
 
-    :param least: the smallest number that is allowed, also at the start of a schedule.
-    :param most: the largest one.
     :raises ConfigError: text instead of a number, a fraction instead of a whole number, another
         type; NaN or infinity; a number out of range.
     """
-    is_linear = isinstance(value, str) and value.startswith(_LINEAR)
-    if is_linear:
-        converted = check(
-            float, value.removeprefix(_LINEAR), f"{where}: the number after {_LINEAR}"
-        )
-    else:
+    if not (isinstance(value, str) and value.startswith(_LINEAR)):
         if isinstance(value, str):
             value = parse_value(value)
-        converted = check(parameter.annotation, value, where)
-    if isinstance(converted, (int, float)):
-        if converted < least:
-            raise ConfigError(f"{where} is {value!r}, must be at least {least:g}")
-        if converted > most:
-            raise ConfigError(f"{where} is {value!r}, must be at most {most:g}")
-    if not is_linear:
-        return converted
-    schedule = LinearSchedule(converted, 0.0, 1.0)
+        return check(parameter.annotation, value, where)
+    number = check(float, value.removeprefix(_LINEAR), f"{where}: the number after {_LINEAR}")
+    # A schedule has the limits of a number, which it is at its start.
+    start = check(parameter.annotation, number, where)
+    schedule = LinearSchedule(start, 0.0, 1.0)
     if not _takes(parameter.annotation, schedule):
         raise ConfigError(f"{where} is {value!r}, but it takes no schedule")
     return schedule
-
-
-def check(kind: Any, value: Any, where: str) -> Any:
-    """Return ``value`` as the type ``kind``, by pydantic.
-
-    :raises ConfigError: it is of another type; the message says what it must be.
-    """
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{where} is {value}, must be finite")
-    try:
-        # Strict for booleans, since True is not 1.
-        return TypeAdapter(kind, config=_CHECKS).validate_python(
-            value, strict=isinstance(value, bool)
-        )
-    except PydanticUserError:
-        # A type that pydantic cannot check.
-        return value
-    except ValidationError as error:
-        # A union has one error for each of its types: by "int", "float", "callable", …
-        messages = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}
-    # rl_zoo3 imports classes by their names, so a string may stand for a class.
-    if isinstance(value, str) and "is" in messages:
-        return value
-    known = [text for kind, text in EXPECTED.items() if kind in messages]
-    # Pydantic's own messages are good enough for the others.
-    expected = [*known, *messages.values()][0].removeprefix("Input should be ")
-    raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 
 def takes_whole(parameter: inspect.Parameter) -> bool:

@@ -21,17 +21,15 @@ from pydantic import (
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
+from sb3_quad.agents.agent_settings import agent_settings, settings_of_model, unlike_trained
 from sb3_quad.agents.pretrained import agent_path, pretrained_names
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.agents.tensors import AGENTS
-from sb3_quad.agents.zips import load_model
-from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen, check, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.simulation.settings import FlightSettings
@@ -40,7 +38,6 @@ from sb3_quad.envs.vehicles.layout import Turn, find_turn
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, first_vehicle
 from sb3_quad.training.algorithms import (
     as_list,
-    check,
     constructor_parameters,
     convert,
     get_algorithm,
@@ -266,6 +263,8 @@ class TrainingJob(JobOptions):
 
     config: TrainingConfig
     """the settings"""
+    agent: Any = Field(default=None, exclude=True, repr=False)
+    """the agent that initial_policy names, if it has been loaded"""
 
     def for_evaluation(self, **changes: Any) -> TrainingConfig:
         """Return the settings with the environments of evaluations.
@@ -313,8 +312,8 @@ def describe(job: TrainingJob) -> str:
     if config.expert:
         line += f", expert {config.expert}"
     line += f", seed {job.seed}"
-    if job.trained_agent:
-        line += f", from {job.trained_agent}"
+    if job.initial_policy:
+        line += f", from {job.initial_policy}"
     return line
 
 
@@ -398,9 +397,7 @@ def build_config(
     hyperparams = {}
     for key, value in settings.items():
         if key in parameters:
-            hyperparams[key] = convert(
-                value, parameters[key], f"{source(key)}: {key}", *LIMITS.get(key, ())
-            )
+            hyperparams[key] = convert(value, parameters[key], f"{source(key)}: {key}")
         elif key not in JOB_KEYS:
             message = unknown(f"key of {algo}", key, [*JOB_KEYS, *parameters])
             raise ConfigError(f"{source(key)}: {message}")
@@ -460,26 +457,35 @@ def check_environment(env_id: str) -> None:
         )
 
 
-def as_agent(path: StrPath, algo: str, env_id: str, changes: StrDict) -> StrDict:
+def as_agent(
+    agent: BaseAlgorithm, path: StrPath, algo: str, env_id: str, changes: StrDict
+) -> StrDict:
     """Return ``changes`` to the settings of an algorithm, together with the observation and
-    networks of a zip.
+    networks of an agent.
 
     ``changes`` take precedence. Evaluations fly with the agent's position integral, if it has one;
-    training flies without it. A zip that does not say how its agent flies adds nothing.
+    training flies without it. An agent that does not say how it flies adds nothing.
 
-    :raises ConfigError: a zip or settings that do not fit; rotors in other places.
+    :param path: the zip that the agent was loaded from.
+    :raises ConfigError: settings that do not fit; rotors in other places.
     """
     config = load_config(algo, env_id, None, changes)
-    own, source = agent_settings(path)
-    if source is None or not config.task:
+    own = settings_of_model(agent)
+    if own is None:
+        # In the zips of rl_zoo3, the settings lie next to the zip.
+        own, source = agent_settings(path)
+        if source is None:
+            return changes
+    if not config.task:
         return changes
     # A new vehicle may be what the user wants, so this is only a warning.
-    notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))
+    vehicle = first_vehicle(config.flight_settings.vehicle)
+    notice = unlike_trained(str(path), own, vehicle)
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
     observed = own.observed
     # The agent knows one order of the rotors.
-    if find_turn(first_vehicle(config.flight_settings.vehicle), own.layout) != Turn():
+    if find_turn(vehicle, own.layout) != Turn():
         observed["rotor_layout"] = own.layout.model_dump(mode="json")
     integral = observed.pop("position_integral")
     adopted = {
@@ -490,7 +496,7 @@ def as_agent(path: StrPath, algo: str, env_id: str, changes: StrDict) -> StrDict
     }
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
-        policy: Any = load_model(path).policy
+        policy: Any = agent.policy
         adopted["policy_kwargs"] = {
             **config.policy_kwargs,
             "net_arch": policy.net_arch,

@@ -65,8 +65,8 @@ def train_command(search: Search) -> str:
         f"sb3-quad train --algo {config.algo} --env {config.env_id} "
         f"--conf-file {shlex.quote(str(Path(search.job.log_folder, BEST)))}"
     )
-    if search.job.trained_agent:
-        command += f" -i {shlex.quote(search.job.trained_agent)}"
+    if search.job.initial_policy:
+        command += f" -i {shlex.quote(search.job.initial_policy)}"
     return command
 
 

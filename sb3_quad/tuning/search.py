@@ -222,15 +222,15 @@ class Search:
         job = self.job
         # The agent is identified by its content, since its file may move.
         agent = None
-        if job.trained_agent is not None:
-            agent = controller_record(ControllerSpec("agent", job.trained_agent)).content
+        if job.initial_policy is not None:
+            agent = controller_record(ControllerSpec("agent", job.initial_policy)).content
         return {
             "algo": job.config.algo,
             "env": job.config.env_id,
             **job.config.settings,
             "search_space": str(self.space.dimensions),
             "seed": job.seed,
-            "trained_agent": agent,
+            "initial_policy": agent,
             "n_evaluations": self.n_evaluations,
             "eval_episodes": job.eval_episodes,
         }

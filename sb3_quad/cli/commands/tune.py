@@ -110,14 +110,16 @@ def _make_search(options: Namespace) -> Any:
 
     # A search is for the settings of a single run.
     options.algo = options.algo or DEFAULT_ALGO
-    config = plan(options).load()
+    stage = plan(options)
+    config = stage.load()
     space = load_space(config, options.search_space)
     job = validate(
         TrainingJob,
         {
             "config": config,
+            "agent": stage.agent,
             "eval_episodes": EPISODES[config.vec_env],
-            **given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes"),
+            **given(options, "device", "initial_policy", "n_eval_envs", "seed", "eval_episodes"),
         },
         "command line",
     )
