@@ -82,23 +82,15 @@ def test_weights_and_biases_has_settings_and_evaluations(tmp_path, monkeypatch, 
         return runs[-1]
 
     monkeypatch.setattr(wandb, "init", noted)
+    monkeypatch.setenv("WANDB_PROJECT", "quads")
+    monkeypatch.setenv("WANDB_RUN_GROUP", "first")
+    monkeypatch.setenv("WANDB_TAGS", "one,two")
     for seed in ("3", "4"):
-        flags = [
-            "--wandb-project-name",
-            "quads",
-            "--wandb-group",
-            "first",
-            "-tags",
-            "one",
-            "two",
-            "--seed",
-            seed,
-        ]
-        assert main([*TRAIN, "--track", *flags]) == 0
+        assert main([*TRAIN, "--track", "--seed", seed]) == 0
     assert [run.config["seed"] for run in runs] == [3, 4]
     assert capsys.readouterr().err.count("eval/mean_reward") == 4  # history and summary of each
     for run in runs:
-        assert run.project == "quads" and run.group == "first" and {"one", "two"} < {*run.tags}
+        assert run.project == "quads" and run.group == "first" and {*run.tags} == {"one", "two"}
         assert run.name.startswith(f"QuadTargetTracking-v0__dagger__{run.config['seed']}__")
         assert (
             run.config["n_envs"] == 16

@@ -85,6 +85,8 @@ def check(kind: Any, value: Any, where: str) -> Any:
         return value
     kind = next((kind for kind in _EXPECTED if kind in messages), next(iter(messages)))
     expected = _EXPECTED.get(kind) or messages[kind].removeprefix("Input should be ")
+    expected = expected.replace("greater than or equal to", "at least")
+    expected = expected.replace("less than or equal to", "at most")
     raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 

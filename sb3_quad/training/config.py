@@ -25,6 +25,7 @@ from sb3_quad.agents.agent_settings import agent_settings, settings_of_model, un
 from sb3_quad.agents.pretrained import agent_path, pretrained_names
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.agents.tensors import AGENTS
+from sb3_quad.agents.zips import load_model
 from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.process import print_once
@@ -233,6 +234,9 @@ class TrainingConfig(Frozen):
             raise ConfigError(
                 f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
             )
+        if self.rollout_steps < 1:
+            key = "train_freq" if self.is_off_policy else "n_steps"
+            raise ConfigError(f"{key} is {self.keyword(key)}, must be at least 1")
         if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
             raise ConfigError(
                 f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; "
@@ -322,6 +326,7 @@ def load_config(
     env_id: str,
     conf_file: StrPath | None = None,
     overrides: StrDict | None = None,
+    agent: BaseAlgorithm | None = None,
 ) -> TrainingConfig:
     """Read the settings of ``env_id`` from a YAML file and apply ``overrides`` to them.
 
@@ -331,6 +336,8 @@ def load_config(
 
     :param conf_file: path of a file, or the name of one that comes with the package such as
         ``thesis/dagger.yml``; None for ``<algo>.yml`` of the package.
+    :param agent: the agent to start from, whose observation and networks take precedence over those
+        of the file, see :func:`as_agent`.
     :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that
         does not fit.
     """
@@ -347,9 +354,11 @@ def load_config(
         raise ConfigError(f"{where}: {env_id} must hold keys and values, such as 'n_envs: 8'")
     changes = overrides or {}
     config = build_config(algo, env_id, merged(settings, changes, where), where, changes)
-    shorter = config.shorter_rollout()
-    if shorter:
-        config = build_config(algo, env_id, {**config.settings, **shorter}, where, changes)
+    more: StrDict = {**config.shorter_rollout()}
+    if agent is not None:
+        more |= as_agent(agent, config, changes)
+    if more:
+        config = build_config(algo, env_id, {**config.settings, **more}, where, changes)
     return config
 
 
@@ -457,30 +466,37 @@ def check_environment(env_id: str) -> None:
         )
 
 
-def as_agent(
-    agent: BaseAlgorithm, path: StrPath, algo: str, env_id: str, changes: StrDict
-) -> StrDict:
-    """Return ``changes`` to the settings of an algorithm, together with the observation and
-    networks of an agent.
+def load_agent(source: str) -> BaseAlgorithm:
+    """Load the agent to start from.
 
-    ``changes`` take precedence. Evaluations fly with the agent's position integral, if it has one;
-    training flies without it. An agent that does not say how it flies adds nothing.
+    :param source: a zip, a run folder or the name of an agent of the package.
+    :raises ConfigError: there is none, or it cannot be read.
+    """
+    path = agent_path(source)
+    agent = load_model(path)
+    if settings_of_model(agent) is None:
+        # The settings of a run of rl_zoo3 lie next to its zip.
+        settings, file = agent_settings(path)
+        if file is not None:
+            settings.write_into(agent)
+    return agent
 
-    :param path: the zip that the agent was loaded from.
+
+def as_agent(agent: BaseAlgorithm, config: TrainingConfig, changes: StrMapping) -> StrDict:
+    """Return the settings that an agent brings to ``config``: its observation and its networks.
+
+    ``changes``, which ``config`` has, take precedence. Evaluations fly with the agent's position
+    integral, if it has one; training flies without it. An agent that does not say how it flies
+    brings nothing.
+
     :raises ConfigError: settings that do not fit; rotors in other places.
     """
-    config = load_config(algo, env_id, None, changes)
     own = settings_of_model(agent)
-    if own is None:
-        # In the zips of rl_zoo3, the settings lie next to the zip.
-        own, source = agent_settings(path)
-        if source is None:
-            return changes
-    if not config.task:
-        return changes
+    if own is None or not config.task:
+        return {}
     # A new vehicle may be what the user wants, so this is only a warning.
     vehicle = first_vehicle(config.flight_settings.vehicle)
-    notice = unlike_trained(str(path), own, vehicle)
+    notice = unlike_trained("-i", own, vehicle)
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
     observed = own.observed
@@ -488,10 +504,8 @@ def as_agent(
     if find_turn(vehicle, own.layout) != Turn():
         observed["rotor_layout"] = own.layout.model_dump(mode="json")
     integral = observed.pop("position_integral")
-    adopted = {
-        **changes,
-        "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
-        # The changes to these are in the settings already.
+    adopted: StrDict = {
+        "env_kwargs": {**config.env_kwargs, **observed, **changes.get("env_kwargs", {})},
         "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
     }
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.

@@ -13,8 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, field_validator
 
-from sb3_quad.agents.pretrained import agent_path
-from sb3_quad.agents.zips import load_model, load_zip
+from sb3_quad.agents.zips import load_zip
 from sb3_quad.algorithms.offset_correction import correct_offset
 from sb3_quad.base.errors import ConfigError, TrainingError, named
 from sb3_quad.base.files import locked, save_model
@@ -29,8 +28,8 @@ from sb3_quad.training.config import (
     SETTINGS,
     TrainingConfig,
     TrainingJob,
-    as_agent,
     describe,
+    load_agent,
     load_config,
     merged,
     with_absolute_paths,
@@ -87,7 +86,9 @@ class Stage(Frozen):
 
         :raises ConfigError: see :func:`~sb3_quad.training.config.load_config`.
         """
-        return load_config(self.algo, self.env, self.conf_file, self.settings)
+        # A settings file takes precedence over the agent's settings.
+        like = None if self.conf_file else self.agent
+        return load_config(self.algo, self.env, self.conf_file, self.settings, like)
 
     def job(self, options: StrMapping) -> TrainingJob:
         """Return the checked job of the stage as a single run.
@@ -194,14 +195,11 @@ def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
                 f"the stages of a pipeline have their own in {file}"
             )
         return load_pipeline(file, changes)
+    agent = None
+    if "initial_policy" in options:
+        agent = load_agent(options["initial_policy"])
     algo = options.get("algo") or DEFAULT_ALGO
     env = options.get("env") or DEFAULT_ENV
-    agent = None
-    # A settings file takes precedence over the agent's settings.
-    if file is None and "initial_policy" in options:
-        path = agent_path(options["initial_policy"])
-        agent = load_model(path)
-        changes = as_agent(agent, path, algo, env, changes)
     return Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes, agent=agent)
 
 

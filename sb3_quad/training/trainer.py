@@ -25,7 +25,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.agents.controller import Controller
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.statistics import STATISTICS
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import flight_settings_of
@@ -42,7 +41,7 @@ from sb3_quad.callbacks.hyperparameters import HyperparameterLog
 from sb3_quad.callbacks.snapshot import SnapshotFile
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.training.algorithms import instance
-from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
+from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config, load_agent
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.runs import (
     MADE_WITH,
@@ -212,7 +211,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         n_updates = -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
         rate.end = rate.start / n_updates
     if job.initial_policy:
-        agent = job.agent or load_model(agent_path(job.initial_policy))
+        agent = job.agent or load_agent(job.initial_policy)
         with named(f"-i {job.initial_policy}"):
             transfer_policy(agent, model)
     # SB3 has seeded the environments with the seed of the policy.
