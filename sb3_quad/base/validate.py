@@ -6,24 +6,26 @@ import re
 import typing
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PydanticUserError, TypeAdapter, ValidationError
 
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrMapping
 
 Model = TypeVar("Model", bound=BaseModel)
-# What a value must be, by the kind of pydantic's error; None for its own words. The first that
-# applies is said: a union has an error for each of its types.
+# The kinds of arguments that a constructor's annotations name
+Count = Annotated[int, Field(ge=1)]
+Natural = Annotated[int, Field(ge=0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Weight = Annotated[float, Field(ge=0.0)]
 _EXPECTED = {
-    "greater": None,
-    "less": None,
     "callable": "a number or lin_<number>",
     "float": "a number",
     "int": "a whole number",
 }
+"""What a value must be, by the kind of pydantic's error; the first that applies."""
 _CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -62,31 +64,43 @@ def _kind(error: ValidationError) -> type[ConfigError]:
     return ConfigError
 
 
-def check(kind: Any, value: Any, where: str) -> Any:
-    """Return ``value`` as the type ``kind``, which may be annotated with limits.
+def check_arguments(owner: type, given: StrMapping) -> None:
+    """Check arguments by the annotations of a constructor.
 
-    :param where: what the message calls the value.
+    :param owner: the class. Names that its ``__init__`` does not have are left alone.
+    :raises ConfigError: one line names the argument, its value and what it must be.
+    """
+    for name, kind in typing.get_type_hints(owner.__init__, include_extras=True).items():  # type: ignore[misc]
+        if name in given:
+            check(kind, given[name], name, strict=True)
+
+
+def check(kind: Any, value: Any, where: str, strict: bool = False) -> Any:
+    """Return ``value`` as the type ``kind``, by pydantic.
+
+    :param strict: whether to refuse what would have to be converted, such as a number in quotes.
     :raises ConfigError: it is of another type or out of range; the message says what it must be.
     """
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{where} is {value}, must be finite")
     try:
-        # Strict for booleans, since True is not 1.
+        # True is not 1.
         return TypeAdapter(kind, config=_CHECKS).validate_python(
-            value, strict=isinstance(value, bool)
+            value, strict=strict or isinstance(value, bool)
         )
     except PydanticUserError:
         # A type that pydantic cannot check.
         return value
     except ValidationError as error:
+        # A union has one error for each of its types: by "int", "float", "callable", …
         messages = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}
     # rl_zoo3 imports classes by their names, so a string may stand for a class.
     if isinstance(value, str) and "is" in messages:
         return value
-    kind = next((kind for kind in _EXPECTED if kind in messages), next(iter(messages)))
-    expected = _EXPECTED.get(kind) or messages[kind].removeprefix("Input should be ")
-    expected = expected.replace("greater than or equal to", "at least")
-    expected = expected.replace("less than or equal to", "at most")
+    ranges = [messages[kind] for kind in ("greater", "less") if kind in messages]
+    known = [text for kind, text in _EXPECTED.items() if kind in messages]
+    # Pydantic's own messages are good enough for the others.
+    expected = [*ranges, *known, *messages.values()][0].removeprefix("Input should be ")
     raise ConfigError(f"{where} is {value!r}, must be {expected}")
 
 

@@ -70,8 +70,8 @@ def takes_expert(algorithm: type[BaseAlgorithm]) -> bool:
 def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
     """Return the keywords of a constructor, an algorithm's or a policy's, that settings may give.
 
-    Each annotation is a type with its limits, if it has any. It is Any where an annotation is
-    missing or has a name that cannot be resolved.
+    Each annotation is a type. It is Any where an annotation is missing or has a name that cannot be
+    resolved.
     """
     # SB3's GymEnv contains "VecEnv" as a string, which only some of its modules can resolve.
     try:
@@ -94,22 +94,21 @@ def constructor_parameters(algorithm: type) -> dict[str, inspect.Parameter]:
 
 
 def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
-    """Convert ``value`` to what the constructor's ``parameter``, whose annotation is a type with
-    its limits, accepts.
+    """Convert ``value`` to what the constructor's ``parameter``, whose annotation is a type,
+    accepts.
 
     Strings become literals or, as ``lin_x``, SB3's ``LinearSchedule(x, 0, 1)``, which every SB3 can
     unpickle.
 
     :raises ConfigError: text instead of a number, a fraction instead of a whole number, another
-        type; NaN or infinity; a number out of range.
+        type; NaN or infinity; a number out of range, also at the start of a schedule.
     """
     if not (isinstance(value, str) and value.startswith(_LINEAR)):
         if isinstance(value, str):
             value = parse_value(value)
         return check(parameter.annotation, value, where)
-    number = check(float, value.removeprefix(_LINEAR), f"{where}: the number after {_LINEAR}")
-    # A schedule has the limits of a number, which it is at its start.
-    start = check(parameter.annotation, number, where)
+    start = check(float, value.removeprefix(_LINEAR), f"{where}: the number after {_LINEAR}")
+    check(parameter.annotation, start, where)
     schedule = LinearSchedule(start, 0.0, 1.0)
     if not _takes(parameter.annotation, schedule):
         raise ConfigError(f"{where} is {value!r}, but it takes no schedule")

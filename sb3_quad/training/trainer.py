@@ -6,6 +6,7 @@ bit for bit; otherwise the episodes start again.
 """
 
 import copy
+import inspect
 import pickle
 import shlex
 import time
@@ -29,7 +30,7 @@ from sb3_quad.agents.statistics import STATISTICS
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.transfer import transfer_policy
-from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError, named
+from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
@@ -201,6 +202,13 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
+    agent = job.agent
+    if agent is None and job.initial_policy:
+        agent = load_agent(job.initial_policy)
+    # The algorithms of SB3 take no agent to start from.
+    takes_agent = "initial_policy" in inspect.signature(config.algorithm).parameters
+    if takes_agent:
+        keywords["initial_policy"] = agent
     model = _construct(config, env, keywords)
     # Query the expert once, so that it fails before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
@@ -210,10 +218,8 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     if isinstance(rate, LinearSchedule):
         n_updates = -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
         rate.end = rate.start / n_updates
-    if job.initial_policy:
-        agent = job.agent or load_agent(job.initial_policy)
-        with named(f"-i {job.initial_policy}"):
-            transfer_policy(agent, model)
+    if agent is not None and not takes_agent:
+        transfer_policy(agent, model)
     # SB3 has seeded the environments with the seed of the policy.
     env.seed(seed_for("training", job.seed))
     return model
