@@ -3,7 +3,7 @@
     python examples/flight_metrics.py
 
 In a settings file, with ``PYTHONPATH=examples``: ``callback: [flight_metrics.FlightMetrics]``. What
-it logs, such as ``rollout/reached_0.1m``, can move a coefficient: ``CoefficientSchedule``.
+it logs, such as ``rollout/reached_0.1m``, can move a coefficient: ``coefficient_schedule.py``.
 """
 
 import argparse
