@@ -1,6 +1,4 @@
-"""Your own callback, and a schedule that follows what it logs.
-
-The expert flies less as crashes get rare.
+"""Your own callback: it lets the expert fly less as crashes get rare, and logs their share.
 
     python examples/own_callback.py
 
@@ -12,14 +10,11 @@ import argparse
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_quad import DAgger, GeometricExpert
-from sb3_quad.callbacks import CoefficientSchedule
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
+from sb3_quad import DAgger, GeometricExpert, QuadcopterVecEnv, fly
 
 
-class CrashRate(BaseCallback):
-    """Log the share of the episodes that ended on the ground, rollout by rollout."""
+class FewerCrashes(BaseCallback):
+    """Log the share of the episodes that ended on the ground, and let the expert fly that share."""
 
     def _on_rollout_start(self) -> None:
         self.episodes = 0
@@ -35,12 +30,12 @@ class CrashRate(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         if self.episodes:
-            self.logger.record("my/crash_rate", self.crashes / self.episodes)
+            rate = self.crashes / self.episodes
+            self.logger.record("my/crash_rate", rate)
             assert isinstance(self.model, DAgger)
-            print(
-                f"{self.num_timesteps:>9,} transitions: {self.crashes} of {self.episodes} "
-                f"episodes crashed, beta {self.model.current_beta:.2f}"
-            )
+            # It counts from the next rollout on.
+            self.model.set_beta(rate)
+            print(f"{self.num_timesteps:>9,} timesteps: {rate:.0%} of {self.episodes} crashed")
 
 
 parser = argparse.ArgumentParser(
@@ -69,9 +64,6 @@ model = DAgger(
     seed=0,
     device="cpu",
 )
-less_expert = CoefficientSchedule(
-    "beta", start=0.8, final=0.0, follow="my/crash_rate", between=(0.5, 0.05)
-)
-model.learn(arguments.timesteps, callback=[CrashRate(), less_expert])
+model.learn(arguments.timesteps, callback=FewerCrashes())
 flights = fly(model, "state_recovery", n_episodes=480, seed=1_000_000)
 print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

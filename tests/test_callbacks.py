@@ -1,7 +1,6 @@
 """Callbacks: with any algorithm and environment, each does its one thing."""
 
 import random
-import signal
 from types import SimpleNamespace
 
 import gymnasium
@@ -9,11 +8,9 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.results_plotter import load_results
-from stop_on_signal import StopOnSignal
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_quad.base.errors import ConfigError
@@ -227,35 +224,6 @@ def test_evaluations_without_results_are_refused(tmp_path):
     np.savez(tmp_path / "evaluations.npz", other=np.zeros(2))
     with pytest.raises(ConfigError, match=r"evaluations\.npz"):
         make_model().learn(80, callback=make_best(tmp_path, 40))
-
-
-class Signal(BaseCallback):
-    """Sends this process a signal at a step."""
-
-    def __init__(self, number, at):
-        super().__init__()
-        self.number, self.at = number, at
-
-    def _on_step(self):
-        if self.num_timesteps == self.at:
-            signal.raise_signal(self.number)
-        return True
-
-
-def test_a_signal_ends_the_training_after_the_step_and_saves(tmp_path):
-    handlers = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
-    model = make_model()
-    stop = StopOnSignal(tmp_path / "model.zip")
-    model.learn(40, callback=stop)
-    assert (stop.signal, stop.exit_code) == ("", 0)
-    assert not list(tmp_path.iterdir())
-    model.learn(1000, callback=[Signal(signal.SIGTERM, 50), stop])
-    assert (stop.signal, stop.exit_code) == ("SIGTERM", 143)
-    saved = PPO.load(tmp_path / "model.zip", device="cpu")
-    assert saved.num_timesteps == model.num_timesteps == 50
-    for ours, theirs in zip(model.policy.parameters(), saved.policy.parameters(), strict=True):
-        assert torch.equal(ours, theirs)
-    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
 def test_random_numbers_can_be_repeated():

@@ -223,7 +223,7 @@ def test_own_callback(run):
     output = run(
         "own_callback.py", "--timesteps", "100000"
     )  # the first episodes end in the third rollout
-    assert "episodes crashed, beta 0.80" in output
+    assert "crashed" in output
 
 
 def test_stop_on_signal(run):
