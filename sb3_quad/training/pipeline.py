@@ -40,7 +40,7 @@ from sb3_quad.training.options import (
     DEFAULT_PIPELINE,
     KEPT_BY_STAGES,
 )
-from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_outside
+from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_links, refuse_outside
 from sb3_quad.training.trainer import resume, train, trained_seconds
 
 STATUS_FILE = "pipeline.yml"
@@ -277,6 +277,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
         :func:`~sb3_quad.training.trainer.resume`.
     :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
     """
+    refuse_links(folder)
     content, where = SETTINGS.read(folder / STATUS_FILE)
     status = validate(Status, content, where)
     log_folder = folder.absolute().parent.parent
@@ -291,6 +292,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     runs = []
     for name in status.runs:
         refuse_outside(log_folder / name, f"{where}: runs", log_folder)
+        refuse_links(log_folder / name)
         runs.append(open_run(log_folder / name))
     results: dict[str, StageResult] = {}
     agent = None

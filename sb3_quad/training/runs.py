@@ -206,6 +206,15 @@ def refuse_outside(path: StrPath, where: str, *folders: Path) -> None:
         )
 
 
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder with links that lead out of it, through which a resumed run would write.
+
+    :raises ConfigError: there is one.
+    """
+    for path in folder.rglob("*"):
+        refuse_outside(path, str(folder), folder)
+
+
 def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
     """Find a run by rl-zoo's ``--exp-id``.
 

@@ -50,6 +50,7 @@ from sb3_quad.training.runs import (
     claim_run,
     made_with,
     open_run,
+    refuse_links,
     refuse_outside,
 )
 from sb3_quad.training.snapshots import load_snapshot
@@ -115,9 +116,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         damaged files; otherwise as :func:`train`.
     """
     run = open_run(run_folder)
-    # A stranger's run may contain links, or name other folders.
-    for path in run.path.rglob("*"):
-        refuse_outside(path, "run folder", run.path)
+    refuse_links(run.path)
     settings, options = run.read_yaml()
     if not {"algo", "env"} <= options.keys():
         raise ConfigError(f"{run.arguments}: algo or env is missing")
