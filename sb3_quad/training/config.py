@@ -206,7 +206,7 @@ class TrainingConfig(Frozen):
         return {"n_steps": n_steps, "batch_size": batch_size}
 
     @model_validator(mode="after")
-    def _consistent(self) -> "TrainingConfig":
+    def _environments_fit(self) -> "TrainingConfig":
         if self.task:
             refuse_unknown(
                 f"keyword of {self.env_id}",
@@ -218,6 +218,23 @@ class TrainingConfig(Frozen):
             refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
         elif self.eval_tasks:
             raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
+        if self.vec_env == "batch" and not self.task:
+            raise ConfigError(
+                f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
+            )
+        if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
+            raise ConfigError(
+                f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
+            )
+        if "NormalizeObservation" in str(self.env_wrapper):
+            raise ConfigError(
+                "env_wrapper: NormalizeObservation has separate statistics in each environment, "
+                "also to evaluate in; remove it, and give normalize: true"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _policy_fits(self) -> "TrainingConfig":
         aliases = self.algorithm.policy_aliases
         refuse_unknown("policy", [self.policy], aliases)
         # The policy's constructor takes these, not the algorithm's.
@@ -226,14 +243,10 @@ class TrainingConfig(Frozen):
             f"keyword of {policy.__name__}", self.policy_kwargs, constructor_parameters(policy)
         )
         check(NetArch, self.policy_kwargs.get("net_arch"), "policy_kwargs: net_arch")
-        if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
-            raise ConfigError(
-                f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
-            )
-        if self.vec_env == "batch" and not self.task:
-            raise ConfigError(
-                f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
-            )
+        return self
+
+    @model_validator(mode="after")
+    def _algorithm_fits(self) -> "TrainingConfig":
         if self.rollout_steps < 1:
             key = "train_freq" if self.is_off_policy else "n_steps"
             raise ConfigError(f"{key} is {self.keyword(key)}, must be at least 1")
@@ -244,11 +257,6 @@ class TrainingConfig(Frozen):
             )
         if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
-        if "NormalizeObservation" in str(self.env_wrapper):
-            raise ConfigError(
-                "env_wrapper: NormalizeObservation has separate statistics in each environment, "
-                "also to evaluate in; remove it, and give normalize: true"
-            )
         if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
