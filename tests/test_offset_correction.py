@@ -1,6 +1,7 @@
 """The offset correction cancels an offset, and changes nothing else."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def test_moved_and_scaled_positions_are_part_of_the_actor():
 
 
 def test_the_correction_counts_the_scale_of_vec_normalize(monkeypatch):
-    env = VecNormalize(QuadcopterVecEnv(16, noise=0.0, seed=1))
+    env: Any = VecNormalize(QuadcopterVecEnv(16, noise=0.0, seed=1))
     env.obs_rms.var[:] = 9.0
     model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
     offsets = iter([np.array([0.3, -0.2, 0.5]), *np.zeros((3, 3))])

@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.agents.controller import Controller
-from sb3_quad.agents.statistics import STATISTICS
+from sb3_quad.agents.statistics import STATISTICS, share_statistics, statistics_of
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.transfer import transfer_policy
@@ -212,6 +212,9 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     # Query the expert once, so that it fails before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
         Controller.for_env(keywords.get("expert"), env).labels(env.reset())
+        # The reset has changed the statistics that the agent brought.
+        if agent is not None:
+            share_statistics(statistics_of(agent), env, training=True)
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):
