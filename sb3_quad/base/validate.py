@@ -71,8 +71,13 @@ def check_arguments(owner: type, given: StrMapping) -> None:
     :raises ConfigError: one line names the argument, its value and what it must be.
     """
     for name, kind in typing.get_type_hints(owner.__init__, include_extras=True).items():  # type: ignore[misc]
-        if name in given:
+        # Infinity is no limit, as PyTorch understands it.
+        if name in given and not _is_infinite(given[name]):
             check(kind, given[name], name, strict=True)
+
+
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, float) and value == math.inf
 
 
 def check(kind: Any, value: Any, where: str, strict: bool = False) -> Any:
