@@ -137,7 +137,7 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
     run = open_run(model.parent)
     settings, arguments = run.read_yaml()
     trained = f"`{_plain(arguments.get('algo', algorithm))}`, {timesteps}"
-    start = arguments.get("trained_agent")
+    start = arguments.get("initial_policy")
     if start:
         trained += f" from `{_plain(Path(start).name)}`"
     facts = {"algorithm": trained, "environment": f"`{_plain(arguments.get('env', run.name))}`"}

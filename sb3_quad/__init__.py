@@ -2,19 +2,11 @@
 gradient of the model, for Stable-Baselines3.
 """
 
-import signal
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-# Ctrl-C ends a command at once while it imports, see interrupts_leave; imports begin here.
-_is_command = "sb3_quad.cli" in sys.orig_argv or Path(sys.argv[0]).stem == "sb3-quad"
-if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-from sb3_quad.base import __version__  # noqa: E402
-from sb3_quad.base.imports import lazy_names  # noqa: E402
-from sb3_quad.envs.registration import register_environments  # noqa: E402
+from sb3_quad.base import __version__
+from sb3_quad.base.imports import lazy_names
+from sb3_quad.envs.registration import register_environments
 
 if TYPE_CHECKING:
     from sb3_quad.agents.agent_settings import env_kwargs

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import publish
 import pytest
 import torch
 import yaml
@@ -22,15 +21,14 @@ from stable_baselines3.common.results_plotter import load_results
 
 import sb3_quad
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.agents.pretrained import agent_path
-from sb3_quad.base.errors import TrainingError
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.cli import closing, main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.envs.simulation.tasks import TASKS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.compare import compare
-from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
-from sb3_quad.training.config import TrainingJob, as_agent, build_config, load_config
+from sb3_quad.training import config as config_module
+from sb3_quad.training.config import TrainingJob, build_config, load_agent, load_config
 from sb3_quad.training.trainer import resume, train
 
 ENV = "QuadTargetTracking-v0"
@@ -120,72 +118,42 @@ def test_help_has_examples_and_needs_no_torch_nor_does_a_missing_agent():
     assert result.stdout.count("examples:") == 1 + len(COMMANDS) and "exit codes:" in result.stdout
 
 
-def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
-    arguments = [
-        "train",
-        "--algo",
-        "dagger",
-        "--conf-file",
-        settings_file,
-        "-f",
-        str(tmp_path / "logs"),
-        "--no-progress",
-    ]
-    more = [
-        "--eval-freq",
-        "400",
-        "--eval-episodes",
-        "4",
-        "--save-freq",
-        "800",
-        "--env-kwargs",
-        "noise:0.1",
-        "--seed",
-        "3",
-    ]
-    more += ["--hyperparams", "eval_tasks:state_recovery"]
-    assert main(arguments + more) == 0
+def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    flags = "--eval-freq 400 --eval-episodes 4 --save-freq 800 --seed 3 --env-kwargs noise:0.1"
+    command = ["train", "--algo", "dagger", "--conf-file", settings_file, "--no-progress"]
+    assert main([*command, *flags.split(), "--hyperparams", "eval_tasks:state_recovery"]) == 0
     output = capsys.readouterr().out
-    run = tmp_path / "logs" / "dagger" / f"{ENV}_1"
-    for part in (
-        "agent",
-        "expert",
-        "thesis",
-        "success",
-        "mean time to 0.1 m",
-        "mean path",
-        "trained in",
-        f"{ENV}.zip, the last one; the commands below name best_model.zip",
-        str(run),
-    ):
+    run = Path("logs", "dagger", f"{ENV}_1")
+    for part in ("agent", "expert", "success", f"{ENV}.zip, the last one", str(run)):
         assert part in output
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
-        *(
-            f"{ENV}.zip",
-            "best_model.zip",
-            "rl_model_800_steps.zip",
-            "evaluations.npz",
-            "0.monitor.csv",
-        ),
-        *(
-            "evaluations_state_recovery.npz",
-            f"{ENV}/config.yml",
-            f"{ENV}/args.yml",
-            f"{ENV}/command.txt",
-        ),
+        f"{ENV}.zip",
+        "best_model.zip",
+        "rl_model_800_steps.zip",
+        "evaluations.npz",
+        "evaluations_state_recovery.npz",
+        "0.monitor.csv",
+        f"{ENV}/config.yml",
+        f"{ENV}/args.yml",
+        f"{ENV}/command.txt",
     }
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == 1200
-    arguments_file = yaml.safe_load((run / ENV / "args.yml").read_text())
-    assert arguments_file["seed"] == 3
-    assert yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"] == {
-        "max_episode_steps": 60,
-        "noise": 0.1,
-    }
+    assert yaml.safe_load((run / ENV / "args.yml").read_text())["seed"] == 3
+    used = yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"]
+    assert used == {"max_episode_steps": 60, "noise": 0.1}
     with np.load(run / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [400, 800, 1200]
-    lines = [line for line in output.splitlines() if " timesteps, " in line and " s: " in line]
-    assert len(lines) == 3 and all(line.count("survival") == 2 for line in lines)  # of both tasks
+    # The commands at the end can be pasted.
+    lines = output.split("next:\n")[1].splitlines()
+    assert len(lines) == 4
+    for line, more in zip(lines, ([], [], ["--episodes", "2", "--no-report"], []), strict=True):
+        words = shlex.split(line)
+        arguments = words[next(k for k, word in enumerate(words) if word in COMMANDS) :]
+        assert main([*arguments, *more]) == 0
+    assert Path(f"evaluations/dagger_{ENV}_1/results.json").is_file()
 
 
 @pytest.mark.parametrize("vec_env", ["batch", pytest.param("dummy", marks=pytest.mark.slow)])
@@ -202,49 +170,6 @@ def test_the_last_update_learns(tmp_path, n_timesteps, last):
     model = train(job(tmp_path, n_timesteps=n_timesteps), report=lambda line: None).model
     assert model.logger.name_to_value["train/learning_rate"] == pytest.approx(last)
     assert model.lr_schedule(1.0) == 1e-3
-
-
-def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    assert (
-        main(
-            [
-                "train",
-                "--algo",
-                "dagger",
-                "--conf-file",
-                settings_file,
-                "--eval-episodes",
-                "0",
-                "--no-progress",
-            ]
-        )
-        == 0
-    )
-    lines = capsys.readouterr().out.split("next:\n")[1].splitlines()
-    agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
-    for line, more, made in zip(
-        lines,
-        (
-            ["-n", "5", "--size", "64x64"],
-            [],
-            ["--episodes", "2", "--no-report"],
-            ["-o", "agent.onnx"],
-        ),
-        (
-            f"dagger_{ENV}_1.mp4",
-            f"dagger_{ENV}_1.html",
-            f"evaluations/dagger_{ENV}_1/results.json",
-            "agent.onnx",
-        ),
-        strict=True,
-    ):
-        words = shlex.split(line)
-        arguments = words[next(k for k, word in enumerate(words) if word in COMMANDS) :]
-        assert main([*arguments, *more]) == 0
-        assert Path(made).is_file()
-    assert all(agent in line for line in lines[1:])
 
 
 @pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])
@@ -275,27 +200,14 @@ def test_other_environments_train_too(tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
-    """In a process of its own, as a shell would send it; SIGTERM is sent by the tests of
-    resumption.
-    """
-    arguments = [
-        "train",
-        "--algo",
-        "dagger",
-        "--conf-file",
-        settings_file,
-        "-f",
-        str(tmp_path),
-        "-n",
-        "1e9",
-    ]
+    """In a process of its own, as a shell would send it."""
+    command = f"train --algo dagger --conf-file {settings_file} -f {tmp_path} -n 1e9"
     process = subprocess.Popen(
-        [sys.executable, "-m", "sb3_quad.cli", *arguments, "--eval-episodes", "0"],
+        [sys.executable, "-m", "sb3_quad.cli", *command.split(), "--eval-episodes", "0"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         cwd=Path(__file__).parent.parent,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     log = tmp_path / "dagger" / f"{ENV}_1" / "0.monitor.csv"
     while process.poll() is None and (not log.is_file() or log.read_text().count("\n") < 10):
@@ -303,16 +215,15 @@ def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate()
     assert process.returncode == 130, errors
-    assert "SIGINT" in output
     assert "Traceback" not in errors
     saved = log.parent / f"{ENV}.zip"
-    assert f"timesteps is in {saved}" in output
+    assert str(saved) in output
     assert PPO.load(saved).num_timesteps > 0
 
 
 @pytest.mark.parametrize(
     ("algo", "after"),
-    [("dagger", 8), ("dagger", 900), ("ppo", 1000), ("ppo_bc", 900), ("apg", 900)],
+    [("dagger", 900), ("ppo", 1000), ("ppo_bc", 900), ("apg", 900)],
 )
 def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after):
     interruption = {"test_cli.Interrupt": {"after": after}}
@@ -338,115 +249,55 @@ def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after
     assert not again.run.resume_state.exists()
 
 
-def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(
+def test_every_zip_of_a_run_says_how_it_flies_and_its_successor_flies_as_it(
     tmp_path, monkeypatch, capsys
 ):
+    monkeypatch.chdir(tmp_path)
     std = [2.0] * 18
-    (tmp_path / "heavy.yaml").write_text(
-        load_vehicle("itm").model_copy(update={"mass": 1.6, "name": "heavy"}).model_dump_json()
-    )
-    own = {"vehicle": str(tmp_path / "heavy.yaml"), "observation_std": std, "max_episode_steps": 40}
-    config = build_config(
-        "ppo",
-        "QuadStateRecovery-v0",
-        {**SMALL, "n_timesteps": 800, "env_kwargs": own, "eval_env_kwargs": {"noise": 0}},
-    )
-    job = TrainingJob(
-        config=config,
-        log_folder=str(tmp_path / "logs"),
-        eval_freq=400,
-        eval_episodes=2,
-        save_freq=400,
-    )
-    run = train(job, report=lambda line: None).run
-    (tmp_path / "heavy.yaml").unlink()
+    heavy = load_vehicle("itm").model_copy(update={"mass": 1.6, "name": "heavy"})
+    Path("heavy.yaml").write_text(heavy.model_dump_json())
+    own = {"vehicle": "heavy.yaml", "observation_std": std, "max_episode_steps": 40}
+    evaluated = {"n_timesteps": 800, "env_kwargs": own, "eval_env_kwargs": {"noise": 0}}
+    often = {"eval_freq": 400, "eval_episodes": 2, "save_freq": 400}
+    config = build_config("ppo", "QuadStateRecovery-v0", {**SMALL, **evaluated})
+    run = train(TrainingJob(config=config, **often), report=lambda line: None).run
+    Path("heavy.yaml").unlink()
     zips = list(run.path.glob("*.zip"))
     assert len(zips) == 4
     for path in zips:
-        mailed = tmp_path / f"mailed_{path.name}"
+        mailed = Path(f"mailed_{path.name}")
         mailed.write_bytes(path.read_bytes())
         settings, source = agent_settings(mailed)
-        assert source == mailed and (settings.vehicle.mass, settings.vehicle.name) == (1.6, "heavy")
-        assert (settings.task, settings.noise, settings.observation_std) == (
-            "state_recovery",
-            0,
-            std,
-        )
-    monkeypatch.chdir(tmp_path)
-    assert agent_path(str(run.path)) == str(run.best_model)
-    assert main(["enjoy", "mailed_best_model.zip", "--no-render"]) == 0
-    output = capsys.readouterr()
-    assert "0.40 s" in output.out and not output.err.count("warning")
-    assert main(["enjoy", str(run.path), "--no-render", "--env-kwargs", "vehicle:itm"]) == 0
-    assert (
-        f"{run.path.name}: was trained on the vehicle heavy and flies itm"
-        in capsys.readouterr().err
+        assert source == mailed
+        assert settings.vehicle == heavy
+        assert settings.task == "state_recovery"
+        assert settings.noise == 0
+        assert settings.observation_std == std
+    capsys.readouterr()
+
+    loaded = []
+    original = config_module.load_model
+    monkeypatch.setattr(
+        config_module, "load_model", lambda path: loaded.append(path) or original(path)
     )
-    assert main(["export", str(run.path), "--format", "onnx"]) == 0
-    assert "vehicle: heavy" in capsys.readouterr().out and (tmp_path / "best_model.onnx").is_file()
-    small = [
-        "--suite",
-        "quick",
-        "--scenario",
-        "recovery",
-        "-n",
-        "2",
-        "--no-report",
-        "-o",
-        "out",
-    ]
-    assert main(["evaluate", str(run.path), *small]) == 0
-    output = capsys.readouterr()
-    assert (
-        run.path.name in output.out
-        and f"{run.path.name} flies heavy, the published one flies itm" in output.err
-    )
-    assert publish.main([str(run.path), "--name", "mine", "--episodes", "2"]) == 0
-    card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]
-    facts = (
-        "vehicle `heavy`",
-        "scaled by a mean and std of its own",
-        arguments["commit"],
-        arguments["versions"],
-        "| seed | 0 |",
-    )
-    assert all(part in card for part in (*facts, run.command.read_text().strip()))
-    assert agent_settings("mine.zip")[0] == agent_settings("mailed_best_model.zip")[0]
-    again = ["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]
-    assert main([*again, "--conf-file", "ppo.yml"]) == 2  # of other sizes
-    assert (
-        f"{run.best_model}: environment spaces and policy_kwargs must be the same"
-        in capsys.readouterr().err
-    )
-    assert (
-        main([*again, "--eval-episodes", "0", "--no-progress"]) == 0
-    )  # its successor has its observation and networks
+    again = ["train", "--algo", "ppo", "--env", ENV, "-n", "400", "--no-progress"]
+    again += ["-i", str(run.path), "--eval-episodes", "0"]
+    # Another file has other sizes.
+    assert main([*again, "--conf-file", "ppo.yml"]) == 2
+    assert "policy_kwargs" in one_line_of_error(capsys)
+    loaded.clear()
+    assert main(again) == 0
+    assert loaded == [str(run.best_model)]
     (successor,) = Path("logs", "ppo").glob(f"{ENV}_*/{ENV}.zip")
     assert agent_settings(successor)[0].observation_std == std
 
 
-@pytest.mark.parametrize("algo", ["dagger", "ppo"])
-def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo):
+def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys):
     path = tmp_path / "diverging.yml"
-    settings = SMALL_DAGGER if algo == "dagger" else SMALL
-    path.write_text(yaml.safe_dump({ENV: {**settings, "callback": "test_cli.Diverge"}}))
-    assert (
-        main(
-            [
-                "train",
-                "--algo",
-                algo,
-                "--conf-file",
-                str(path),
-                "-f",
-                str(tmp_path),
-                "--eval-episodes",
-                "0",
-            ]
-        )
-        == 2
-    )
-    saved = tmp_path / algo / f"{ENV}_1" / f"{ENV}.zip"
+    path.write_text(yaml.safe_dump({ENV: {**SMALL_DAGGER, "callback": "test_cli.Diverge"}}))
+    command = f"train --algo dagger --conf-file {path} -f {tmp_path} --eval-episodes 0"
+    assert main(command.split()) == 2
+    saved = tmp_path / "dagger" / f"{ENV}_1" / f"{ENV}.zip"
     assert str(saved) in one_line_of_error(capsys)
     model = PPO.load(saved)
     assert model.num_timesteps == 400
@@ -454,21 +305,16 @@ def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo)
 
 
 @pytest.mark.parametrize(
-    ("agent", "other"),
-    [("crazyflie-recovery", True), ("itm-recovery", False), ("any-quadcopter", False)],
+    ("agent", "other"), [("crazyflie-recovery", True), ("itm-recovery", False)]
 )
 def test_an_agent_that_goes_on_with_another_vehicle_is_said(agent, other, capsys):
-    as_agent(agent_path(agent), "dagger", ENV, {})
-    assert (
-        "was trained on the vehicle crazyflie and flies itm" in capsys.readouterr().err
-    ) == other
+    load_config("dagger", ENV, agent=load_agent(agent))
+    assert ("crazyflie and flies itm" in capsys.readouterr().err) == other
 
 
-@pytest.mark.parametrize("agent", ["any-quadcopter", "itm-recovery"])
-def test_an_agent_that_goes_on_with_a_vehicle_of_another_layout_knows_its_rotors(agent):
+def test_an_agent_that_goes_on_with_a_vehicle_of_another_layout_knows_its_rotors():
     changes = {"env_kwargs": {"vehicle": "crazyflie"}}
-    changes = as_agent(agent_path(agent), "apg", ENV, changes)
-    config = load_config("apg", ENV, overrides=changes)
+    config = load_config("apg", ENV, None, changes, load_agent("any-quadcopter"))
     assert config.flight_settings.rotor_layout.name == "itm"
     # The expert of the closing table flies it in this layout, too.
     config.make_expert()
@@ -477,7 +323,7 @@ def test_an_agent_that_goes_on_with_a_vehicle_of_another_layout_knows_its_rotors
 def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
     quiet = {"report": lambda line: None}
     first = train(job(tmp_path, n_timesteps=400), **quiet)
-    start = {"trained_agent": str(first.run.model)}
+    start = {"initial_policy": str(first.run.model)}
     small = {"n_timesteps": 400, "learning_rate": 0.0}
     second = train(job(tmp_path, "ppo", **small).model_copy(update=start), **quiet)
     ours, theirs = second.model.policy.state_dict(), first.model.policy.state_dict()
@@ -519,83 +365,54 @@ def test_any_task_has_a_closing_table(task):
     assert table.title.startswith(
         task if isinstance(task, str) else "75% target_tracking, 25% far_tracking"
     )
-    of_thesis = isinstance(task, str) and task in THESIS_SCENARIOS
-    assert [bool(column.source) for column in table.columns] == [False, False] + of_thesis * [
-        True,
-        True,
-    ]
-
-
-@pytest.mark.parametrize("as_command", [True, False])
-def test_ctrl_c_while_a_command_is_imported_ends_it_at_once(as_command):
-    """Where it is only imported by others, it raises KeyboardInterrupt as ever."""
-    code = "import sb3_quad, os, signal; os.kill(os.getpid(), signal.SIGINT)"
-    words = ["sb3_quad.cli"] if as_command else []
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
-    assert done.returncode == -signal.SIGINT
-    assert ("KeyboardInterrupt" in done.stderr) is not as_command
 
 
 @pytest.mark.parametrize("ignored", [False, True])
-def test_a_command_that_runs_notes_ctrl_c_again(ignored):
-    """Unless it is ignored, as by a shell for what it starts in the background."""
+def test_neither_an_import_nor_a_command_changes_what_ctrl_c_does(ignored):
+    """Also if it is ignored, as by a shell for what it starts in the background."""
     code = (
-        "import signal, sb3_quad.cli as cli; before = signal.getsignal(signal.SIGINT);"
-        "cli.main(['check-vehicle', 'itm', '-n', '2']);"
-        "after = signal.getsignal(signal.SIGINT);"
-        "assert before is (signal.SIG_IGN if ignored else signal.SIG_DFL), before;"
-        "assert after is (signal.SIG_IGN if ignored else signal.default_int_handler), after"
+        "import signal; before = signal.getsignal(signal.SIGINT);"
+        "import sb3_quad, sb3_quad.cli as cli;"
+        "assert signal.getsignal(signal.SIGINT) is before;"
+        "cli.main(['plot', 'none']);"
+        "assert signal.getsignal(signal.SIGINT) is before"
     )
-    words = [sys.executable, "-c", f"ignored = {ignored};" + code, "sb3_quad.cli"]
+    words = [sys.executable, "-c", code]
     if ignored:
         words = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *words]
     subprocess.run(words, capture_output=True, check=True)
 
 
-def test_flights_of_a_file_are_cloned_by_beta_0_alone(tmp_path, capsys):
+def test_a_run_clones_the_flights_of_a_file_and_resumes_with_them(tmp_path):
     flights = tmp_path / "flights.npz"
     sb3_quad.fly(sb3_quad.PIDExpert(), n_episodes=4, max_episode_steps=50, record=flights)
-    settings = {**SMALL_DAGGER, "demonstrations": str(flights)}
-    settings["env_kwargs"] = {"max_episode_steps": 50}
-    file = tmp_path / "flights.yml"
-    asked = ["train", "--algo", "dagger", "--conf-file", str(file), "-f", str(tmp_path / "logs")]
-    asked += ["--eval-episodes", "2", "--no-progress"]
-    file.write_text(yaml.safe_dump({ENV: settings}))
-    assert main(asked) == 2
-    assert "with beta=0, DAgger can clone the flights" in capsys.readouterr().err
-    assert not (tmp_path / "logs").exists()
-    file.write_text(yaml.safe_dump({ENV: {**settings, "beta": 0}}))
-    assert main(asked) == 0
-    assert "expert" not in (tmp_path / "logs/dagger" / f"{ENV}_1" / ENV / "config.yml").read_text()
-    file.write_text(yaml.safe_dump({ENV: {**settings, "demonstrations": "none.npz"}}))
-    assert main(asked) == 2
-    assert "none.npz: cannot be read" in capsys.readouterr().err
-
-
-def test_a_resumed_run_holds_the_flights_of_its_file(tmp_path):
-    sb3_quad.fly(
-        sb3_quad.PIDExpert(), n_episodes=4, max_episode_steps=50, record=tmp_path / "flights.npz"
-    )
-    cloned = {"demonstrations": str(tmp_path / "flights.npz"), "beta": 0}
-    cloned["callback"] = {"test_cli.Interrupt": {"after": 900}}
+    cloned = {
+        "demonstrations": str(flights),
+        "beta": 0,
+        "callback": {"test_cli.Interrupt": {"after": 900}},
+    }
     Interrupt.sent = True
     whole = train(job(tmp_path, **cloned), report=lambda line: None)
+    # Demonstrations need no expert.
+    assert "expert" not in whole.run.config.read_text()
     Interrupt.sent = False
     interrupted = train(job(tmp_path, **cloned), report=lambda line: None)
-    (tmp_path / "flights.npz").unlink()
+    flights.unlink()
     again = resume(str(interrupted.run.path), report=lambda line: None)
     model: Any = again.model
     assert len(model.dataset) == 200
     for ours, theirs in zip(
-        again.model.policy.parameters(), whole.model.policy.parameters(), strict=True
+        model.policy.parameters(), whole.model.policy.parameters(), strict=True
     ):
         assert torch.equal(ours, theirs)
+    with pytest.raises(ConfigError, match=r"flights\.npz"):
+        train(job(tmp_path, **cloned), report=lambda line: None)
 
 
 def test_closed_streams_cost_nothing(tmp_path, monkeypatch):
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
-    arguments = "evaluate pid --suite quick --scenario tracking -n 2 --no-report -o"
+    arguments = "evaluate pid --suite quick --scenario tracking --episodes 2 --no-report -o"
     assert main([*arguments.split(), str(tmp_path)]) == 0
     assert (tmp_path / "results.json").is_file()
 
@@ -606,5 +423,5 @@ def test_a_training_whose_output_nobody_reads_says_so(tmp_path):
 
     config = build_config("dagger", ENV, SMALL_DAGGER)
     job = TrainingJob(config=config, log_folder=str(tmp_path), eval_freq=400, eval_episodes=2)
-    with pytest.raises(TrainingError, match="reader of the output, has ended; the model after"):
+    with pytest.raises(TrainingError, match="the model after"):
         train(job, report)

@@ -184,13 +184,13 @@ def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp
 def test_an_agent_goes_on_with_its_statistics_or_is_refused(run, tmp_path):
     settings = {**SETTINGS, "n_timesteps": 400}
     del settings["gradient_steps"]
-    following = job(tmp_path, "ppo_bc", settings, trained_agent=str(run.model))
+    following = job(tmp_path, "ppo_bc", settings, initial_policy=str(run.model))
     made: Any = make_environments(following.config, 8, 0)
     with closing(made) as env:
         build_model(following, env)
         np.testing.assert_array_equal(env.obs_rms.mean, statistics(run.model).mean)
         assert env.training
-    raw = job(tmp_path, "ppo_bc", {**settings, "normalize": False}, trained_agent=str(run.model))
+    raw = job(tmp_path, "ppo_bc", {**settings, "normalize": False}, initial_policy=str(run.model))
     with pytest.raises(ConfigError, match="must both have it, or neither"):
         train(raw, quiet)
     assert not (tmp_path / "ppo_bc").exists()

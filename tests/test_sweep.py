@@ -85,7 +85,7 @@ def test_the_configurations_are_the_product_of_list_and_grid():
         ("A", {"configurations": {"a": {}, "A": {}}}),
         ("suite", {"evaluation": {"suite": "no-such"}}),
         ("nobody", {"expert": "nobody"}),
-        ("none.zip", {"trained_agent": "none.zip"}),
+        ("none.zip", {"initial_policy": "none.zip"}),
         ("'.[ray]'", {}),
     ],
 )

@@ -46,7 +46,7 @@ def test_weights_and_biases_has_settings_and_evaluations(tmp_path, monkeypatch, 
     wandb = pytest.importorskip("wandb", reason="needs wandb, the extra [track]")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "offline")
-    assert main([*TRAIN, "--track", "--wandb-project-name", "quads", "--seed", "3"]) == 0
+    assert main([*TRAIN, "--track", "--seed", "3"]) == 0
     assert capsys.readouterr().err.count("eval/mean_reward") == 2  # history and summary
     (events,) = Path("wandb").glob("offline-run-*/files/runs/*/events.*")
     assert hyperparameters(events.parent)["seed"] == 3

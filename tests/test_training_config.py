@@ -4,15 +4,17 @@ one clear error.
 
 import inspect
 from pathlib import Path
-from typing import Any, Literal, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import pytest
 import torch.nn as nn
 import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
+from pydantic import Field
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad.agents.resolve import DEFAULT_EXPERT
 from sb3_quad.base.errors import ConfigError
@@ -106,48 +108,60 @@ def test_any_text_on_the_command_line_is_a_value(text):
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("settings", "key"),
     [
-        ({"n_setps": 100}, "did you mean 'n_steps'"),
-        ({"n_envs": 0}, "n_envs is 0, must be at least 1"),
-        ({"gamma": 2}, "gamma is 2, must be at most 1"),
-        ({"vf_coef": -1}, "vf_coef is -1, must be at least 0"),
-        ({"n_timesteps": "many"}, "must be a whole number"),
-        ({"n_steps": 2.5}, "n_steps is 2.5, must be a whole number"),
-        ({"n_steps": "lin_100"}, "takes no schedule"),
-        ({"learning_rate": "fast"}, "must be a number or lin_<number>"),
-        ({"learning_rate": "lin_fast"}, "the number after lin_ is 'fast', must be a number"),
-        ({"learning_rate": float("nan")}, "must be finite"),
-        ({"n_steps": True}, "n_steps is True, must be a whole number"),
-        ({"bc_loss": "mae"}, "'mse', 'nll'"),
-        ({"policy": "MlpPolciy"}, "did you mean 'MlpPolicy'"),
-        ({"vec_env": "bath"}, "'batch', 'dummy' or 'subproc'"),
-        ({"env_kwargs": {"nosie": 0}}, "did you mean 'noise'"),
-        ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "did you mean 'nn.Tanh'"),
-        ({"policy_kwargs": {"net_arhc": [8]}}, "did you mean 'net_arch'"),
-        ({"policy_kwargs": {"net_arch": 8}}, "policy_kwargs: net_arch is 8, must be a valid list"),
-        (
-            {"policy_kwargs": {"net_arch": {"pi": [8, 0]}}},
-            r"net_arch is \{'pi': \[8, 0\]\}, must be at least 1",
-        ),
+        ({"n_setps": 100}, "n_steps"),
+        ({"n_envs": 0}, "n_envs"),
+        ({"n_envs": True}, "n_envs"),
+        ({"gamma": 2}, "gamma"),
+        ({"vf_coef": -1}, "vf_coef"),
+        ({"n_timesteps": "many"}, "n_timesteps"),
+        ({"n_steps": 2.5}, "n_steps"),
+        ({"n_steps": "lin_100"}, "n_steps"),
+        ({"n_steps": True}, "n_steps"),
+        ({"learning_rate": "fast"}, "learning_rate"),
+        ({"learning_rate": "lin_fast"}, "learning_rate"),
+        ({"learning_rate": float("nan")}, "learning_rate"),
+        ({"bc_loss": "mae"}, "bc_loss"),
+        ({"policy": "MlpPolciy"}, "MlpPolicy"),
+        ({"vec_env": "bath"}, "vec_env"),
+        ({"env_kwargs": {"nosie": 0}}, "noise"),
+        ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "nn.Tanh"),
+        ({"policy_kwargs": {"net_arhc": [8]}}, "net_arch"),
+        ({"policy_kwargs": {"net_arch": 8}}, "net_arch"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8, 0]}}}, "net_arch"),
         ({"normalize": "often"}, "normalize"),
         (
             {"env_wrapper": "gymnasium.wrappers.NormalizeObservation", "vec_env": "dummy"},
-            "env_wrapper: NormalizeObservation .* normalize: true",
+            "env_wrapper",
         ),
-        ({"callback": 3}, "package.module.Class"),
+        ({"callback": 3}, "callback"),
     ],
 )
-def test_bad_settings_are_named(settings, message):
-    with pytest.raises(ConfigError, match=message) as error:
-        build(**settings)
+def test_a_bad_setting_is_one_line_that_names_the_key(settings, key):
+    with pytest.raises(ConfigError, match=key) as error:
+        build_model(TrainingJob(config=build(**settings)), QuadcopterVecEnv(2))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings", "key"),
+    [
+        ("ppo", {"n_steps": 0}, "n_steps"),
+        ("sac", {"train_freq": 0}, "train_freq"),
+        ("ppo", {"expert": "pid"}, "expert"),
+        ("ppo", {"noise_type": "normal"}, "noise_type"),
+    ],
+)
+def test_so_it_is_for_algorithms_of_sb3(algo, settings, key):
+    with pytest.raises(ConfigError, match=key):
+        build(algo, **settings)
 
 
 class Broken(PPO):
     """Its constructor has a bug."""
 
-    def __init__(self, policy, env, seed, device, verbose, tensorboard_log, bug="len(1)"):
+    def __init__(self, policy, env, seed, device, verbose, tensorboard_log, bug="", n_steps=1):
         eval(bug)
 
 
@@ -165,14 +179,14 @@ def test_the_bugs_of_a_constructor_are_no_bad_settings(monkeypatch):
         with pytest.raises(kind) as raised:
             make("Broken", bug=bug)
         assert type(raised.value) is kind
-    with pytest.raises(ConfigError, match="did you mean 'bug'"):
+    with pytest.raises(ConfigError, match="bug"):
         make("Broken", bugg="")
-    with pytest.raises(ConfigError, match="more than this machine's memory"):
+    with pytest.raises(ConfigError, match="memory"):
         make("Broken", bug="exec('raise RuntimeError(\"cannot allocate memory\")')")
 
 
-@pytest.mark.parametrize("algo", ["dagger", "ppo_bc", "ppo"])
-@pytest.mark.parametrize("n_timesteps", [1000, 60_000, 130_000, 6_000_000])
+@pytest.mark.parametrize("algo", ["dagger", "ppo"])
+@pytest.mark.parametrize("n_timesteps", [1000, 6_000_000])
 def test_a_budget_of_less_than_a_rollout_shortens_it_and_the_line_says_what_is_trained(
     algo, n_timesteps
 ):
@@ -191,16 +205,12 @@ def test_a_budget_of_less_than_a_rollout_shortens_it_and_the_line_says_what_is_t
 
 
 def test_unknown_names_come_with_the_nearest():
-    with pytest.raises(ConfigError, match="did you mean 'dagger'"):
+    with pytest.raises(ConfigError, match="dagger"):
         load_config("dager", ENV)
-    with pytest.raises(ConfigError, match="did you mean 'QuadStateRecovery-v0'"):
+    with pytest.raises(ConfigError, match="QuadStateRecovery-v0"):
         check_environment("QuadStateRecovry-v0")
-    with pytest.raises(ConfigError, match=r"did you mean 'thesis/dagger.yml'"):
+    with pytest.raises(ConfigError, match=r"thesis/dagger.yml"):
         load_config("dagger", ENV, "thesis/dager.yml")
-    with pytest.raises(ConfigError, match="does not learn from an expert"):
-        build("ppo", expert="pid")
-    with pytest.raises(ConfigError, match="no batched form"):
-        build("ppo", "Pendulum-v1", vec_env="batch")
 
 
 def test_whole_numbers_may_be_written_as_powers():
@@ -342,16 +352,19 @@ def test_a_value_becomes_what_its_type_says(kind, value, expected):
 
 
 @pytest.mark.parametrize(
-    ("kind", "value", "message"),
+    ("kind", "value"),
     [
-        (type[RolloutBuffer], ReplayBuffer, "must be a subclass of RolloutBuffer"),
-        (Literal["a", "b"], "c", "must be 'a' or 'b'"),
-        (float, "inf", "must be finite"),
-        (Any, float("nan"), "must be finite"),
+        (type[RolloutBuffer], ReplayBuffer),
+        (Literal["a", "b"], "c"),
+        (float, "inf"),
+        (Any, float("nan")),
+        (Annotated[float, Field(ge=0, le=1)] | LinearSchedule, 2),
+        (Annotated[float, Field(ge=0, le=1)] | LinearSchedule, "lin_2"),
+        (Annotated[float, Field(ge=0, le=1)], "lin_1"),
     ],
 )
-def test_a_value_of_another_type_is_refused(kind, value, message):
-    with pytest.raises(ConfigError, match=message):
+def test_a_value_of_another_type_or_out_of_range_is_refused(kind, value):
+    with pytest.raises(ConfigError, match=r"^x"):
         convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
 
 
@@ -374,30 +387,23 @@ def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of
             assert f"tasks {flown[task]:.0%} {task}, " in line
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file(env_id):
+def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file():
     for algo in ("dagger", "ppo_bc"):
-        assert (
-            load_config(algo, env_id, f"robust/{algo}.yml").expert == "privileged_geometric"
-        )  # in random worlds
-        assert load_config(algo, env_id, f"nominal/{algo}.yml").expert == "geometric"
-        assert load_config(algo, env_id).expert == DEFAULT_EXPERT == "pid"
-        assert build_config(algo, env_id, MINIMAL).expert == DEFAULT_EXPERT
-        assert (
-            build_config(algo, env_id, MINIMAL).settings["expert"] == DEFAULT_EXPERT
-        )  # which config.yml then names
-        assert load_config(algo, env_id, f"thesis/{algo}.yml").expert == "pid"
-    robust = dict.fromkeys(
-        (DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "privileged_geometric"
-    )
-    pipelines = {**robust, "nominal/two_stage.yml": "geometric"}
-    for file, expert in {**pipelines, THESIS: "pid", "thesis/two_stage.yml": "pid"}.items():
-        stages = load_pipeline(file).stages
-        assert {
-            load_config(each.algo, each.env, each.conf_file, each.settings).expert
-            for each in stages
-            if each.algo != "apg"  # which learns from no expert
-        } == {expert}
+        # config.yml names the default expert.
+        assert build(algo).settings["expert"] == load_config(algo, ENV).expert == DEFAULT_EXPERT
+        assert load_config(algo, ENV, f"thesis/{algo}.yml").expert == "pid"
+        assert load_config(algo, ENV, f"nominal/{algo}.yml").expert == "geometric"
+        # In random worlds.
+        assert load_config(algo, ENV, f"robust/{algo}.yml").expert == "privileged_geometric"
+    experts = {
+        DEFAULT_PIPELINE: "privileged_geometric",
+        "nominal/two_stage.yml": "geometric",
+        THESIS: "pid",
+    }
+    for file, expert in experts.items():
+        for stage in load_pipeline(file).stages:
+            # APG learns from no expert.
+            assert stage.algo == "apg" or stage.load().expert == expert
 
 
 def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():

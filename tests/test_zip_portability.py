@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coefficient_schedule import CoefficientSchedule
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -15,6 +14,7 @@ import sb3_quad
 from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.agents.pretrained import pretrained_names
+from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 

@@ -61,6 +61,15 @@ def raised_as(error: type[SB3QuadError], what: str) -> Iterator[None]:
         raise error(f"{what} ({type(failure).__name__}: {reason})") from failure
 
 
+@contextmanager
+def named(where: str) -> Iterator[None]:
+    """Put what a ConfigError in this block is about before its message."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
 def refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str]) -> None:
     """Refuse names that are not among the valid ones.
 

@@ -95,9 +95,6 @@ def interrupts_leave() -> Iterator[None]:
     try:
         yield
     finally:
-        # A command has begun like this, see sb3_quad/__init__.py.
-        if before is signal.SIG_DFL:
-            before = signal.default_int_handler
         signal.signal(signal.SIGINT, before)
 
 

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.files import one_line, read_text
+from sb3_quad.base.files import one_line, read_text, write_text
 from sb3_quad.base.trees import walk
-from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 
 
 class Loader(yaml.SafeLoader):
@@ -76,6 +76,11 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     :raises ConfigError: See :func:`parse_keys`; or the file cannot be read.
     """
     return parse_keys(read_text(path), str(path))
+
+
+def write_yaml(path: StrPath, content: StrMapping) -> None:
+    """Write keys and values in their order; the file appears whole or not at all."""
+    write_text(path, yaml.safe_dump(content, sort_keys=False))
 
 
 class YamlFolder(NamedTuple):

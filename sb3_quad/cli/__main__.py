@@ -2,7 +2,7 @@
 
 import sys
 
-from sb3_quad.cli.app import main
+from sb3_quad.cli import main
 
 if __name__ == "__main__":  # worker processes import this module too
     sys.exit(main())

@@ -10,6 +10,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
 from sb3_quad.base.files import kind_and_line
@@ -119,9 +120,11 @@ def _parse(arguments: list[str]) -> Namespace | None:
         # argparse has printed the help or the version.
         return None
     # A missing file is refused at once, since the imports of a command take seconds.
-    agent = getattr(options, "trained_agent", None)
-    if agent and not Path(agent).is_file():
-        raise ConfigError(f"-i {agent}: no such file, and no folder of a run with an agent")
+    agent = getattr(options, "initial_policy", None)
+    if agent:
+        options.initial_policy = agent_path(agent)
+        if not Path(options.initial_policy).is_file():
+            raise ConfigError(f"-i {agent}: no such file, and no folder of a run with an agent")
     return options
 
 

@@ -1,6 +1,5 @@
 """Argument parsing with one-line errors, types of arguments, and flags of several commands."""
 
-import math
 import random
 import typing
 from argparse import (
@@ -12,23 +11,21 @@ from argparse import (
     RawDescriptionHelpFormatter,
 )
 from collections.abc import Container, Mapping
-from typing import Any, ClassVar, NoReturn, TypeAlias
+from typing import Annotated, Any, ClassVar, NoReturn, TypeAlias
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt
 
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict
+from sb3_quad.base.validate import check
 
 SHORT_FLAGS = {
     "n_timesteps": "-n",
-    "trained_agent": "-i",
+    "initial_policy": "-i",
     "log_folder": "-f",
     "tensorboard_log": "-tb",
-    "uuid": "-uuid",
     "progress": "-P",
-    "wandb_tags": "-tags",
 }
 """rl-zoo's short names of some flags."""
 # Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
@@ -111,47 +108,47 @@ SWITCH = {"action": "store_true"}
 SEVERAL = {"nargs": "+"}
 
 
-def whole(text: str) -> int:
-    """Return a whole number, also from a text such as ``1e6``."""
-    number = parse_number(text)
-    if isinstance(number, str) or not abs(number) < 2**63 or number != int(number):
-        raise ArgumentTypeError(f"{text!r} is not a whole number below 2**63")
-    return int(number)
+def _checked(kind: Any, text: str) -> Any:
+    """Return the number in a text, such as ``1e6``, as one of the type ``kind``."""
+    try:
+        return check(kind, parse_number(text), "it")
+    except ConfigError as error:
+        raise ArgumentTypeError(str(error)) from None
 
 
-def natural(text: str, least: int = 0) -> int:
+def whole(text: str) -> Any:
+    """Return a whole number."""
+    return _checked(Annotated[int, Field(gt=-(2**63), lt=2**63)], text)
+
+
+def natural(text: str) -> Any:
     """Return a whole number of at least 0."""
-    number = whole(text)
-    if number < least:
-        raise ArgumentTypeError(f"{text}: must be at least {least}")
-    return number
+    return _checked(NonNegativeInt, text)
 
 
-def positive(text: str) -> int:
+def positive(text: str) -> Any:
     """Return a whole number of at least 1."""
-    return natural(text, least=1)
+    return _checked(PositiveInt, text)
+
+
+def above_zero(text: str) -> Any:
+    """Return a finite number above 0."""
+    return _checked(PositiveFloat, text)
 
 
 def seed(text: str) -> int:
     """Return a whole number of at least 0, a random one for a negative number."""
-    number = whole(text)
+    number: int = whole(text)
     if number < 0:
         number = random.SystemRandom().randrange(2**31)
     return number
 
 
-def above_zero(text: str) -> float:
-    """Return a finite number above 0."""
-    number = float(text)
-    if not 0 < number < math.inf:
-        raise ArgumentTypeError(f"{text}: must be above 0, and finite")
-    return number
+KINDS = {bool: SWITCH, StrDict: PAIRS, str: str}
+"""The types (or keywords of ``add_argument``) of flags by those of their fields.
 
-
-KINDS = {bool: SWITCH, StrDict: PAIRS, float: float, str: str}
-"""The types (or keywords of ``add_argument``) of flags by those of their fields; else ``whole``."""
-OWN_KINDS = {"trained_agent": agent_path, "wandb_tags": SEVERAL}
-"""Those of single fields."""
+Others are numbers, which the field's model checks.
+"""
 Flags: TypeAlias = "Mapping[str, str | tuple[Any, ...] | Flags]"
 """A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
 default if there is one, and the help; the help alone for a text without a default. A table in it
@@ -186,16 +183,15 @@ def field_flags(model: type[BaseModel], *names: str) -> StrDict:
     flags = {}
     for name in names or model.model_fields:
         field = model.model_fields[name]
-        kind: Any = whole
+        kind: Any = parse_number
         # The type itself, and the alternatives of a union such as `int | None`.
         for part in (field.annotation, *typing.get_args(field.annotation)):
             kind = KINDS.get(part, kind)
-        kind = OWN_KINDS.get(name, kind)
         text = str(field.description)
         if field.default not in (None, False):
             text += f" ({field.default})"
         words = f"{SHORT_FLAGS.get(name, '')} --{name.replace('_', '-')}".strip()
-        if kind in (whole, float):
+        if kind is parse_number:
             words += " N"
         flags[words] = (kind, text)
     return flags

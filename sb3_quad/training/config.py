@@ -21,7 +21,7 @@ from pydantic import (
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
+from sb3_quad.agents.agent_settings import agent_settings, settings_of_model, unlike_trained
 from sb3_quad.agents.pretrained import agent_path, pretrained_names
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.agents.zips import load_model
@@ -205,7 +205,7 @@ class TrainingConfig(Frozen):
         return {"n_steps": n_steps, "batch_size": batch_size}
 
     @model_validator(mode="after")
-    def _consistent(self) -> "TrainingConfig":
+    def _environments_fit(self) -> "TrainingConfig":
         if self.task:
             refuse_unknown(
                 f"keyword of {self.env_id}",
@@ -217,6 +217,23 @@ class TrainingConfig(Frozen):
             refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
         elif self.eval_tasks:
             raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
+        if self.vec_env == "batch" and not self.task:
+            raise ConfigError(
+                f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
+            )
+        if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
+            raise ConfigError(
+                f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
+            )
+        if "NormalizeObservation" in str(self.env_wrapper):
+            raise ConfigError(
+                "env_wrapper: NormalizeObservation has separate statistics in each environment, "
+                "also to evaluate in; remove it, and give normalize: true"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _policy_fits(self) -> "TrainingConfig":
         aliases = self.algorithm.policy_aliases
         refuse_unknown("policy", [self.policy], aliases)
         # The policy's constructor takes these, not the algorithm's.
@@ -225,14 +242,13 @@ class TrainingConfig(Frozen):
             f"keyword of {policy.__name__}", self.policy_kwargs, constructor_parameters(policy)
         )
         check(NetArch, self.policy_kwargs.get("net_arch"), "policy_kwargs: net_arch")
-        if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
-            raise ConfigError(
-                f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
-            )
-        if self.vec_env == "batch" and not self.task:
-            raise ConfigError(
-                f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
-            )
+        return self
+
+    @model_validator(mode="after")
+    def _algorithm_fits(self) -> "TrainingConfig":
+        if self.rollout_steps < 1:
+            key = "train_freq" if self.is_off_policy else "n_steps"
+            raise ConfigError(f"{key} is {self.keyword(key)}, must be at least 1")
         if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
             raise ConfigError(
                 f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; "
@@ -240,11 +256,6 @@ class TrainingConfig(Frozen):
             )
         if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
-        if "NormalizeObservation" in str(self.env_wrapper):
-            raise ConfigError(
-                "env_wrapper: NormalizeObservation has separate statistics in each environment, "
-                "also to evaluate in; remove it, and give normalize: true"
-            )
         if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
@@ -263,6 +274,8 @@ class TrainingJob(JobOptions):
 
     config: TrainingConfig
     """the settings"""
+    agent: Any = Field(default=None, exclude=True, repr=False)
+    """the agent that initial_policy names, if it has been loaded"""
 
     def for_evaluation(self, **changes: Any) -> TrainingConfig:
         """Return the settings with the environments of evaluations.
@@ -310,8 +323,8 @@ def describe(job: TrainingJob) -> str:
     if config.expert:
         line += f", expert {config.expert}"
     line += f", seed {job.seed}"
-    if job.trained_agent:
-        line += f", from {job.trained_agent}"
+    if job.initial_policy:
+        line += f", from {job.initial_policy}"
     return line
 
 
@@ -320,6 +333,7 @@ def load_config(
     env_id: str,
     conf_file: StrPath | None = None,
     overrides: StrDict | None = None,
+    agent: BaseAlgorithm | None = None,
 ) -> TrainingConfig:
     """Read the settings of ``env_id`` from a YAML file and apply ``overrides`` to them.
 
@@ -329,6 +343,8 @@ def load_config(
 
     :param conf_file: path of a file, or the name of one that comes with the package such as
         ``thesis/dagger.yml``; None for ``<algo>.yml`` of the package.
+    :param agent: the agent to start from, whose observation and networks take precedence over those
+        of the file, see :func:`as_agent`.
     :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that
         does not fit.
     """
@@ -345,9 +361,11 @@ def load_config(
         raise ConfigError(f"{where}: {env_id} must hold keys and values, such as 'n_envs: 8'")
     changes = overrides or {}
     config = build_config(algo, env_id, merged(settings, changes, where), where, changes)
-    shorter = config.shorter_rollout()
-    if shorter:
-        config = build_config(algo, env_id, {**config.settings, **shorter}, where, changes)
+    more: StrDict = {**config.shorter_rollout()}
+    if agent is not None:
+        more |= as_agent(agent, config, changes)
+    if more:
+        config = build_config(algo, env_id, {**config.settings, **more}, where, changes)
     return config
 
 
@@ -455,37 +473,51 @@ def check_environment(env_id: str) -> None:
         )
 
 
-def as_agent(path: StrPath, algo: str, env_id: str, changes: StrDict) -> StrDict:
-    """Return ``changes`` to the settings of an algorithm, together with the observation and
-    networks of a zip.
+def load_agent(source: str) -> BaseAlgorithm:
+    """Load the agent to start from.
 
-    ``changes`` take precedence. Evaluations fly with the agent's position integral, if it has one;
-    training flies without it. A zip that does not say how its agent flies adds nothing.
-
-    :raises ConfigError: a zip or settings that do not fit; rotors in other places.
+    :param source: a zip, a run folder or the name of an agent of the package.
+    :raises ConfigError: there is none, or it cannot be read.
     """
-    config = load_config(algo, env_id, None, changes)
-    own, source = agent_settings(path)
-    if source is None or not config.task:
-        return changes
+    path = agent_path(source)
+    agent = load_model(path)
+    if settings_of_model(agent) is None:
+        # The settings of a run of rl_zoo3 lie next to its zip.
+        settings, file = agent_settings(path)
+        if file is not None:
+            settings.write_into(agent)
+    return agent
+
+
+def as_agent(agent: BaseAlgorithm, config: TrainingConfig, changes: StrMapping) -> StrDict:
+    """Return the settings that an agent brings to ``config``: its observation and its networks.
+
+    ``changes``, which ``config`` has, take precedence. Evaluations fly with the agent's position
+    integral, if it has one; training flies without it. An agent that does not say how it flies
+    brings nothing.
+
+    :raises ConfigError: settings that do not fit; rotors in other places.
+    """
+    own = settings_of_model(agent)
+    if own is None or not config.task:
+        return {}
     # A new vehicle may be what the user wants, so this is only a warning.
-    notice = unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle))
+    vehicle = first_vehicle(config.flight_settings.vehicle)
+    notice = unlike_trained("-i", own, vehicle)
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
     observed = own.observed
     # The agent knows one order of the rotors.
-    if find_turn(first_vehicle(config.flight_settings.vehicle), own.layout) != Turn():
+    if find_turn(vehicle, own.layout) != Turn():
         observed["rotor_layout"] = own.layout.model_dump(mode="json")
     integral = observed.pop("position_integral")
-    adopted = {
-        **changes,
-        "env_kwargs": {**observed, **changes.get("env_kwargs", {})},
-        # The changes to these are in the settings already.
+    adopted: StrDict = {
+        "env_kwargs": {**config.env_kwargs, **observed, **changes.get("env_kwargs", {})},
         "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
     }
     # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
     if "policy_kwargs" not in changes and not config.is_off_policy:
-        policy: Any = load_model(path).policy
+        policy: Any = agent.policy
         adopted["policy_kwargs"] = {
             **config.policy_kwargs,
             "net_arch": policy.net_arch,

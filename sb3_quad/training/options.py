@@ -20,7 +20,7 @@ DEFAULT_PIPELINE = "two_stage.yml"
 DEFAULT_ALGO = "dagger"
 DEFAULT_ENV = "QuadTargetTracking-v0"
 # A pipeline's stages have their own values of these.
-KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "trained_agent")
+KEPT_BY_STAGES = ("algo", "env", "n_timesteps", "initial_policy")
 # YAML reads 1e6 as text.
 Number = Annotated[int, BeforeValidator(parse_number)]
 
@@ -69,7 +69,7 @@ def all_changes(hyperparams: StrMapping, options: StrMapping) -> StrDict:
 class RunOptions(Frozen):
     """Run options outside the settings file; the configurations of a sweep may override them."""
 
-    trained_agent: str | None = None
+    initial_policy: str | None = None
     """agent to start from: an SB3 zip, a run folder or a name"""
     n_eval_envs: PositiveInt | None = None
     """environments of an evaluation (batch: one per episode; else 1)"""
@@ -99,20 +99,10 @@ class JobOptions(RunOptions):
     """folder for TensorBoard"""
     verbose: Literal[0, 1, 2] = 0
     """1: SB3's tables, 2: debugging"""
-    uuid: bool = False
-    """add a UUID to the run folder's name"""
     progress: bool = False
     """progress bar; without it, a line each minute"""
     track: bool = False
-    """track with Weights & Biases; -tb is runs unless you give it"""
-    wandb_project_name: str = "sb3"
-    """project in Weights & Biases"""
-    wandb_entity: str | None = None
-    """entity there, a user or team"""
-    wandb_group: str | None = None
-    """group of runs there"""
-    wandb_tags: list[str] | None = None
-    """tags of the run there"""
+    """track with Weights & Biases, see docs/zoo.md; -tb is runs unless you give it"""
 
     @model_validator(mode="before")
     @classmethod

@@ -5,22 +5,22 @@ The two stages of the thesis (4.2) form one. A pipeline's file lists its stages 
 """
 
 import shlex
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import yaml
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, field_validator
 
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import load_zip
-from sb3_quad.base.errors import ConfigError, TrainingError
-from sb3_quad.base.files import locked, save_model, write_text
+from sb3_quad.base.errors import ConfigError, TrainingError, named
+from sb3_quad.base.files import locked, save_model
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.yaml_files import write_yaml
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.evaluation.offset_correction import correct_offset
@@ -28,9 +28,8 @@ from sb3_quad.training.config import (
     SETTINGS,
     TrainingConfig,
     TrainingJob,
-    as_agent,
-    build_config,
     describe,
+    load_agent,
     load_config,
     merged,
     with_absolute_paths,
@@ -41,10 +40,11 @@ from sb3_quad.training.options import (
     DEFAULT_PIPELINE,
     KEPT_BY_STAGES,
 )
-from sb3_quad.training.runs import RunFolder, claim_folder, open_run
+from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_links, refuse_outside
 from sb3_quad.training.trainer import resume, train, trained_seconds
 
 STATUS_FILE = "pipeline.yml"
+State = Literal["new", "begun", "done"]
 
 
 class Requirement(Frozen):
@@ -78,13 +78,26 @@ class Stage(Frozen):
     """timesteps between evaluations of this stage"""
     eval_episodes: PositiveInt | None = None
     """episodes of each evaluation"""
+    agent: Any = Field(default=None, exclude=True, repr=False)
+    """the loaded agent that a single run starts from"""
 
     def load(self) -> TrainingConfig:
         """Return the checked settings of the stage.
 
         :raises ConfigError: see :func:`~sb3_quad.training.config.load_config`.
         """
-        return load_config(self.algo, self.env, self.conf_file, self.settings)
+        # A settings file takes precedence over the agent's settings.
+        like = None if self.conf_file else self.agent
+        return load_config(self.algo, self.env, self.conf_file, self.settings, like)
+
+    def job(self, options: StrMapping) -> TrainingJob:
+        """Return the checked job of the stage as a single run.
+
+        :param options: those of :class:`~sb3_quad.training.options.JobOptions`.
+        :raises ConfigError: settings or options that do not fit.
+        """
+        fields = {**options, "config": self.load(), "agent": self.agent}
+        return validate(TrainingJob, fields, "command line")
 
 
 class Pipeline(Frozen):
@@ -138,45 +151,29 @@ class PipelineResult(NamedTuple):
     exit_code: int = 0
 
 
-def is_pipeline(conf_file: StrPath) -> bool:
-    """Whether a settings file lists stages rather than the settings of one run."""
-    return "stages" in SETTINGS.read(conf_file)[0]
-
-
 def is_pipeline_run(folder: Path) -> bool:
     """Whether a folder is a pipeline's rather than a single run's."""
     return (folder / STATUS_FILE).is_file()
 
 
-def load_pipeline(conf_file: StrPath) -> Pipeline:
+def load_pipeline(conf_file: StrPath, changes: StrMapping | None = None) -> Pipeline:
     """Load the pipeline in a file, by path or by the name of one in the package.
 
+    :param changes: changes to the settings of every stage, merged as by
+        :func:`~sb3_quad.training.config.merged`.
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
     """
     pipeline = validate(Pipeline, *SETTINGS.read(conf_file))
-    if not SETTINGS.is_packaged(conf_file):
-        return pipeline
-    # The stages of a packaged pipeline use packaged settings, whatever is in the user's folder.
     stages = []
     for stage in pipeline.stages:
-        if stage.conf_file is not None:
-            settings = str(SETTINGS.packaged(stage.conf_file))
-            stage = stage.model_copy(update={"conf_file": settings})
-        stages.append(stage)
-    return Pipeline(stages=stages)
-
-
-def with_settings(pipeline: Pipeline, changes: StrMapping) -> Pipeline:
-    """Return the pipeline with ``changes`` applied to the settings of every stage.
-
-    They are merged as by :func:`~sb3_quad.training.config.merged`.
-    """
-    stages = []
-    for stage in pipeline.stages:
+        settings = merged(stage.settings, changes or {}, stage.name)
         # The pipeline may be resumed from another folder.
-        settings = with_absolute_paths(stage.env, merged(stage.settings, changes, stage.name))
-        stages.append(stage.model_copy(update={"settings": settings}))
-    return pipeline.model_copy(update={"stages": stages})
+        update: StrDict = {"settings": with_absolute_paths(stage.env, settings)}
+        # The stages of a packaged pipeline use packaged settings, whatever is in the user's folder.
+        if stage.conf_file is not None and SETTINGS.is_packaged(conf_file):
+            update["conf_file"] = str(SETTINGS.packaged(stage.conf_file))
+        stages.append(stage.model_copy(update=update))
+    return Pipeline(stages=stages)
 
 
 def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
@@ -191,20 +188,19 @@ def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
     # Without any of these, the default is a pipeline rather than a single run.
     if not options.keys() & {"algo", "env", "conf_file"}:
         file = SETTINGS.packaged(DEFAULT_PIPELINE)
-    if file is not None and is_pipeline(file):
-        for key in KEPT_BY_STAGES:
-            if key in options:
-                raise ConfigError(
-                    f"{key} goes with a single run (algo, env); "
-                    f"the stages of a pipeline have their own in {file}"
-                )
-        return with_settings(load_pipeline(file), changes)
+    if file is not None and "stages" in SETTINGS.read(file)[0]:
+        for key in options.keys() & KEPT_BY_STAGES:
+            raise ConfigError(
+                f"{key} goes with a single run (algo, env); "
+                f"the stages of a pipeline have their own in {file}"
+            )
+        return load_pipeline(file, changes)
+    agent = None
+    if "initial_policy" in options:
+        agent = load_agent(options["initial_policy"])
     algo = options.get("algo") or DEFAULT_ALGO
     env = options.get("env") or DEFAULT_ENV
-    # A settings file takes precedence over the agent's settings.
-    if file is None and "trained_agent" in options:
-        changes = as_agent(agent_path(options["trained_agent"]), algo, env, changes)
-    return Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes)
+    return Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes, agent=agent)
 
 
 def run_pipeline(
@@ -230,11 +226,11 @@ def run_pipeline(
     stages = []
     for number, (stage, planned) in enumerate(zip(pipeline.stages, jobs, strict=True)):
         settings = f"stage_{number}.yml"
-        content = {stage.env: planned.config.settings}
-        write_text(folder / settings, yaml.safe_dump(content, sort_keys=False))
+        write_yaml(folder / settings, {stage.env: planned.config.settings})
         stages.append(stage.model_copy(update={"conf_file": settings, "settings": {}}))
     status = Status(stages=stages, job=dict(job), runs=[])
-    _write_status(folder, status.model_dump(mode="json", exclude_defaults=True))
+    content = status.model_dump(mode="json", exclude_defaults=True)
+    write_yaml(folder / STATUS_FILE, content)
     return resume_pipeline(folder, report, log_folder=jobs[0].log_folder)
 
 
@@ -246,24 +242,11 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     jobs: list[TrainingJob] = []
     for stage in pipeline.stages:
         where = f"stage {stage.name!r}"
-        try:
+        with named(where):
             config = stage.load()
-            if stage.correct_offset:
-                if not config.task:
-                    raise ConfigError(
-                        f"correct_offset: {config.env_id} is not an environment of this package"
-                    )
-                if config.env_wrapper or config.vec_env_wrapper:
-                    raise ConfigError("correct_offset: flies without wrappers; remove them")
-                if config.flight_settings.size != OBSERVATION_SIZE:
-                    raise ConfigError(
-                        f"correct_offset is for agents that see the {OBSERVATION_SIZE} features "
-                        "alone"
-                    )
+            _check_correction(stage, config)
             if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
                 raise ConfigError("normalize: must be as in the stage before, whose agent it has")
-        except ConfigError as error:
-            raise ConfigError(f"{where}: {error}") from None
         # The evaluations of a stage may differ from those of the pipeline.
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**own, **job, "config": config}, where)
@@ -273,6 +256,20 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     return jobs
 
 
+def _check_correction(stage: Stage, config: TrainingConfig) -> None:
+    """Check that the offset of a stage's agent can be corrected, if it is to be."""
+    if not stage.correct_offset:
+        return
+    if not config.task:
+        raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
+    if config.env_wrapper or config.vec_env_wrapper:
+        raise ConfigError("correct_offset: flies without wrappers; remove them")
+    if config.flight_settings.size != OBSERVATION_SIZE:
+        raise ConfigError(
+            f"correct_offset is for agents that see the {OBSERVATION_SIZE} features alone"
+        )
+
+
 def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> PipelineResult:
     """Resume an interrupted or killed pipeline within its current stage, then train the others.
 
@@ -280,54 +277,46 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
         :func:`~sb3_quad.training.trainer.resume`.
     :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
     """
+    refuse_links(folder)
     content, where = SETTINGS.read(folder / STATUS_FILE)
     status = validate(Status, content, where)
-    # Make the paths valid in any folder. Those of an older version are relative to the folder of
-    # the training.
     log_folder = folder.absolute().parent.parent
     stages = []
     for stage in status.stages:
-        settings = folder / str(stage.conf_file)
-        if settings.is_file():
-            stage = stage.model_copy(update={"conf_file": str(settings)})
-        stages.append(stage)
-    jobs = stage_jobs(
-        Pipeline(stages=stages), {**status.job, "log_folder": str(log_folder), **changes}
-    )
-    runs = list(status.runs)
-    results = {}
-    agent = ""
+        settings = str(folder / str(stage.conf_file))
+        stages.append(stage.model_copy(update={"conf_file": settings}))
+    options = {**status.job, "log_folder": str(log_folder), **changes}
+    if not changes.get("tensorboard_log"):
+        refuse_outside(options.get("tensorboard_log") or ".", where, log_folder, Path())
+    jobs = stage_jobs(Pipeline(stages=stages), options)
+    runs = []
+    for name in status.runs:
+        refuse_outside(log_folder / name, f"{where}: runs", log_folder)
+        refuse_links(log_folder / name)
+        runs.append(open_run(log_folder / name))
+    results: dict[str, StageResult] = {}
+    agent = None
 
     def note(number: int, run: RunFolder) -> None:
         """Record a stage's run folder before its training begins."""
-        runs[number:] = [run.path.absolute().relative_to(log_folder).as_posix()]
-        _write_status(folder, {**content, "runs": runs})
+        runs[number:] = [run]
+        names = [run.path.absolute().relative_to(log_folder).as_posix() for run in runs]
+        write_yaml(folder / STATUS_FILE, {**content, "runs": names})
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
         try:
-            for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
-                run = None
-                if number < len(runs):
-                    place = log_folder / runs[number]
-                    run = open_run(place if place.is_dir() else runs[number])
-                    # Files that an older version names may have changed since.
-                    config = build_config(
-                        stage.algo, stage.env, run.read_yaml()[0], str(run.config)
-                    )
-                    job = job.model_copy(update={"config": config})
-                # A callback may end a stage early. If the next stage has a run, this one had ended.
-                later = number + 1 < len(runs)
-                if run and (later or run.timesteps >= job.config.n_timesteps):
+            for number, (stage, job) in enumerate(zip(stages, jobs, strict=True)):
+                if agent is not None:
+                    job = job.model_copy(update={"initial_policy": str(agent)})
+                state = state_of(runs, number, job.config.n_timesteps)
+                if state == "done":
+                    run = runs[number]
                     seconds = trained_seconds(run)
                 else:
-                    if agent:
-                        job = job.model_copy(update={"trained_agent": agent})
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
-                    # A run that has a model and no snapshot cannot be resumed.
-                    if run and (run.not_begun or run.resume_state.is_file()):
-                        trained = resume(
-                            str(run.path), report, **changes, trained_agent=job.trained_agent
-                        )
+                    if state == "begun":
+                        own = {"initial_policy": job.initial_policy}
+                        trained = resume(str(runs[number].path), report, **changes, **own)
                     else:
                         trained = train(job, report, on_start=partial(note, number))
                     run = trained.run
@@ -335,8 +324,8 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                 # ``signals`` also has the signal that ended a training.
                 if signals.received:
                     break
-                agent = str(_agent(stage, job, run, report))
-                results[stage.name] = StageResult(str(run.path), agent, run.timesteps, seconds)
+                agent = _agent(stage, job, run, report)
+                results[stage.name] = StageResult(str(run.path), str(agent), run.timesteps, seconds)
         except KeyboardInterrupt:
             if not signals.received:
                 raise
@@ -345,8 +334,21 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
-def _write_status(folder: Path, content: StrDict) -> None:
-    write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
+def state_of(runs: Sequence[RunFolder], number: int, n_timesteps: int) -> State:
+    """Return how far a stage of a pipeline is, by the run folders.
+
+    :param runs: those of the stages that have begun.
+    :param number: the stage, from 0.
+    :param n_timesteps: timesteps of the stage.
+    """
+    if number >= len(runs):
+        return "new"
+    run = runs[number]
+    # A callback may end a stage early. If the next stage has a run, this one had ended.
+    if number + 1 < len(runs) or run.timesteps >= n_timesteps:
+        return "done"
+    # A run that has a model and no snapshot cannot be resumed, so it begins anew.
+    return "begun" if run.not_begun or run.resume_state.is_file() else "new"
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:

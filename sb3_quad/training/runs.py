@@ -3,12 +3,10 @@
 import shlex
 import subprocess
 import sys
-import uuid
 from pathlib import Path
 
 import stable_baselines3
 import torch
-import yaml
 
 from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.agents.zips import saved_data
@@ -16,7 +14,7 @@ from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import make_folder, remove_half_written, write_text
 from sb3_quad.base.types import StrDict, StrPath
-from sb3_quad.base.yaml_files import read_yaml
+from sb3_quad.base.yaml_files import read_yaml, write_yaml
 
 MADE_WITH = ("commit", "versions")  # keys of args.yml
 
@@ -91,13 +89,13 @@ class RunFolder:
         args.yml comes last, so that a run with it is complete.
         """
         self.config.parent.mkdir(exist_ok=True)
-        write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
+        write_yaml(self.config, settings)
         command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
         # A user's program may train, too.
         if not command.startswith("sb3-quad"):
             command = f"python {command}".replace("python __main__.py", "sb3-quad")
         write_text(self.command, f"{command}\n")
-        write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
+        write_yaml(self.arguments, arguments)
 
     def read_yaml(self) -> tuple[StrDict, StrDict]:
         """Read config.yml and args.yml, including those of rl_zoo3.
@@ -133,19 +131,18 @@ def file_name(env_id: str) -> str:
     return env_id.replace("/", "-").replace(":", "-")
 
 
-def claim_run(log_folder: StrPath, algo: str, env_id: str, unique: bool = False) -> RunFolder:
+def claim_run(log_folder: StrPath, algo: str, env_id: str) -> RunFolder:
     """Make the folder of a new run, with the next free number.
 
     No other process can get the same one.
 
-    :param unique: add a UUID to the name, as rl-zoo's ``--uuid`` does.
     :raises ConfigError: a folder that cannot be made.
     """
     name = file_name(env_id)
-    return RunFolder(claim_folder(Path(log_folder) / algo, name, unique), name)
+    return RunFolder(claim_folder(Path(log_folder) / algo, name), name)
 
 
-def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
+def claim_folder(parent: Path, name: str) -> Path:
     """Make ``<parent>/<name>_<number>`` with the next free number.
 
     No other process can get the same one.
@@ -162,7 +159,7 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     # Numbers of removed runs before the last one are not reused.
     number = max(folders, default=0) + 1
     while True:
-        path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
+        path = parent / f"{name}_{number}"
         try:
             path.mkdir()
             return path
@@ -193,6 +190,29 @@ def open_run(path: StrPath) -> RunFolder:
     if len(configs) != 1:
         raise ConfigError(f"run folder {folder}: holds no run (<Env>/config.yml is missing)")
     return RunFolder(folder, configs[0].parent.name)
+
+
+def refuse_outside(path: StrPath, where: str, *folders: Path) -> None:
+    """Refuse a path of a run, which may be a stranger's, that is in none of the folders.
+
+    :param where: what the message calls the path.
+    :raises ConfigError: it is elsewhere: an absolute path, by ``..``, or through a link.
+    """
+    place = Path(path).resolve()
+    if not any(place.is_relative_to(folder.resolve()) for folder in folders):
+        raise ConfigError(
+            f"{where}: {path} is outside of {' and '.join(map(str, folders))}; "
+            "a run that is resumed writes only there"
+        )
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder with links that lead out of it, through which a resumed run would write.
+
+    :raises ConfigError: there is one.
+    """
+    for path in folder.rglob("*"):
+        refuse_outside(path, str(folder), folder)
 
 
 def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:

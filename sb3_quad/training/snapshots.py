@@ -1,140 +1,17 @@
-"""Snapshots of a run: one file with everything that it needs to resume, replaced as a whole."""
+"""Resuming a run from its snapshot, with its other files as they were at that moment."""
 
-import io
-import json
 import os
-import random
 import shlex
-import time
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch as th
-from pydantic import TypeAdapter
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.agents.zips import load_zip
-from sb3_quad.algorithms.statistics import STATISTICS, share_statistics
-from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_arrays, write_bytes
-from sb3_quad.base.process import StopSignals
-from sb3_quad.base.types import Arrays, Report, StrDict
+from sb3_quad.base.types import Arrays
+from sb3_quad.callbacks.snapshot import misfit, restore
 from sb3_quad.training.config import TrainingJob
 from sb3_quad.training.runs import RunFolder
-
-# Prefix of the environments' arrays.
-ENVIRONMENT = "environment."
-# Fill counters of a model's stores, which keep rows beyond a rollout.
-COUNTERS = {"dataset": ("added",), "replay_buffer": ("pos", "full")}
-# By name: value, sample count, excluded formats.
-LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])
-NO_BYTES = np.zeros(0, np.uint8)
-# Arrays whose length is not known before they are read.
-ANY_LENGTH = ("model", "best_model", "random", "log")
-# Share of the run's time that snapshots may take.
-SHARE = 0.03
-# Seconds between two snapshots of an off-policy algorithm, whose rollouts are short.
-PAUSE = 1.0
-
-
-class SnapshotFile(BaseCallback):
-    """Takes a snapshot whenever a rollout starts, and writes some of them to the file.
-
-    It writes the first one, then one every few seconds. If writing takes long, such as with a large
-    dataset on a slow disk, it writes fewer.
-
-    :param every: seconds between two snapshots; 0: only :meth:`write` writes.
-    :param report: called with one line if a snapshot cannot be written; the training continues.
-    :param signals: a received signal ends the training as soon as the snapshot can be completed.
-    :raises TrainingError: parameters that are no longer finite; the snapshot is then from before
-        that update.
-    """
-
-    def __init__(self, run: RunFolder, every: float, report: Report, signals: StopSignals) -> None:
-        super().__init__()
-        self._run = run
-        self._every = every
-        self._report = report
-        self._signals = signals
-        self._state: Arrays = {}
-        self._next_taken = -np.inf  # s
-        self._next_write = -np.inf  # s
-
-    def _on_training_start(self) -> None:
-        path = self._run.resume_state
-        # Restore pending log values, so that a resumed run logs what an uninterrupted one would.
-        if not path.is_file():
-            return
-        log = read_arrays(path, "log")["log"]
-        for name, (value, count, excluded) in LOG.validate_json(str(log)).items():
-            self.logger.name_to_value[name] = value
-            self.logger.name_to_count[name] = count
-            self.logger.name_to_excluded[name] = excluded
-
-    def _on_step(self) -> bool:
-        if not self._signals.received:
-            return True
-        # In the first step after a snapshot, a replay buffer has nothing yet that would be lost.
-        # Until then, the training continues.
-        first_step = self._state["timesteps"] + self.training_env.num_envs
-        return isinstance(self.model, OffPolicyAlgorithm) and self.num_timesteps != first_step
-
-    def _on_rollout_start(self) -> None:
-        start = time.monotonic()
-        is_early = isinstance(self.model, OffPolicyAlgorithm) and start < self._next_taken
-        if is_early and not self._signals.received:
-            return
-        for name, parameter in self.model.policy.named_parameters():
-            if not th.isfinite(parameter).all():
-                raise TrainingError(
-                    f"after {self.num_timesteps:,} timesteps {name} is no longer finite; "
-                    "lower learning_rate"
-                )
-        self._next_taken = start + PAUSE
-        model = io.BytesIO()
-        self.model.save(model)
-        # The rows of the stores are read when the snapshot is written. A rollout later there are
-        # more, and the oldest of a full store are replaced; the resumed training adds the same rows
-        # again before it reads any.
-        self._state = {
-            **_surroundings(self.training_env, self.model),
-            "timesteps": np.array(self.model.num_timesteps),
-            "model": np.frombuffer(model.getvalue(), np.uint8),
-            "log": log_state(self.logger),
-        }
-        if self._run.episodes.is_file():
-            self._state["episodes"] = np.array(self._run.episodes.stat().st_size)
-        if self._run.best_model.is_file():
-            self._state["best_model"] = np.fromfile(self._run.best_model, np.uint8)
-        start = time.monotonic()
-        if self._every > 0 and start >= self._next_write:
-            try:
-                self.write()
-            except ConfigError as error:
-                self._report(f"warning: no new snapshot, the one before is kept: {error}")
-            self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
-
-    def write(self) -> None:
-        """Write the latest snapshot; until it is complete, the file keeps the one before.
-
-        :raises ConfigError: a folder that cannot be written, a full disk.
-        """
-        arrays: StrDict = dict(self._state)
-        for name, store in _stores(self.model).items():
-            arrays |= _filled(name, store)
-        write_arrays(self._run.resume_state, **arrays)
-
-    def save_model(self) -> str:
-        """Write the model of the latest snapshot, and return its place; empty without one."""
-        if not self._state:
-            return ""
-        write_bytes(self._run.model, self._state["model"].tobytes())
-        return f"; the model after {self._state['timesteps']:,} timesteps is in {self._run.model}"
 
 
 def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: Any) -> Any:
@@ -147,151 +24,15 @@ def load_snapshot(run: RunFolder, job: TrainingJob, env: VecEnv, **attributes: A
     :raises ConfigError: a file that is missing or damaged, or has other settings; then nothing has
         been rolled back.
     """
-    path = run.resume_state
-    if not path.is_file():
+    if not run.resume_state.is_file():
         message = f"run folder {run.path}: holds no interrupted run"
         if run.result.is_file():
             message += f"; to train its model further use -i {shlex.quote(str(run.result))}"
         raise ConfigError(message)
-    state = read_arrays(path)
-    try:
-        model = _restore(state, job, env, attributes)
-    except ConfigError as error:
-        raise _misfit(path, error) from None
+    keywords = job.model_dump(include={"device", "tensorboard_log", "verbose"})
+    model, state = restore(run.resume_state, job.config.algorithm, env, **keywords, **attributes)
     _roll_back(run, state)
     return model
-
-
-def _restore(state: Arrays, job: TrainingJob, env: VecEnv, attributes: StrDict) -> Any:
-    """Return the model of a snapshot, with its stores, environments and random numbers."""
-    batch = _batch(env)
-    # The model comes first, since the other expected arrays depend on it.
-    _check(state, {"model": NO_BYTES})
-    model: Any = load_zip(
-        job.config.algorithm,
-        io.BytesIO(state["model"].tobytes()),
-        where="model",
-        env=env,
-        device=job.device,
-        tensorboard_log=job.tensorboard_log,
-        verbose=job.verbose,
-        force_reset=batch is None,
-        **attributes,
-    )
-    share_statistics(getattr(model, STATISTICS, None), env, training=True)
-    _check(state, {"timesteps": np.array(0), **_surroundings(env, model)})
-    _require(int(state["episodes"]) >= 0, "episodes is negative")
-    _require(model.num_timesteps == state["timesteps"], "timesteps is not that of model")
-    for name, store in _stores(model).items():
-        _fill(name, store, state)
-    environment = {
-        name.removeprefix(ENVIRONMENT): array
-        for name, array in state.items()
-        if name.startswith(ENVIRONMENT)
-    }
-    if batch is not None:
-        batch.restore(environment)
-    else:
-        _require(not environment, f"{ENVIRONMENT}… belongs to environments of another kind")
-    # The random numbers come last, since loading may sample. Damaged text may raise anything.
-    with raised_as(ConfigError, "log, random or torch cannot be read"):
-        LOG.validate_json(str(state["log"]))
-        set_random_state(state)
-    return model
-
-
-def _surroundings(env: VecEnv, model: Any) -> Arrays:
-    """Return random states, environments and fill counters of the stores, and placeholders for the
-    log and the files.
-    """
-    state = {
-        **random_state(),
-        "log": np.array(""),
-        "episodes": np.array(0),
-        "best_model": NO_BYTES,
-    }
-    batch = _batch(env)
-    if batch is not None:
-        for name, array in batch.snapshot().items():
-            state[f"{ENVIRONMENT}{name}"] = array
-    for name, store in _stores(model).items():
-        for counter in COUNTERS[name]:
-            state[f"{name}.{counter}"] = np.array(getattr(store, counter))
-    return state
-
-
-def _check(state: Arrays, expected: Arrays) -> None:
-    """Check that a snapshot has arrays of the names, types and shapes of the expected ones."""
-    for name, like in expected.items():
-        _require(name in state, f"{name} is missing")
-        array = state[name]
-        if name in ANY_LENGTH:
-            fits = array.dtype.kind == like.dtype.kind and array.ndim == like.ndim
-        else:
-            fits = array.dtype == like.dtype and array.shape == like.shape
-        _require(
-            fits,
-            f"{name} is {array.dtype} {array.shape}, must be {like.dtype} {like.shape}",
-        )
-
-
-def _require(fits: bool, problem: str) -> None:
-    if not fits:
-        raise ConfigError(problem)
-
-
-def _misfit(path: Path, problem: object) -> ConfigError:
-    return ConfigError(
-        f"{path}: {problem}; it is damaged, or of other settings; "
-        "-i trains an agent of the run further"
-    )
-
-
-def _batch(env: VecEnv) -> Any:
-    """Return the batch of the batched environment, which can be restored; None for others, and for
-    wrapped ones.
-    """
-    # Wrappers have their own state, which begins with the episodes.
-    return None if env is not env.unwrapped else getattr(env, "batch", None)
-
-
-def _stores(model: Any) -> StrDict:
-    """Return what a model keeps beyond a rollout, by name."""
-    return {
-        name: getattr(model, name) for name in COUNTERS if getattr(model, name, None) is not None
-    }
-
-
-def _filled(name: str, store: Any) -> Arrays:
-    """Return views of the filled rows of a dataset or a replay buffer, by name."""
-    if not isinstance(store, ReplayBuffer):
-        arrays = store.filled
-    elif isinstance(store.observations, dict):
-        raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
-    else:
-        # The memory-efficient variant keeps the last next observation in one more row.
-        rows = store.size() + 1
-        arrays = {
-            key: array[:rows] for key, array in vars(store).items() if isinstance(array, np.ndarray)
-        }
-    return {f"{name}.{key}": array for key, array in arrays.items()}
-
-
-def _fill(name: str, store: Any, state: Arrays) -> None:
-    """Put a snapshot's rows into a store."""
-    for counter in COUNTERS[name]:
-        value = state[f"{name}.{counter}"].item()
-        _require(
-            0 <= value < getattr(store, "buffer_size", np.inf),
-            f"{name}.{counter} is beyond its rows",
-        )
-        setattr(store, counter, value)
-    for key, rows in _filled(name, store).items():
-        # Arrays that were written after the counters may have more rows.
-        if key in state and state[key].ndim:
-            state[key] = state[key][: len(rows)]
-        _check(state, {key: rows})
-        rows[...] = state[key]
 
 
 def _roll_back(run: RunFolder, state: Arrays) -> None:
@@ -303,7 +44,7 @@ def _roll_back(run: RunFolder, state: Arrays) -> None:
             is_earlier = rows["timesteps"] <= state["timesteps"]
             earlier = {name: array[is_earlier] for name, array in rows.items()}
         except (KeyError, IndexError, TypeError):
-            raise _misfit(path, "holds no evaluations") from None
+            raise misfit(path, "holds no evaluations") from None
         # A file that stays as it is needs no space on the disk.
         if not is_earlier.all():
             kept[path] = earlier
@@ -319,39 +60,3 @@ def _roll_back(run: RunFolder, state: Arrays) -> None:
         run.best_model.unlink(missing_ok=True)
     if run.episodes.is_file():
         os.truncate(run.episodes, min(run.episodes.stat().st_size, int(state["episodes"])))
-
-
-def log_state(logger: Logger) -> Any:
-    """Return what was recorded since the logger's last dump, as JSON.
-
-    These are the losses of the latest update, for example.
-    """
-    records = {}
-    for name, value in logger.name_to_value.items():
-        if isinstance(value, (int, float, np.number)):
-            records[name] = (
-                float(value),
-                logger.name_to_count[name],
-                logger.name_to_excluded[name],
-            )
-    return np.array(json.dumps(records))
-
-
-def random_state() -> Arrays:
-    """Return the states of the global generators that SB3 samples from.
-
-    They are torch's, Python's and NumPy's.
-    """
-    states = [random.getstate(), np.random.get_state(legacy=False)]  # noqa: NPY002
-    return {
-        "torch": th.get_rng_state().numpy().copy(),
-        "random": np.array(json.dumps(states, default=np.ndarray.tolist)),
-    }
-
-
-def set_random_state(state: Arrays) -> None:
-    """Restore the generators to what :func:`random_state` returned."""
-    (version, words, gauss), numpy_state = json.loads(str(state["random"]))
-    random.setstate((version, tuple(words), gauss))
-    np.random.set_state(numpy_state)  # noqa: NPY002
-    th.set_rng_state(th.from_numpy(state["torch"]))

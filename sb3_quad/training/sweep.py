@@ -94,8 +94,8 @@ class Configuration(SettingsOptions, RunOptions):
         if isinstance(planned, Stage):
             planned = Pipeline(stages=[planned])
         options = self.given(RunOptions)
-        if self.trained_agent is not None:
-            options["trained_agent"] = agent_path(self.trained_agent)
+        if self.initial_policy is not None:
+            options["initial_policy"] = agent_path(self.initial_policy)
         return planned, options
 
     def check(self) -> None:
@@ -104,9 +104,9 @@ class Configuration(SettingsOptions, RunOptions):
         :raises ConfigError: a setting that does not fit; an unknown vehicle or expert; no agent.
         """
         pipeline, options = self.plan()
-        agent = options.get("trained_agent")
+        agent = options.get("initial_policy")
         if agent is not None and not Path(agent).is_file():
-            raise ConfigError(f"trained_agent {agent}: no such file")
+            raise ConfigError(f"initial_policy {agent}: no such file")
         for job in stage_jobs(pipeline, options):
             if job.config.task is not None:
                 first_vehicle(job.flight_settings.vehicle)

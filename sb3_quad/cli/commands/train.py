@@ -36,6 +36,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     PAIRS,
     PROGRESS,
@@ -65,7 +66,7 @@ KEPT_BY_RESUME = (
     "algo",
     "env",
     "hyperparams",
-    "trained_agent",
+    "initial_policy",
     "log_folder",
     "seed",
     *SettingsOptions.model_fields,
@@ -93,7 +94,7 @@ SETTINGS_FLAGS: Flags = {
     **TRUST,
     **PROGRESS,
     **field_flags(SettingsOptions),
-    **field_flags(JobOptions, "trained_agent", "n_eval_envs", "device"),
+    **field_flags(JobOptions, "initial_policy", "n_eval_envs", "device"),
 }
 # The flags of rl-zoo's ``train.py``, with their meanings.
 FLAGS: Flags = {
@@ -115,35 +116,45 @@ FLAGS: Flags = {
 
 def run(options: Namespace) -> int:
     """Train, compare, print where everything is. Returns the exit code."""
-    from sb3_quad.base.validate import validate
     from sb3_quad.cli.closing import close_pipeline, close_run
     from sb3_quad.cli.output import shows_progress
-    from sb3_quad.training import pipeline
-    from sb3_quad.training.config import SETTINGS, TrainingJob, describe
-    from sb3_quad.training.trainer import resume, train
+    from sb3_quad.training.trainer import TrainingResult
 
-    if options.resume is not None:
-        refuse_with_resume(options, *KEPT_BY_RESUME)
-    prepare(options)
     job = given(options, *JobOptions.model_fields)
     job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
-        folder = Path(options.resume)
-        if not pipeline.is_pipeline_run(folder):
-            return close_run(resume(options.resume, **job))
-        result = pipeline.resume_pipeline(folder, **job)
-    else:
-        if options.thesis:
-            options.conf_file = SETTINGS.packaged(THESIS)
-        stages = plan(options)
-        if isinstance(stages, pipeline.Stage):
-            checked = validate(TrainingJob, {"config": stages.load(), **job}, "command line")
-            print(describe(checked))
-            return close_run(train(checked))
-        result = pipeline.run_pipeline(
-            stages, job, Path(options.conf_file or DEFAULT_PIPELINE).stem
-        )
+        refuse_with_resume(options, *KEPT_BY_RESUME)
+    prepare(options)
+    result = _begin(options, job) if options.resume is None else _resume(options.resume, job)
+    if isinstance(result, TrainingResult):
+        return close_run(result)
     return close_pipeline(result)
+
+
+def _resume(folder: str, job: StrDict) -> Any:
+    """Continue a run or a pipeline, and return its result."""
+    from sb3_quad.training.pipeline import is_pipeline_run, resume_pipeline
+    from sb3_quad.training.trainer import resume
+
+    if is_pipeline_run(Path(folder)):
+        return resume_pipeline(Path(folder), **job)
+    return resume(folder, **job)
+
+
+def _begin(options: Namespace, job: StrDict) -> Any:
+    """Train a new run or a new pipeline, and return its result."""
+    from sb3_quad.training.config import SETTINGS, describe
+    from sb3_quad.training.pipeline import Stage, run_pipeline
+    from sb3_quad.training.trainer import train
+
+    if options.thesis:
+        options.conf_file = SETTINGS.packaged(THESIS)
+    stages = plan(options)
+    if isinstance(stages, Stage):
+        single = stages.job(job)
+        print(describe(single))
+        return train(single)
+    return run_pipeline(stages, job, Path(options.conf_file or DEFAULT_PIPELINE).stem)
 
 
 def prepare(options: Namespace) -> None:

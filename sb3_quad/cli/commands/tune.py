@@ -77,9 +77,15 @@ def run(options: Namespace) -> int:
     prepare(options)
     # A search is for the settings of a single run.
     options.algo = options.algo or DEFAULT_ALGO
-    config = plan(options).load()
-    known = given(options, "device", "trained_agent", "n_eval_envs", "seed", "eval_episodes")
-    data = {"config": config, "eval_episodes": EPISODES[config.vec_env], **known}
+    stage = plan(options)
+    config = stage.load()
+    known = given(options, "device", "initial_policy", "n_eval_envs", "seed", "eval_episodes")
+    data = {
+        "config": config,
+        "agent": stage.agent,
+        "eval_episodes": EPISODES[config.vec_env],
+        **known,
+    }
     job = validate(TrainingJob, data, "command line")
     objective = make_objective(job, options.search_space, options.n_evaluations)
     name = options.study_name or f"{config.algo}_{config.env_id}"

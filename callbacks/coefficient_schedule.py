@@ -1,14 +1,5 @@
-"""A callback that moves a coefficient of the algorithm with the progress of the training.
+"""A callback that moves a coefficient of the algorithm with the progress of the training."""
 
-    python examples/coefficient_schedule.py
-
-docs/callbacks.md says more. In a settings file, with ``PYTHONPATH=examples``::
-
-    callback:
-      - coefficient_schedule.CoefficientSchedule: {coefficient: beta, start: 1.0, final: 0.0}
-"""
-
-import argparse
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,18 +8,15 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_quad import DAgger, PIDExpert
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
 
 PROGRESS = "progress"
 
 
 class CoefficientSchedule(BaseCallback):
-    """Move a coefficient from ``start`` to ``final`` while a quantity goes through ``between``.
+    """Moves a coefficient from ``start`` to ``final`` while a quantity goes through ``between``.
 
     It was made for DAgger's ``beta`` (how often the expert flies) and PPOBC's ``bc_coef`` (weight
     of the cloning term). You can use it with any algorithm, for any of its numbers that is a float
@@ -37,6 +25,14 @@ class CoefficientSchedule(BaseCallback):
     The coefficient is set after a rollout, applies to the next one, and is logged as
     ``schedule/<coefficient>``. A model's zip contains the current number, and nothing of this
     package. A training that continues from the zip continues from that number.
+
+    >>> from stable_baselines3 import PPO
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> env = QuadcopterVecEnv(8, max_episode_steps=50, seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
+    >>> _ = model.learn(1600, callback=CoefficientSchedule("ent_coef", start=0.01, final=0.0))
+    >>> model.ent_coef
+    0.0
 
     :param coefficient: its name. If the model has a method ``set_<name>(value)``, it is called.
     :param start: its value until the followed quantity is known and has passed ``between[0]``.
@@ -189,35 +185,3 @@ class _LastLogged(KVWriter):
 
     def close(self) -> None:
         """Nothing to close."""
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--timesteps", type=int, default=240_000, help="over all environments (%(default)s)"
-    )
-    arguments = parser.parse_args()
-
-    env = QuadcopterVecEnv(48, max_episode_steps=1000, seed=0)
-    model = DAgger(
-        "MlpPolicy",
-        env,
-        expert=PIDExpert(),
-        n_steps=250,
-        batch_size=2048,
-        gradient_steps=100,
-        n_epochs=1,
-        learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
-        seed=0,
-        device="cpu",
-    )
-    # β falls from 1 to 0 while the share of training episodes that succeed goes from 50 % to 95 %.
-    schedule = CoefficientSchedule(
-        "beta", 1.0, 0.0, follow="rollout/success_rate", between=(0.5, 0.95)
-    )
-    model.learn(arguments.timesteps, callback=schedule)
-    print(f"beta {model.current_beta:.2f}")
-    flights = fly(model, "target_tracking", n_episodes=480, seed=1_000_000)
-    print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")
