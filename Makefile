@@ -18,13 +18,15 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs notebooks docs-links pictures pictures-long lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs notebooks docs-links pictures pictures-long lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests that a change is likely to break, in minutes"
 	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers"
+	@echo "make test-portable  run those of make test as an older processor would"
+	@echo "make campaign       kill commands at random moments, and give them values at random that nobody should give"
 	@echo "make coverage       run those of make test, and show which lines of the packages they do not reach"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
@@ -56,6 +58,18 @@ test: $(INSTALLED)
 
 test-all: $(INSTALLED)
 	$(PYTEST) $(ARGS)
+
+# Weekly in CI. SB3_QUAD_KILLS=50 SB3_QUAD_INPUTS=all: more of both.
+campaign: $(INSTALLED)
+	$(PY) -m pytest -m campaign -o timeout=0 $(ARGS)
+
+# Every library takes the code that it has for a processor without AVX, so that sums come out otherwise.
+# NumPy refuses names that are no choice here, so that it is asked for those that are.
+CHOICES = import numpy._core._multiarray_umath as m; print(*m.__cpu_dispatch__)
+test-portable: $(INSTALLED)
+	ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= \
+	NUMBA_CACHE_DIR=$(CURDIR)/build/portable \
+	NPY_DISABLE_CPU_FEATURES="$$($(PY) -c '$(CHOICES)')" $(PYTEST) -m "not slow" $(ARGS)
 
 # setup.cfg says what is left out: code that numba compiles runs where no tracer sees it.
 coverage: $(INSTALLED)
