@@ -18,13 +18,13 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs notebooks docs-links pictures pictures-long lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files docs notebooks docs-links pictures pictures-long lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests that a change is likely to break, in minutes"
-	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers"
+	@echo "make test-all       run these and the slow ones: pages that train, wheels, compilers"
 	@echo "make test-portable  run those of make test as an older processor would"
 	@echo "make campaign       kill commands at random moments, and give them values at random that nobody should give"
 	@echo "make coverage       run those of make test, and show which lines of the packages they do not reach"
@@ -32,7 +32,6 @@ help:
 	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
 	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
 	@echo "make transfer-table print the table of docs/research/export.md, ARGS=\"-n 64 --curves\""
-	@echo "make test-extras    install each extra into an empty environment, as docs/installation.md says, and try it; ARGS=\"tune zoo\" some"
 	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
 	@echo "make pictures       draw the pages' pictures anew, ARGS=\"starts.png\" some of them; docs/pictures.py has their commands"
 	@echo "make pictures-long  draw those of agents that are trained first, in hours"
@@ -110,9 +109,6 @@ transfer-files: $(INSTALLED)
 		$(PY) -m sb3_quad.cli export $$agent --format onnx --vehicle $$vehicle -o $(TRANSFER_FILES)/$$name@$$vehicle.onnx >/dev/null || exit 1; \
 	done; done
 
-test-extras:
-	PYTHON=$(PYTHON) .ci/extras $(ARGS)
-
 # -n: what a page or a docstring refers to must be there.
 SPHINX := $(DOCS_VENV)/bin/python -m sphinx -E -n -W --keep-going -q -d build/doctrees
 
@@ -156,7 +152,7 @@ type: $(INSTALLED) links
 type-demo:
 	npx --yes --package typescript@5 tsc -p sb3_quad/show/demo/jsconfig.json
 
-# mypy and import-linter do not follow __path__, by which a checkout's envs/ and its like are part of sb3_quad: links do.
+# mypy and import-linter do not follow package_dir, by which a checkout's envs/ and its like are part of sb3_quad: links do.
 links:
 	@rm -rf $(LINKS) && mkdir -p $(LINKS)
 	@for path in sb3_quad/* envs callbacks zoo_configs; do ln -s "$(CURDIR)/$$path" $(LINKS); done
