@@ -200,15 +200,6 @@ def test_a_wrench_that_is_set_lasts_until_the_next_episode_brings_its_own():
     )
 
 
-def test_vehicles_repeat_over_the_rows_and_are_randomised():
-    names = ["itm", "crazyflie", "hummingbird"]
-    env = QuadcopterVecEnv(7, vehicle=names, seed=0, randomize={"mass": [0.9, 1.1]})
-    env.reset()
-    assert [each.name for each in env.get_attr("vehicle")] == [names[row % 3] for row in range(7)]
-    factors = env.batch.vehicles[P.mass] / env.batch.base_vehicles[P.mass]
-    assert (factors >= 0.9).all() and (factors <= 1.1).all()
-
-
 # --- distributions of vehicles
 
 

@@ -201,17 +201,6 @@ def test_moving_targets_are_the_same_in_pybullet(reference, request):
     single.close()
 
 
-def test_a_given_target_is_where_a_reference_begins(csv):
-    from sb3_quad.envs import QuadcopterEnv
-
-    env = QuadcopterEnv(reference=csv)
-    env.reset(seed=0, options={"target": (1.0, 2.0, 20.0)})
-    env.step(np.zeros(4))
-    moved = spiral(np.array([DT]))[0, :3]
-    np.testing.assert_allclose(env.target, np.add((1.0, 2.0, 20.0), moved), atol=1e-12)
-    env.close()
-
-
 def test_rows_have_references_of_their_own():
     env = QuadcopterVecEnv(4, seed=0, reference="circle")
     env.reset()
@@ -270,19 +259,6 @@ def test_files_of_a_reference_lie_beside_the_suite(csv, tmp_path):
     assert str(flown.reference.file) == csv
 
 
-def test_the_curves_of_the_suite_have_the_speeds_of_their_names():
-    suite = load_suite("trajectories")
-    for flown in suite.scenarios:
-        table = flown.reference.tracks(DT).table
-        speed = np.linalg.norm(table[:, 3:6], axis=1).max()
-        *_, name = flown.name.split("_")
-        assert speed == pytest.approx({"turning": 2, "limit": 3.8}.get(name) or int(name), rel=5e-3)
-    vehicle = flown.nominal_vehicle()
-    level = vehicle.gravity * math.sqrt(vehicle.thrust_limits[1] ** 2 - 1.0)
-    steepest = np.linalg.norm(table[:, 6:9], axis=1).max()
-    assert flown.name == "figure_eight_limit" and steepest == pytest.approx(0.7 * level, rel=0.01)
-
-
 def test_a_zip_keeps_a_curve_and_no_file_or_function(csv):
     model = SimpleNamespace()
     for reference, kept in ((csv, None), (spiral, None), ("helix", Reference(curve="helix"))):
@@ -290,16 +266,6 @@ def test_a_zip_keeps_a_curve_and_no_file_or_function(csv):
         settings.write_into(model)
         own = settings_of_record(model.flight_settings, "model")
         assert own.reference == kept and own.preview == settings.preview
-
-
-def test_a_snapshot_keeps_how_targets_move():
-    flown = QuadcopterVecEnv(3, seed=0)
-    other = QuadcopterVecEnv(3, seed=1)
-    flown.reset()
-    flown.set_reference((0, 0, 15), velocity=(1, 0, 0), heading=0.5)
-    other.reset()
-    other.batch.restore(flown.batch.snapshot())
-    np.testing.assert_array_equal(other.batch.observe(), flown.batch.observe())
 
 
 def test_a_heading_that_jumps_by_a_whole_turn_turns_no_further():

@@ -10,7 +10,6 @@ import pytest
 from sb3_quad import envs
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.observation import (
     DEFAULT_STD,
@@ -23,7 +22,6 @@ from sb3_quad.envs.simulation.random import EPISODE, STEP, philox
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import (
     BODY_RATES,
-    POSITION,
     QUATERNION,
     ROTOR_SPEEDS,
     TARGET,
@@ -213,18 +211,6 @@ def test_targets_are_never_below_ground(distance):
     assert height.mean() == pytest.approx((lowest + 15.0 + distance) / 2, rel=0.03)
 
 
-def test_targets_near_and_far():
-    rows = start(8_000, "recovery_and_tracking")
-    state = QuadcopterState(rows.state)
-    assert np.quantile(state.distance, [0.0, 0.25, 0.5, 0.75, 1.0]) == pytest.approx(
-        [0, 6.25, 12.5, 18.75, 25], abs=0.5
-    )
-    assert np.linalg.norm(state.velocity, axis=1).min() > 0.0
-    state = QuadcopterState(start(8_000, "far_tracking").state)
-    assert np.quantile(state.distance, [0.0, 0.5, 1.0]) == pytest.approx([10, 17.5, 25], abs=0.3)
-    assert (state.velocity == 0.0).all() and (state.rotation[:, 2, 2] == 1.0).all()
-
-
 def test_a_reset_touches_the_rows_it_names_and_counts_their_episodes():
     rows = start(5, "state_recovery")
     before, streams = rows.state.copy(), rows.streams.copy()
@@ -290,19 +276,6 @@ def test_tilt_is_exact_at_every_angle(angle):
     assert scores(rows)["reward"][0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
 
 
-def test_precision_is_half_due_at_its_range_and_steepest_at_the_target():
-    rows = start(3, "target_tracking", precision_cost=0.02, precision_range=0.3, position_cost=0.0)
-    rows.state[POSITION] = rows.state[TARGET] + np.array([-0.001, -0.3, -8.7]) * np.array(
-        [[0.0], [0.0], [1.0]]
-    )
-    near, middle, far = scores(rows)["reward"]
-    assert (
-        near == pytest.approx(-0.02 * 0.001 / 0.3, rel=0.01)
-        and middle == pytest.approx(-0.01)
-        and far > -0.02
-    )
-
-
 # --- tasks as data
 
 
@@ -340,19 +313,3 @@ def test_a_named_mixture_is_the_mixture_written_out():
     assert ended > 0
     for name, array in named.batch.snapshot().items():
         np.testing.assert_array_equal(array, written_out.batch.snapshot()[name])
-
-
-def test_a_named_mixture_gives_way_to_what_the_user_gives():
-    parameters, weights = resolve_tasks(
-        "thesis_recovery", {"nearest_target": 5.0, "target_distance": 9.0}
-    )
-    assert weights.tolist() == [0.6, 1.0]
-    assert parameters[:, T.nearest_target].tolist() == [5.0, 5.0]
-    assert parameters[:, T.precision_cost].tolist() == [0.03, 0.03]
-    assert FlightSettings(task="thesis_recovery").max_episode_steps == 500
-    assert FlightSettings(task="thesis_recovery", max_episode_steps=70).max_episode_steps == 70
-    changed = FlightSettings(vehicle="crazyflie").with_changes(task="thesis_recovery")
-    assert changed.max_episode_steps == 500
-    assert changed.with_changes(task="target_tracking").max_episode_steps == MAX_EPISODE_STEPS
-    kept = FlightSettings(max_episode_steps=70).with_changes(task="thesis_recovery")
-    assert kept.max_episode_steps == 70

@@ -170,52 +170,6 @@ def test_compiling_is_told_where_something_is_compiled_and_nowhere_else(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_the_end_of_an_episode():
-    env = QuadcopterVecEnv(6, seed=0, noise=0.0, max_episode_steps=400)
-    env.reset()
-    falling = np.tile(np.float32([-1, -1, -1, -1]), (6, 1))
-    falling[3:] = 0.0  # hover: to the time limit
-    total, ends, length = np.zeros(6), {}, 0
-    while len(ends) < 6:
-        before = env.true_state().copy()
-        observations, rewards, dones, infos = env.step(falling)
-        length += 1
-        for row in set(range(6)) - set(ends):
-            total[row] += rewards[row]
-            assert bool(infos[row]) == bool(dones[row])
-            if dones[row]:
-                ends[row] = infos[row]
-                assert infos[row]["episode"]["l"] == length
-                assert infos[row]["episode"]["r"] == pytest.approx(total[row], abs=1e-4)
-                terminal = infos[row]["terminal_observation"]
-                position = before.position[row] - before.target[row] + 0.01 * before.velocity[row]
-                np.testing.assert_allclose(
-                    terminal[:3] * env.observation_std[row, :3], position, atol=0.01
-                )
-                start = env.true_state()
-                np.testing.assert_array_equal(start.position[row], (0, 0, 15))
-                relative = start.position[row] - start.target[row]
-                np.testing.assert_allclose(
-                    observations[row, :3] * env.observation_std[row, :3], relative, atol=1e-5
-                )
-    for row in range(3):
-        assert (
-            ends[row]["collision"]
-            and not ends[row]["survival"]
-            and not ends[row]["TimeLimit.truncated"]
-        )
-        assert total[row] < -15.0
-    for row in range(3, 6):
-        assert (
-            ends[row]["survival"]
-            and not ends[row]["is_success"]
-            and ends[row]["TimeLimit.truncated"]
-            and not ends[row]["collision"]
-        )
-        assert ends[row]["distance"] == pytest.approx(10.0)
-        assert ends[row]["episode"]["l"] == 400
-
-
 @pytest.mark.parametrize(
     ("task", "distance", "tilt", "succeeds"),
     [
@@ -381,22 +335,6 @@ def test_scaling_and_noise_of_one_row_act_on_that_row():
         got[66], (expected[66] * plain.observation_std[66] - 0.5) / 4.0, atol=1e-6
     )
     assert not np.allclose(got[1], expected[1])
-
-
-def test_wrench_pushes_the_rows_it_names_until_set_anew():
-    env = QuadcopterVecEnv(3, noise=0.0, seed=0)
-    env.reset()
-    env.set_wrench(force=(5.0, 0.0, 0.0), indices=[1])
-    env.set_wrench(torque=(0.0, 0.0, 0.01), torque_frame="world", indices=[2])
-    for _ in range(10):
-        env.step(np.zeros((3, 4)))
-    state = env.true_state()
-    assert state.velocity[:, 0] == pytest.approx([0.0, 0.1 * 5.0 / env.vehicle.mass, 0.0])
-    assert state.body_rates[:, 2] == pytest.approx([0.0, 0.0, 0.1 * 0.01 / env.vehicle.inertia[2]])
-    speed = state.velocity[1, 0]
-    env.set_wrench()
-    env.step(np.zeros((3, 4)))
-    assert env.true_state().velocity[1, 0] == pytest.approx(speed)
 
 
 # --- refusals

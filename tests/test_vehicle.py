@@ -110,24 +110,6 @@ def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -
     )
 
 
-@given(vehicles())
-def test_kernel_parameters_are_in_their_order(vehicle: Vehicle) -> None:
-    values = dict(zip(PARAMETER_NAMES, vehicle.parameters(), strict=True))
-    low, high = vehicle.thrust_range
-    assert values["mass"] == vehicle.mass and values["izz"] == vehicle.inertia[2]
-    assert (
-        values["roll_arm_2"] == vehicle.mixer[1, 2] and values["yaw_arm_3"] == vehicle.mixer[3, 3]
-    )
-    ends = [
-        values["thrust_middle"] - values["thrust_half_range"],
-        values["thrust_middle"] + values["thrust_half_range"],
-    ]
-    np.testing.assert_allclose(
-        [*ends, values["hover_thrust"]], [low, high, vehicle.hover_thrust], atol=1e-12
-    )
-    assert ends[0] >= 0.0  # its square root is a rotor speed
-
-
 def test_frozen_and_copies_are_validated() -> None:
     with pytest.raises(ValidationError):
         ITM.mass = 2.0  # type: ignore[misc]
