@@ -110,7 +110,8 @@ def lend_compiled_code(purelib):
         target = purelib.joinpath(*name.split("."))
         for path in folder.glob("*.py"):
             shutil.copystat(path, target / path.name)
-        shutil.copytree(folder / "__pycache__", target / "__pycache__", dirs_exist_ok=True)
+        if (folder / "__pycache__").is_dir():
+            shutil.copytree(folder / "__pycache__", target / "__pycache__", dirs_exist_ok=True)
 
 
 @pytest.mark.slow
