@@ -31,7 +31,7 @@ settings.register_profile(
     "fuzz", deadline=None, derandomize=False, max_examples=1000, print_blob=True
 )
 settings.register_profile(
-    "default", deadline=None, derandomize=True, database=None, max_examples=12, print_blob=True
+    "default", deadline=None, derandomize=True, database=None, max_examples=20, print_blob=True
 )
 settings.load_profile("default")
 

@@ -186,7 +186,7 @@ SEEN = {
 DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
 
 
-@settings(max_examples=settings().max_examples // 4)
+@settings(max_examples=settings().max_examples // 5)
 @given(
     vehicle=st.fixed_dictionaries(VEHICLES, optional=DISTRIBUTION),
     randomize=st.fixed_dictionaries({}, optional=RANDOM),
@@ -403,7 +403,7 @@ def new_policy(inputs, outputs, widths, activation):
     )
 
 
-@settings(max_examples=settings().max_examples // 4)
+@settings(max_examples=settings().max_examples // 5)
 @given(
     widths=st.lists(st.integers(1, 70), max_size=3),
     activation=st.sampled_from([nn.Tanh, nn.ReLU, nn.ELU]),
