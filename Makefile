@@ -18,19 +18,20 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all coverage fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs notebooks docs-links pictures lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files docs notebooks docs-links pictures lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests that a change is likely to break, in minutes"
-	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers"
+	@echo "make test-all       run these and the slow ones: pages that train, wheels, compilers"
+	@echo "make test-portable  run those of make test as an older processor would"
+	@echo "make campaign       kill commands at random moments, and give them values at random that nobody should give"
 	@echo "make coverage       run those of make test, and show which lines of the packages they do not reach"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
 	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
 	@echo "make transfer-table print the table of docs/research/export.md, ARGS=\"-n 64 --curves\""
-	@echo "make test-extras    install each extra into an empty environment, as docs/installation.md says, and try it; ARGS=\"tune zoo\" some"
 	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
 	@echo "make pictures       draw the pages' pictures anew, ARGS=\"starts.png\" some of them; docs/pictures.py has their commands"
 	@echo "make notebooks      run the notebooks whose code has changed, and keep their outputs for the site; ARGS=--rerun all"
@@ -55,6 +56,18 @@ test: $(INSTALLED)
 
 test-all: $(INSTALLED)
 	$(PYTEST) $(ARGS)
+
+# Weekly in CI. SB3_QUAD_KILLS=50 SB3_QUAD_INPUTS=all: more of both.
+campaign: $(INSTALLED)
+	$(PY) -m pytest -m campaign -o timeout=0 $(ARGS)
+
+# Every library takes the code that it has for a processor without AVX, so that sums come out otherwise.
+# NumPy refuses names that are no choice here, so that it is asked for those that are.
+CHOICES = import numpy._core._multiarray_umath as m; print(*m.__cpu_dispatch__)
+test-portable: $(INSTALLED)
+	ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= \
+	NUMBA_CACHE_DIR=$(CURDIR)/build/portable \
+	NPY_DISABLE_CPU_FEATURES="$$($(PY) -c '$(CHOICES)')" $(PYTEST) -m "not slow" $(ARGS)
 
 # setup.cfg says what is left out: code that numba compiles runs where no tracer sees it.
 coverage: $(INSTALLED)
@@ -94,9 +107,6 @@ transfer-files: $(INSTALLED)
 		case $$name@$$vehicle in itm-*@itm) ;; itm-*|crazyflie-*@itm|crazyflie-*@*hummingbird) continue;; esac; \
 		$(PY) -m sb3_quad.cli export $$agent --format onnx --vehicle $$vehicle -o $(TRANSFER_FILES)/$$name@$$vehicle.onnx >/dev/null || exit 1; \
 	done; done
-
-test-extras:
-	PYTHON=$(PYTHON) .ci/extras $(ARGS)
 
 # -n: what a page or a docstring refers to must be there.
 SPHINX := $(DOCS_VENV)/bin/python -m sphinx -E -n -W --keep-going -q -d build/doctrees
@@ -138,7 +148,7 @@ type: $(INSTALLED) links
 type-demo:
 	npx --yes --package typescript@5 tsc -p sb3_quad/show/demo/jsconfig.json
 
-# mypy and import-linter do not follow __path__, by which a checkout's envs/ and its like are part of sb3_quad: links do.
+# mypy and import-linter do not follow package_dir, by which a checkout's envs/ and its like are part of sb3_quad: links do.
 links:
 	@rm -rf $(LINKS) && mkdir -p $(LINKS)
 	@for path in sb3_quad/* envs callbacks zoo_configs; do ln -s "$(CURDIR)/$$path" $(LINKS); done

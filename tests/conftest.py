@@ -1,7 +1,6 @@
 """Common state of all tests (CPU, one PyTorch thread, fixed seeds, no display), and small agents.
 
-``--shuffle SEED`` runs the tests in another order. Where the output is not a terminal, a line each
-minute says how far they are.
+``--shuffle SEED`` runs the tests in another order.
 """
 
 import importlib.abc
@@ -12,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 # PyTorch reads it when it is imported. Without a GPU the tests are the same on every machine.
@@ -76,42 +74,6 @@ if importlib.util.find_spec("pybullet") is None:
     sys.meta_path.insert(0, WithoutPyBullet())
 
 
-class Progress:
-    """Report each minute how many tests have run. A terminal shows that by itself.
-
-    Under xdist only the controller reports; it hears of its workers' tests by the same hooks.
-    """
-
-    def __init__(self, reporter):
-        self._reporter = reporter
-        self._total = 0
-        self._done = 0
-        self._ended = threading.Event()
-
-    def pytest_collection_finish(self, session):
-        self._total = self._total or len(session.items)
-
-    @pytest.hookimpl(optionalhook=True)
-    def pytest_xdist_node_collection_finished(self, ids):
-        self._total = len(ids)
-
-    def pytest_runtestloop(self):
-        threading.Thread(target=self._report, daemon=True).start()
-
-    def pytest_runtest_logfinish(self):
-        self._done += 1
-
-    def pytest_sessionfinish(self):
-        self._ended.set()
-
-    def _report(self):
-        while not self._ended.wait(60):
-            stats = self._reporter.stats
-            failed = len(stats.get("failed", ())) + len(stats.get("error", ()))
-            # The line before it is one of dots, which has not ended.
-            self._reporter.write_line(f"\n{self._done} of {self._total} tests, {failed} failed")
-
-
 def pytest_addoption(parser):
     parser.addoption("--shuffle", type=int, metavar="SEED", help="run the tests in another order")
 
@@ -128,16 +90,12 @@ def pytest_configure():
 
 
 def pytest_sessionstart(session):
-    if hasattr(session.config, "workerinput"):
-        return
-    if not session.config.option.collectonly:
+    is_worker = hasattr(session.config, "workerinput")
+    if not is_worker and not session.config.option.collectonly:
         # Workers would all compile the same code, and on a slow machine the first test of each
         # would take longer than a test may.
         compile_all = "from sb3_quad import QuadcopterVecEnv; QuadcopterVecEnv(1)"
         subprocess.run([sys.executable, "-c", compile_all], check=True)
-    if not sys.stdout.isatty():
-        plugins = session.config.pluginmanager
-        plugins.register(Progress(plugins.get_plugin("terminalreporter")))
 
 
 def pytest_collection_modifyitems(config, items):

@@ -186,7 +186,7 @@ SEEN = {
 DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
 
 
-@settings(max_examples=settings().max_examples // 2)
+@settings(max_examples=settings().max_examples // 5)
 @given(
     vehicle=st.fixed_dictionaries(VEHICLES, optional=DISTRIBUTION),
     randomize=st.fixed_dictionaries({}, optional=RANDOM),
@@ -257,7 +257,7 @@ def test_gradients_go_through_a_battery_that_limits_every_rotor_and_stops_some(s
 
 def test_a_feature_without_a_gradient_is_refused(monkeypatch):
     monkeypatch.setitem(FEATURE_SIZES, "rotor_speeds", 4)
-    with pytest.raises(ConfigError, match="features rotor_speeds: have no gradient"):
+    with pytest.raises(ConfigError, match="rotor_speeds"):
         FlightTape(new_batch(2, 0), 4)
 
 
@@ -271,8 +271,7 @@ def test_rows_of_different_noise_have_the_gradients_of_their_own():
     record_and_compare(tape, random_actions(20, batch.n, 0), 0)
 
 
-@pytest.mark.parametrize("substeps", [2, 4])
-@pytest.mark.parametrize("vehicle", ["itm", "l2f_crazyflie"])
+@pytest.mark.parametrize(("vehicle", "substeps"), [("itm", 4), ("l2f_crazyflie", 2)])
 def test_the_gradient_by_the_start_is_that_of_differences(vehicle, substeps):
     torque = {"magnitude": 0.03, "unit": "weight", "frame": "world"}
     batch = new_batch(
@@ -404,7 +403,7 @@ def new_policy(inputs, outputs, widths, activation):
     )
 
 
-@settings(max_examples=settings().max_examples // 4 * 3)
+@settings(max_examples=settings().max_examples // 5)
 @given(
     widths=st.lists(st.integers(1, 70), max_size=3),
     activation=st.sampled_from([nn.Tanh, nn.ReLU, nn.ELU]),

@@ -13,7 +13,6 @@ from gymnasium.wrappers.vector import (
 )
 
 import sb3_quad  # noqa: F401  (registers the environments)
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 
@@ -115,18 +114,3 @@ def test_gymnasiums_wrappers_count_each_episode_once(mode):
         -0.3, abs=0.01
     )
     assert len(DictInfoToList(make(4)).reset(seed=0)[1]) == 4
-
-
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: make(3).reset(seed=[1, 2]), "2 numbers for 3"),
-        (lambda: make(2).reset(seed=1.5), "seed 1.5 is not a whole number"),
-        (lambda: make(3).reset(options={"target": (0, 0, 1)}), "reset options"),
-        (lambda: make(2, autoreset_mode="NextSteps"), "did you mean 'NextStep'"),
-        (lambda: make(2, render_mode="human"), "render_mode"),
-    ],
-)
-def test_bad_input_raises(call, says):
-    with pytest.raises(ConfigError, match=says):
-        call()

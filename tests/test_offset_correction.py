@@ -9,15 +9,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.agents.pretrained import load_pretrained
-from sb3_quad.algorithms.offset_correction import (
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.offset_correction import (
     correct_offset,
     hover_offset,
     scale_position,
     shift_position,
 )
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import fly
 
 
 def test_moved_and_scaled_positions_are_part_of_the_actor():
@@ -43,7 +43,7 @@ def test_the_correction_counts_the_scale_of_vec_normalize(monkeypatch):
     model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
     offsets = iter([np.array([0.3, -0.2, 0.5]), *np.zeros((3, 3))])
     monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.hover_offset", lambda *_, **__: next(offsets)
+        "sb3_quad.evaluation.offset_correction.hover_offset", lambda *_, **__: next(offsets)
     )
     raw = env.venv.reset()
     moved = raw.copy()
@@ -73,7 +73,7 @@ def test_a_correction_that_fails_leaves_the_agent_as_it_was(scale, monkeypatch):
         except StopIteration:
             raise ConfigError("the agent crashes") from None
 
-    monkeypatch.setattr("sb3_quad.algorithms.offset_correction.hover_offset", fail_the_second_time)
+    monkeypatch.setattr("sb3_quad.evaluation.offset_correction.hover_offset", fail_the_second_time)
     before = {name: values.clone() for name, values in model.policy.state_dict().items()}
     with pytest.raises(ConfigError):
         correct_offset(model, scale=scale)
@@ -84,7 +84,7 @@ def test_a_correction_that_fails_leaves_the_agent_as_it_was(scale, monkeypatch):
 @pytest.mark.slow
 def test_the_correction_cancels_the_offset_of_a_trained_agent(monkeypatch):
     monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.fly", partial(fly, max_episode_steps=700)
+        "sb3_quad.evaluation.offset_correction.fly", partial(fly, max_episode_steps=700)
     )  # 7 s are enough to arrive
     model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))

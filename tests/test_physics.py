@@ -179,7 +179,7 @@ def vehicles(draw):
 
 
 @settings(
-    max_examples=settings().max_examples // 8,
+    max_examples=settings().max_examples // 4,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )
 @given(vehicle=vehicles(), seed=st.integers(0, 2**32 - 1), pushed=st.booleans())
@@ -208,12 +208,11 @@ def test_flight_of_an_impossible_inertia_is_pybullets(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "itm"])
-@pytest.mark.parametrize("seed", range(3))
-def test_flight_of_the_shipped_vehicles_is_pybullets(name, seed, tmp_path):
+def test_flight_of_the_shipped_vehicles_is_pybullets(name, tmp_path):
     """Full deflection for 0.1 s at most at a time: longer, and a small vehicle spins faster than
     PyBullet is exact at.
     """
-    vehicle, rng = load_vehicle(name), np.random.default_rng(seed)
+    vehicle, rng = load_vehicle(name), np.random.default_rng(0)
     state = random_state(rng, vehicle)
     actions = np.clip(
         random_actions(rng, 200)[::2] * rng.choice([-1.0, 1.0], size=(100, 4)), -1, 1
@@ -226,7 +225,7 @@ def test_flight_of_the_shipped_vehicles_is_pybullets(name, seed, tmp_path):
     assert worst_difference(vehicle, tmp_path, state, actions, wrench).max() < 1e-9
 
 
-@pytest.mark.parametrize("physics_step", [0.0005, 0.001, 0.002])
+@pytest.mark.parametrize("physics_step", [0.0005, 0.002])
 def test_other_physics_steps(physics_step, tmp_path):
     vehicle = ITM.model_copy(update={"physics_step": physics_step, "control_step": 0.01})
     rng = np.random.default_rng(3)

@@ -8,11 +8,11 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 
-from sb3_quad.algorithms.offset_correction import Correction
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
 from sb3_quad.cli import main
+from sb3_quad.evaluation.offset_correction import Correction
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs
 from sb3_quad.training.trainer import train

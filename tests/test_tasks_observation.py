@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from sb3_quad import envs
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.observation import (
     DEFAULT_STD,
@@ -24,14 +22,13 @@ from sb3_quad.envs.simulation.random import EPISODE, STEP, philox
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import (
     BODY_RATES,
-    POSITION,
     QUATERNION,
     ROTOR_SPEEDS,
     TARGET,
     VELOCITY,
     QuadcopterState,
 )
-from sb3_quad.envs.simulation.tasks import SCORED, TASK, T, Task, in_words, resolve_tasks
+from sb3_quad.envs.simulation.tasks import SCORED, TASK, T, Task, resolve_tasks
 from sb3_quad.envs.vehicles.layout import find_turn
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
@@ -135,10 +132,9 @@ def features_of(state):
     return batch.observe() * DEFAULT_STD
 
 
-@pytest.mark.parametrize("name", ["hummingbird", "crazyflie"])
-def test_turned_features_are_those_of_the_turned_vehicle(name):
+def test_turned_features_are_those_of_the_turned_vehicle():
     """A body whose axes are turned about z sees the same flight in its own axes."""
-    turn = find_turn(load_vehicle(name), ITM)
+    turn = find_turn(load_vehicle("hummingbird"), ITM)
     state = QuadcopterState(start(50, "recovery_and_tracking", seed=2).state)
     turned = state.copy()
     angle = -turn.angle / 2.0
@@ -149,19 +145,6 @@ def test_turned_features_are_those_of_the_turned_vehicle(name):
     matrix = turn_features(turn)
     np.testing.assert_allclose(features_of(state) @ matrix.T, features_of(turned), atol=1e-5)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(OBSERVATION_SIZE), atol=1e-12)
-
-
-def test_additive_noise_does_not_vanish_at_the_target():
-    env, plain = (
-        QuadcopterVecEnv(4000, task="state_recovery", noise=noise, seed=0) for noise in (NOISE, 0.0)
-    )
-    seen, true = env.reset(), plain.reset()
-    assert np.std(seen[:, :3]) == pytest.approx(0.1, rel=0.03)  # r = r_T there, in σ
-    spread = np.hypot(0.05 * true[:, 12:], 0.1)
-    assert np.std((seen - true)[:, 12:] / spread) == pytest.approx(1.0, rel=0.02)
-    assert env.batch.additive_level.tolist() == [0.1]
-    env.set_noise(0.0)
-    assert env.batch.additive_level.tolist() == [0.0]
 
 
 def test_noise_is_the_same_on_pybullet_and_for_short():
@@ -217,7 +200,7 @@ def test_state_recovery_starts():
     assert np.abs(together - np.eye(10)).max() < 0.04
 
 
-@pytest.mark.parametrize("distance", [15.0, 20.0, 40.0])
+@pytest.mark.parametrize("distance", [15.0, 40.0])
 def test_targets_are_never_below_ground(distance):
     rows = start(5_000, "target_tracking", target_distance=distance, max_distance=60.0)
     state = QuadcopterState(rows.state)
@@ -226,18 +209,6 @@ def test_targets_are_never_below_ground(distance):
     lowest = max(15.0 - distance, ITM.collision_radius + 0.25)
     assert height.min() >= lowest - 1e-9
     assert height.mean() == pytest.approx((lowest + 15.0 + distance) / 2, rel=0.03)
-
-
-def test_targets_near_and_far():
-    rows = start(8_000, "recovery_and_tracking")
-    state = QuadcopterState(rows.state)
-    assert np.quantile(state.distance, [0.0, 0.25, 0.5, 0.75, 1.0]) == pytest.approx(
-        [0, 6.25, 12.5, 18.75, 25], abs=0.5
-    )
-    assert np.linalg.norm(state.velocity, axis=1).min() > 0.0
-    state = QuadcopterState(start(8_000, "far_tracking").state)
-    assert np.quantile(state.distance, [0.0, 0.5, 1.0]) == pytest.approx([10, 17.5, 25], abs=0.3)
-    assert (state.velocity == 0.0).all() and (state.rotation[:, 2, 2] == 1.0).all()
 
 
 def test_a_reset_touches_the_rows_it_names_and_counts_their_episodes():
@@ -293,7 +264,7 @@ def test_reward_and_ends_of_each_task():
     np.testing.assert_array_equal(got["out_of_range"], away)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.7, math.pi / 2, 2.5, math.pi - 1e-6, math.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.7, math.pi - 1e-6, math.pi])
 def test_tilt_is_exact_at_every_angle(angle):
     rows = start(1, "target_tracking", tilt_cost=1.0, position_cost=0.0, body_rates_cost=0.0)
     rows.state[QUATERNION, 0] = (
@@ -303,19 +274,6 @@ def test_tilt_is_exact_at_every_angle(angle):
         0.0,
     )
     assert scores(rows)["reward"][0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
-
-
-def test_precision_is_half_due_at_its_range_and_steepest_at_the_target():
-    rows = start(3, "target_tracking", precision_cost=0.02, precision_range=0.3, position_cost=0.0)
-    rows.state[POSITION] = rows.state[TARGET] + np.array([-0.001, -0.3, -8.7]) * np.array(
-        [[0.0], [0.0], [1.0]]
-    )
-    near, middle, far = scores(rows)["reward"]
-    assert (
-        near == pytest.approx(-0.02 * 0.001 / 0.3, rel=0.01)
-        and middle == pytest.approx(-0.01)
-        and far > -0.02
-    )
 
 
 # --- tasks as data
@@ -355,40 +313,3 @@ def test_a_named_mixture_is_the_mixture_written_out():
     assert ended > 0
     for name, array in named.batch.snapshot().items():
         np.testing.assert_array_equal(array, written_out.batch.snapshot()[name])
-
-
-def test_a_named_mixture_gives_way_to_what_the_user_gives():
-    parameters, weights = resolve_tasks(
-        "thesis_recovery", {"nearest_target": 5.0, "target_distance": 9.0}
-    )
-    assert weights.tolist() == [0.6, 1.0]
-    assert parameters[:, T.nearest_target].tolist() == [5.0, 5.0]
-    assert parameters[:, T.precision_cost].tolist() == [0.03, 0.03]
-    assert FlightSettings(task="thesis_recovery").max_episode_steps == 500
-    assert FlightSettings(task="thesis_recovery", max_episode_steps=70).max_episode_steps == 70
-    changed = FlightSettings(vehicle="crazyflie").with_changes(task="thesis_recovery")
-    assert changed.max_episode_steps == 500
-    assert changed.with_changes(task="target_tracking").max_episode_steps == MAX_EPISODE_STEPS
-    kept = FlightSettings(max_episode_steps=70).with_changes(task="thesis_recovery")
-    assert kept.max_episode_steps == 70
-    words = in_words("thesis_recovery")
-    assert words == "thesis_recovery (60% state_recovery, 40% far_tracking)"
-
-
-@pytest.mark.parametrize(
-    ("task", "kwargs", "says"),
-    [
-        ("hover", {}, "unknown task 'hover'"),
-        ("thesis_recover", {}, "did you mean 'thesis_recovery'"),
-        ({"thesis_recovery": 1.0}, {}, "unknown task 'thesis_recovery'"),
-        ({}, {}, "names no task"),
-        ({"target_tracking": -1.0}, {}, "weights"),
-        ("target_tracking", {"target_distanc": 1}, "did you mean 'target_distance'"),
-        ("target_tracking", {"nearest_target": 11}, "nearest_target 11"),
-        ("target_tracking", {"start_position": (0, 0, -1)}, "above the ground"),
-        (3, {}, "unknown task '3'"),
-    ],
-)
-def test_bad_tasks_are_refused(task, kwargs, says):
-    with pytest.raises(ConfigError, match=says):
-        resolve_tasks(task, kwargs)

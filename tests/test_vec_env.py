@@ -2,9 +2,6 @@
 Stable-Baselines3's interface.
 """
 
-import subprocess
-import sys
-import threading
 import warnings
 
 import numba
@@ -24,7 +21,6 @@ from sb3_quad.base.process import print_once
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.experts.pid import PIDExpert
 
 TASKS = ("target_tracking", "state_recovery")
@@ -32,18 +28,13 @@ MIXTURE = {"target_tracking": 1.0, "state_recovery": 2.0}
 
 
 def fly(env, steps, actions=None):
-    """Observations, rewards, dones and infos of ``steps`` steps with the same random actions for
+    """Observations, rewards and dones of ``steps`` steps with the same random actions for
     the same number of rows.
     """
-    rng = np.random.default_rng(0)
-    actions = (
-        rng.uniform(-1, 1, (steps, env.num_envs, 4)).astype(np.float32)
-        if actions is None
-        else actions
-    )
-    steps_taken = [env.step(action) for action in actions]
-    infos = [[dict(info) for info in step[3]] for step in steps_taken[-1:]]
-    return *(np.array([step[k] for step in steps_taken]) for k in range(3)), infos
+    if actions is None:
+        actions = np.random.default_rng(0).uniform(-1, 1, (steps, env.num_envs, 4))
+    taken = [env.step(action.astype(np.float32))[:3] for action in actions]
+    return [np.array(each) for each in zip(*taken, strict=True)]
 
 
 # --- whole episodes, compared with PyBullet
@@ -103,83 +94,43 @@ def test_whole_episodes_are_pybullets(task, controller):
         assert len(expected) == len(rewards[row])
         np.testing.assert_allclose(rewards[row], expected, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(infos[row]["terminal_observation"], observation, atol=2e-6)
-        assert infos[row]["is_success"] == info["is_success"]
-        assert infos[row]["survival"] == info["survival"] == (not terminated)
-        assert infos[row]["TimeLimit.truncated"] == (not terminated)
+        for name in ("is_success", "survival", "collision", "out_of_range"):
+            assert infos[row][name] == info[name]
+        assert infos[row]["TimeLimit.truncated"] == info["survival"] == (not terminated)
         assert infos[row]["episode"]["l"] == len(expected)
         assert infos[row]["episode"]["r"] == pytest.approx(expected.sum(), abs=1e-5)
         assert infos[row]["distance"] == pytest.approx(info["distance"], abs=1e-8)
-        assert infos[row]["collision"] == info["collision"]
-        assert infos[row]["out_of_range"] == info["out_of_range"]
-    single.close()
-
-
-def test_noise_is_the_same_in_both():
-    batch, single = (
-        QuadcopterVecEnv(3, task="state_recovery", seed=7),
-        envs.QuadcopterEnv(task="state_recovery"),
-    )
-    first = batch.reset()
-    for row in range(3):
-        np.testing.assert_allclose(
-            single.reset(seed=row_seeds(7, 3)[row])[0], first[row], atol=1e-6
-        )
-    action = np.full(4, 0.1, dtype=np.float32)
-    np.testing.assert_allclose(
-        single.step(action)[0], batch.step(np.tile(action, (3, 1)))[0][2], atol=1e-6
-    )
     single.close()
 
 
 # --- rows apart from each other
 
 
-@pytest.mark.parametrize("task", [*TASKS, MIXTURE])
-def test_a_row_is_what_its_seed_alone_is(task):
+def test_a_row_is_what_its_seed_alone_is():
     n, steps = 200, 300
-    env = QuadcopterVecEnv(n, task=task, seed=3, max_episode_steps=150)
+    env = QuadcopterVecEnv(n, task=MIXTURE, seed=3, max_episode_steps=150)
     env.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, 4)).astype(np.float32)
-    observations, rewards, dones, _ = fly(env, steps, actions)
-    for row in (0, 1, 63, 64, 128, 199):
-        alone = QuadcopterVecEnv(1, task=task, max_episode_steps=150)
+    observations, rewards, dones = fly(env, steps, actions)
+    for row in (0, 63, 64, 199):
+        alone = QuadcopterVecEnv(1, task=MIXTURE, max_episode_steps=150)
         alone.batch.seed([row_seeds(3, n)[row]])
         alone.reset()
-        observation, reward, done, _ = fly(alone, steps, actions[:, [row]])
+        observation, reward, done = fly(alone, steps, actions[:, [row]])
         np.testing.assert_array_equal(observation[:, 0], observations[:, row])
         np.testing.assert_array_equal(reward[:, 0], rewards[:, row])
         np.testing.assert_array_equal(done[:, 0], dones[:, row])
 
 
-@pytest.mark.parametrize("n", [64, 193, 700])
+@pytest.mark.parametrize("n", [193, 700])
 def test_results_do_not_depend_on_the_number_of_threads(n):
     flights = []
     for threads in (1, 2, 5):
         env = QuadcopterVecEnv(n, task=MIXTURE, seed=1, n_threads=threads, max_episode_steps=60)
-        flights.append([env.reset(), *fly(env, 150)[:3], env.true_state().array.copy()])
+        flights.append([env.reset(), *fly(env, 150), env.true_state().array.copy()])
     for flight in flights[1:]:
         for got, expected in zip(flight, flights[0], strict=True):
             np.testing.assert_array_equal(got, expected)
-
-
-def test_two_environments_may_fly_in_two_threads():
-    expected = {}
-    flown = {}
-
-    def job(seed, results):
-        env = QuadcopterVecEnv(400, seed=seed)
-        env.reset()
-        results[seed] = fly(env, 60)[0]
-
-    for seed in (1, 1000):
-        job(seed, expected)
-    threads = [threading.Thread(target=job, args=(seed, flown)) for seed in (1, 1000)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for seed in (1, 1000):
-        np.testing.assert_array_equal(flown[seed], expected[seed])
 
 
 def test_seed_gives_the_same_again_and_without_it_episodes_go_on():
@@ -189,26 +140,6 @@ def test_seed_gives_the_same_again_and_without_it_episodes_go_on():
     assert env.seed(0) == row_seeds(0, 5)
     np.testing.assert_array_equal(env.reset(), first)
     np.testing.assert_array_equal(env.reset(), second)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="no fork")
-def test_a_forked_child_flies_too():
-    code = """
-import os, numpy as np
-from sb3_quad.envs.vec_env import QuadcopterVecEnv
-env = QuadcopterVecEnv(512, seed=0); env.reset()
-for _ in range(20): env.step(np.zeros((512, 4)))
-child = os.fork()
-for _ in range(20): observations = env.step(np.ones((512, 4)))[0]
-os.write(1, f"{observations.sum()}\\n".encode())
-if child: assert os.waitpid(child, 0)[1] == 0
-"""
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=True
-    )
-    sums = result.stdout.split()
-    assert len(sums) == 2 and sums[0] == sums[1]
 
 
 # --- ends of episodes
@@ -229,52 +160,6 @@ def test_compiling_is_told_where_something_is_compiled_and_nowhere_else(capsys):
     with compile_notice():
         doubled(1)
     assert capsys.readouterr().err == ""
-
-
-def test_the_end_of_an_episode():
-    env = QuadcopterVecEnv(6, seed=0, noise=0.0, max_episode_steps=400)
-    env.reset()
-    falling = np.tile(np.float32([-1, -1, -1, -1]), (6, 1))
-    falling[3:] = 0.0  # hover: to the time limit
-    total, ends, length = np.zeros(6), {}, 0
-    while len(ends) < 6:
-        before = env.true_state().copy()
-        observations, rewards, dones, infos = env.step(falling)
-        length += 1
-        for row in set(range(6)) - set(ends):
-            total[row] += rewards[row]
-            assert bool(infos[row]) == bool(dones[row])
-            if dones[row]:
-                ends[row] = infos[row]
-                assert infos[row]["episode"]["l"] == length
-                assert infos[row]["episode"]["r"] == pytest.approx(total[row], abs=1e-4)
-                terminal = infos[row]["terminal_observation"]
-                position = before.position[row] - before.target[row] + 0.01 * before.velocity[row]
-                np.testing.assert_allclose(
-                    terminal[:3] * env.observation_std[row, :3], position, atol=0.01
-                )
-                start = env.true_state()
-                np.testing.assert_array_equal(start.position[row], (0, 0, 15))
-                relative = start.position[row] - start.target[row]
-                np.testing.assert_allclose(
-                    observations[row, :3] * env.observation_std[row, :3], relative, atol=1e-5
-                )
-    for row in range(3):
-        assert (
-            ends[row]["collision"]
-            and not ends[row]["survival"]
-            and not ends[row]["TimeLimit.truncated"]
-        )
-        assert total[row] < -15.0
-    for row in range(3, 6):
-        assert (
-            ends[row]["survival"]
-            and not ends[row]["is_success"]
-            and ends[row]["TimeLimit.truncated"]
-            and not ends[row]["collision"]
-        )
-        assert ends[row]["distance"] == pytest.approx(10.0)
-        assert ends[row]["episode"]["l"] == 400
 
 
 @pytest.mark.parametrize(
@@ -337,19 +222,6 @@ def test_out_of_range_ends():
     assert rewards[1] == pytest.approx(-15.3, abs=0.01) and rewards[0] > -0.1
 
 
-def test_returned_arrays_are_fresh():
-    env = QuadcopterVecEnv(3, seed=0)
-    first = [env.reset(), *env.step(np.zeros((3, 4)))[:3]]
-    kept = [array.copy() for array in first]
-    env.step(np.ones((3, 4)))
-    for array, copy in zip(first, kept, strict=True):
-        np.testing.assert_array_equal(array, copy)
-    assert (
-        first[0].dtype == first[1].dtype == first[2].dtype == np.float32
-        and first[3].dtype == np.bool_
-    )
-
-
 # --- what users set
 
 
@@ -374,19 +246,10 @@ def test_setters_reach_the_rows_they_name():
     assert env.get_attr("noise") == [0.0] * 4
     env.set_attr("noise", 0.1, indices=2)
     assert env.get_attr("noise") == [0.0, 0.0, 0.1, 0.0]
-    assert env.get_attr("vehicle")[3].name == env.vehicle.name == "itm"
     assert [state.n for state in env.env_method("true_state")] == [1] * 4
-    assert (
-        env.get_attr("render_mode") == [None] * 4 and env.env_is_wrapped(VecMonitor) == [False] * 4
-    )
+    assert env.env_is_wrapped(VecMonitor) == [False] * 4
     env.set_wrench(force=(0.0, 2.0, 0.0), indices=[1])
-    assert [wrench.tolist() for wrench in env.get_attr("wrench", [0, 1])] == [
-        [0.0] * 12,
-        [0.0, 2.0] + [0.0] * 10,
-    ]
-    assert (
-        env.get_attr("task") == ["target_tracking"] * 4 and env.get_attr("task_kwargs") == [{}] * 4
-    )
+    assert [wrench[1] for wrench in env.get_attr("wrench", [0, 1])] == [0.0, 2.0]
 
 
 def test_its_episodes_are_a_monitors():
@@ -457,60 +320,7 @@ def test_scaling_and_noise_of_one_row_act_on_that_row():
     assert not np.allclose(got[1], expected[1])
 
 
-def test_wrench_pushes_the_rows_it_names_until_set_anew():
-    env = QuadcopterVecEnv(3, noise=0.0, seed=0)
-    env.reset()
-    env.set_wrench(force=(5.0, 0.0, 0.0), indices=[1])
-    env.set_wrench(torque=(0.0, 0.0, 0.01), torque_frame="world", indices=[2])
-    for _ in range(10):
-        env.step(np.zeros((3, 4)))
-    state = env.true_state()
-    assert state.velocity[:, 0] == pytest.approx([0.0, 0.1 * 5.0 / env.vehicle.mass, 0.0])
-    assert state.body_rates[:, 2] == pytest.approx([0.0, 0.0, 0.1 * 0.01 / env.vehicle.inertia[2]])
-    speed = state.velocity[1, 0]
-    env.set_wrench()
-    env.step(np.zeros((3, 4)))
-    assert env.true_state().velocity[1, 0] == pytest.approx(speed)
-
-
-def test_vehicles_by_row():
-    light, heavy = load_vehicle("itm"), load_vehicle("itm").model_copy(update={"mass": 3.0})
-    env = QuadcopterVecEnv(3, vehicle=[light, heavy, light], noise=0.0, seed=0)
-    env.reset()
-    assert [vehicle.mass for vehicle in env.get_attr("vehicle")] == [light.mass, 3.0, light.mass]
-    env.set_wrench(force=(3.0, 0.0, 0.0))
-    env.step(np.zeros((3, 4)))
-    assert env.true_state().velocity[:, 0] == pytest.approx(
-        0.03 / np.array([light.mass, 3.0, light.mass])
-    )
-    np.testing.assert_allclose(env.true_state().velocity[:, 2], 0.0, atol=1e-12)
-
-
 # --- refusals
-
-SLOW = load_vehicle("itm").model_copy(update={"control_step": 0.02})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ({"n_envs": 2.5}, "n_envs 2.5"),
-        ({"n_envs": 2, "noise": float("nan")}, "finite"),
-        ({"n_envs": 2, "observation_std": np.zeros(18)}, "observation_std"),
-        ({"n_envs": 2, "observation_mean": np.zeros(17)}, r"observation_mean of shape \(17,\)"),
-        ({"n_envs": 2, "observation_mean": []}, r"observation_mean of shape \(0,\)"),
-        ({"n_envs": 2, "max_episode_steps": [5, 0]}, "max_episode_steps"),
-        ({"n_envs": 2, "max_episode_steps": []}, "max_episode_steps"),
-        ({"n_envs": 2, "max_episode_steps": True}, "true and false are not numbers"),
-        ({"n_envs": 2, "max_episode_steps": [5] * 3}, "max_episode_steps: 3 values for 2"),
-        ({"n_envs": 2, "vehicle": ["itm"] * 3}, "vehicle: 3 values for 2"),
-        ({"n_envs": 2, "vehicle": []}, "vehicle: 0 values for 2"),
-        ({"n_envs": 2, "vehicle": ["itm", SLOW]}, "vehicle of row 1: physics_step"),
-    ],
-)
-def test_bad_arguments_are_refused(arguments, says):
-    with pytest.raises(ConfigError, match=says):
-        QuadcopterVecEnv(**arguments)
 
 
 def test_bad_actions_are_refused_and_change_nothing():
@@ -518,29 +328,14 @@ def test_bad_actions_are_refused_and_change_nothing():
     env.reset()
     before = env.true_state().copy()
     for wrong in (np.zeros((70, 3)), np.zeros(4), np.zeros((69, 4))):
-        with pytest.raises(ValueError, match=r"must be \(70, 4\)"):
+        with pytest.raises(ValueError, match="action"):
             env.step(wrong)
     for value in (np.nan, np.inf, -np.inf):
         actions = np.zeros((70, 4))
         actions[68, 2] = value
-        with pytest.raises(ValueError, match=rf"row 68 is \[0.0, 0.0, {value}, 0.0\]"):
+        with pytest.raises(ValueError, match="row 68"):
             env.step(actions)
     np.testing.assert_array_equal(env.true_state().array, before.array)
-
-
-@pytest.mark.parametrize(
-    ("method", "arguments", "says"),
-    [
-        ("set_target", [(1, 2)], r"position of shape \(2,\)"),
-        ("set_target", [(1, 2, np.nan)], "finite"),
-        ("set_wrench", [(1, 2, 3, 4)], "force of shape"),
-        ("set_wrench", [(1, 2, 3), (0, 0, 0), "earth"], "force_frame 'earth'"),
-        ("set_noise", ["much"], "noise: 'much'"),
-    ],
-)
-def test_bad_settings_are_refused(method, arguments, says):
-    with pytest.raises(ConfigError, match=says):
-        getattr(QuadcopterVecEnv(2), method)(*arguments)
 
 
 @pytest.mark.parametrize("kind", [QuadcopterVecEnv, QuadcopterGymVectorEnv])
@@ -548,22 +343,12 @@ def test_steps_wait_for_the_first_reset(kind):
     env, other = kind(2, seed=0), kind(2, seed=0)
     actions = np.zeros((2, 4), np.float32)
     for _ in range(2):
-        with pytest.raises(ResetNeeded, match="call reset"):
+        with pytest.raises(ResetNeeded, match="reset"):
             env.step(actions)
     other.reset()
     # A restored run goes on without a reset.
     env.batch.restore(other.batch.snapshot())
     np.testing.assert_array_equal(env.step(actions)[0], other.step(actions)[0])
-
-
-def test_the_length_of_episodes_is_read_and_not_set():
-    env = QuadcopterVecEnv(3, max_episode_steps=[10, 25])
-    assert env.get_attr("max_episode_steps", [1, 2]) == [25, 10]
-    with pytest.raises(AttributeError, match="max_episode_steps"):
-        env.max_episode_steps = 5
-    with pytest.raises(AttributeError, match="max_episode_steps"):
-        env.set_attr("max_episode_steps", 5)
-    assert env.max_episode_steps.tolist() == [10, 25, 10]
 
 
 def test_targets_wait_for_the_first_reset():
@@ -578,9 +363,9 @@ def test_targets_wait_for_the_first_reset():
 
 
 def test_wind_without_drag_warns():
-    with pytest.warns(UserWarning, match="wind acts through drag, and itm has none"):
+    with pytest.warns(UserWarning, match="wind"):
         QuadcopterVecEnv(1).set_wind((1, 0, 0))
-    with pytest.warns(UserWarning, match="randomize: wind acts through drag"):
+    with pytest.warns(UserWarning, match="wind"):
         QuadcopterVecEnv(1, randomize={"wind": [0, 4]})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -601,7 +386,7 @@ def test_unknown_rows_methods_and_attributes_are_refused():
     with pytest.raises(AttributeError):
         env.get_attr("colour")
     env.set_options({"target": (0, 0, 1)})
-    with pytest.raises(ConfigError, match="reset options"):
+    with pytest.raises(ConfigError, match="options"):
         env.reset()
     env.reset()
 

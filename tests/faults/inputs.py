@@ -9,13 +9,13 @@ Prints a line for each case that does not. Exit code 1 if any did.
 """
 
 import argparse
-import itertools
 import os
 import random
 import resource
 import shutil
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from campaign import forked
 
 import sb3_quad.cli.closing
 from sb3_quad.algorithms.dagger import DAgger
-from sb3_quad.cli.app import COMMANDS, make_parser
+from sb3_quad.cli.app import make_parser
 from sb3_quad.envs.simulation.tasks import Task
 from sb3_quad.envs.vehicles.vehicle import Vehicle, load_vehicle
 from sb3_quad.evaluation.scenarios.scenario import Scenario
@@ -49,6 +49,7 @@ SUITE = {
     "name": "one",
     "scenarios": [{"name": "near", "target": {"distance": 1.0}, "duration": 2.0, "episodes": 2}],
 }
+ENV = "QuadTargetTracking-v0"
 SETTINGS: dict[str, Any] = {"n_timesteps": 20, "n_envs": 2, "n_steps": 10, "batch_size": 20}
 SETTINGS |= {"policy_kwargs": {"net_arch": [4]}}
 BASES = {
@@ -58,64 +59,50 @@ BASES = {
     "evaluate": "pid --suite suite.yaml --no-report",
     "export": "itm-recovery --format onnx",
     "plot": "a=no_run",
-    "sweep": "sweep.yaml --dry-run",
+    "report": "no_results",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",
-    "tune": "--algo dagger --conf-file settings.yml -n 20 --n-trials 1 --eval-episodes 1 "
-    "--n-evaluations 1",
 }
 Case = tuple[str, list[str], dict[str, str]]  # what it is, a command, files
 
 
-def cases() -> list[Case]:
-    """All of them, in a fixed order."""
-    found: list[Case] = []
-    files = {"settings.yml": _yaml({"QuadTargetTracking-v0": SETTINGS}), "suite.yaml": _yaml(SUITE)}
-    files["sweep.yaml"] = _yaml({"algo": "dagger", "env": "QuadTargetTracking-v0", "seed": [0, 1]})
+def arguments() -> Iterator[Case]:
+    """Every option of every command, with every text."""
+    files = {"settings.yml": _yaml({ENV: SETTINGS}), "suite.yaml": _yaml(SUITE)}
     subparsers: Any = next(
         each for each in make_parser()._actions if isinstance(each, argparse._SubParsersAction)
     )
-    assert {*COMMANDS} == {*BASES}
-    for command, base in BASES.items():
+    for command in sorted(BASES.keys() & subparsers.choices.keys()):
+        base = BASES[command].split()
         for action in subparsers.choices[command]._actions:
             if action.nargs == 0 or isinstance(action, argparse.BooleanOptionalAction):
                 continue
-            paths = action.metavar in ("FILE", "FOLDER", "DIR", "PATH", "WHERE", "AGENT")
-            for text in [*TEXTS, *([] if paths else [OUTSIDE])]:
-                given = (
-                    [*base.split(), action.option_strings[-1], text]
-                    if action.option_strings
-                    else [text, *base.split()[1:]]
-                )
-                found.append((f"{command} {action.dest}", [command, *given], files))
-    dagger = ["train", *BASES["train"].split()]
-    keys = sorted(
-        {*TrainingConfig.model_fields, *constructor_parameters(DAgger)}
-        - {"algo", "env_id", "settings", "hyperparams"}
-    )
-    for key, value in itertools.product(keys, VALUES):
-        settings = {"QuadTargetTracking-v0": {**SETTINGS, key: value}}
-        found.append((f"settings {key}", dagger, {**files, "settings.yml": _yaml(settings)}))
-    for key, value in itertools.product(Task.model_fields, VALUES):
-        settings = {
-            "QuadTargetTracking-v0": {**SETTINGS, "env_kwargs": {"task_kwargs": {key: value}}}
-        }
-        found.append((f"task {key}", dagger, {**files, "settings.yml": _yaml(settings)}))
+            is_path = action.metavar in ("FILE", "FOLDER", "DIR", "PATH", "WHERE", "AGENT")
+            for text in TEXTS if is_path else [*TEXTS, OUTSIDE]:
+                given = [text, *base[1:]]
+                if action.option_strings:
+                    given = [*base, action.option_strings[-1], text]
+                yield f"{command} {action.dest}", [command, *given], files
+
+
+def keys() -> Iterator[Case]:
+    """Every key of every kind of file, with every value."""
+    train = ["train", *BASES["train"].split()]
+    settings = {*TrainingConfig.model_fields, *constructor_parameters(DAgger)}
+    settings -= {"algo", "env_id", "settings", "hyperparams"}
     itm = load_vehicle("itm").model_dump(mode="json", exclude_none=True)
-    for key, value in itertools.product(Vehicle.model_fields, VALUES):
-        found.append(
-            (
-                f"vehicle {key}",
-                ["check-vehicle", "v.yaml", "-n", "1"],
-                {"v.yaml": _yaml({**itm, key: value})},
-            )
-        )
-    evaluate = ["evaluate", *BASES["evaluate"].split()]
-    for key, value in itertools.product(Scenario.model_fields, VALUES):
-        scenario = {**SUITE["scenarios"][0], key: value}
-        found.append(
-            (f"scenario {key}", evaluate, {"suite.yaml": _yaml({**SUITE, "scenarios": [scenario]})})
-        )
-    return found
+    for value in VALUES:
+        for key in sorted(settings):
+            yield key, train, {"settings.yml": _yaml({ENV: {**SETTINGS, key: value}})}
+        for key in Task.model_fields:
+            changed = {**SETTINGS, "env_kwargs": {"task_kwargs": {key: value}}}
+            yield f"task {key}", train, {"settings.yml": _yaml({ENV: changed})}
+        for key in Vehicle.model_fields:
+            command = ["check-vehicle", "v.yaml", "-n", "1"]
+            yield f"vehicle {key}", command, {"v.yaml": _yaml({**itm, key: value})}
+        for key in Scenario.model_fields:
+            suite = {"name": "one", "scenarios": [{**SUITE["scenarios"][0], key: value}]}
+            command = ["evaluate", *BASES["evaluate"].split()]
+            yield f"scenario {key}", command, {"suite.yaml": _yaml(suite)}
 
 
 def _yaml(content: Any) -> str:
@@ -151,7 +138,7 @@ def attempt(case: Case, folder: Path) -> str:
 def campaign(folder: Path, count: int | None, seed: int) -> int:
     """How many cases end as none should."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    chosen = cases()
+    chosen = [*arguments(), *keys()]
     if count is not None:
         chosen = random.Random(seed).sample(chosen, count)
     failed = 0

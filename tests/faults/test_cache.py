@@ -23,8 +23,11 @@ def test_a_read_only_installation_without_a_home_says_that_it_compiles_at_every_
     """Its folders for compiled code cannot be made, for the superuser either: plain files have
     their names.
     """
-    for name in ("sb3_quad", "envs", "callbacks", "zoo_configs"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    # As installed: the checkout's finder would give its own otherwise.
+    places = {"sb3_quad": "sb3_quad"}
+    places |= {name: f"sb3_quad/{name}" for name in ("envs", "callbacks", "zoo_configs")}
+    for name, place in places.items():
+        shutil.copytree(ROOT / name, tmp_path / place, ignore=shutil.ignore_patterns("__pycache__"))
     for package in [path.parent for path in tmp_path.rglob("__init__.py")]:
         (package / "__pycache__").write_text("")
 
@@ -48,12 +51,8 @@ def test_a_read_only_installation_without_a_home_says_that_it_compiles_at_every_
         return done.stdout, done.stderr.splitlines()
 
     result, said = started()
-    assert (
-        result == "(1.0, 0.0, 0.0) 0\n"
-        and len(said) == 1
-        and "cannot be cached" in said[0]
-        and "NUMBA_CACHE_DIR" in said[0]
-    )
+    assert result == "(1.0, 0.0, 0.0) 0\n"
+    assert len(said) == 1 and "NUMBA_CACHE_DIR" in said[0]
     for hits in (0, 1):
         assert started(NUMBA_CACHE_DIR=str(tmp_path / "better")) == (
             f"(1.0, 0.0, 0.0) {hits}\n",
