@@ -40,7 +40,6 @@ from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.simulation.settings import KEY
-from sb3_quad.envs.vehicles.vehicle import first_vehicle
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flights import fly
@@ -108,8 +107,7 @@ class Configuration(SettingsOptions, RunOptions):
         if agent is not None and not Path(agent).is_file():
             raise ConfigError(f"initial_policy {agent}: no such file")
         for job in stage_jobs(pipeline, options):
-            if job.config.task is not None:
-                first_vehicle(job.flight_settings.vehicle)
+            # This finds an unknown vehicle, too.
             job.config.make_expert()
 
 

@@ -97,7 +97,7 @@ class Objective:
         for name, values in self.space.items():
             with raised_as(ConfigError, f"search space: {name}: give a list, or low, high and log"):
                 value = _suggest(trial, name, values)
-            if str(settings.get(name)).startswith(LINEAR):
+            if isinstance(value, float) and str(settings.get(name)).startswith(LINEAR):
                 value = f"{LINEAR}{value:.4g}"
             put_key(settings, name, value, name)
         return settings
@@ -193,14 +193,19 @@ def open_study(
 
 
 def _start(objective: Objective) -> StrDict:
-    """Return the parameters that stand for the given settings."""
-    start = {}
+    """Return the parameters that stand for the given settings, as far as the space has these."""
+    start: StrDict = {}
     for name, values in objective.space.items():
-        value = str(objective.job.config.settings.get(name))
+        value: Any = _plain(objective.job.config)
+        for key in name.split("."):
+            value = value.get(key) if isinstance(value, dict) else None
+        number = parse_number(str(value).removeprefix(LINEAR))
         if isinstance(values, list):
-            start[name] = value
-        elif value != "None":
-            start[name] = parse_number(value.removeprefix(LINEAR))
+            # Optuna refuses anything else.
+            if value in values:
+                start[name] = str(value)
+        elif isinstance(number, (int, float)):
+            start[name] = number
     return start
 
 

@@ -1,4 +1,4 @@
-r"""Search for hyperparameters by Optuna, and write the best ones as a settings file.
+r"""Search for hyperparameters by Optuna; the best become a settings file.
 
 Each trial trains an agent with other settings. The first one uses the settings
 unchanged.
@@ -10,8 +10,8 @@ examples:
   sb3-quad tune --algo ppo_bc --env QuadStateRecovery-v0 \
     -i logs/dagger/QuadTargetTracking-v0_1/best_model.zip -n 3e6
   # random search without a pruner
-  sb3-quad tune --algo ppo --env QuadStateRecovery-v0 --sampler RandomSampler \
-    --pruner NopPruner --seed 1
+  sb3-quad tune --algo ppo --env QuadStateRecovery-v0 \
+    --sampler RandomSampler --pruner NopPruner --seed 1
   # the same command again, or in another terminal, continues the study
   sb3-quad tune --algo dagger --storage sqlite:///study.db
   # your own search space
