@@ -16,7 +16,7 @@ from sb3_quad import DAgger, GeometricExpert, QuadcopterVecEnv, fly
 class FewerCrashes(BaseCallback):
     """Log the share of the episodes that ended on the ground, and let the expert fly that share."""
 
-    def _on_rollout_start(self) -> None:
+    def _on_training_start(self) -> None:
         self.episodes = 0
         self.crashes = 0
 
@@ -29,13 +29,15 @@ class FewerCrashes(BaseCallback):
         return True  # False would end the training
 
     def _on_rollout_end(self) -> None:
-        if self.episodes:
+        # A share of fewer episodes would be noise.
+        if self.episodes >= 100:
             rate = self.crashes / self.episodes
             self.logger.record("my/crash_rate", rate)
             assert isinstance(self.model, DAgger)
             # It counts from the next rollout on.
             self.model.set_beta(rate)
             print(f"{self.num_timesteps:>9,} timesteps: {rate:.0%} of {self.episodes} crashed")
+            self._on_training_start()
 
 
 parser = argparse.ArgumentParser(
