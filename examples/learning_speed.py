@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import APG, QuadcopterVecEnv, fly
 from sb3_quad.base.seeds import seed_for
@@ -128,7 +129,8 @@ def train_from_nothing(seed: int, limit: float, rows: list[tuple[Any, ...]]) -> 
     """Train only by the model's gradient, on windows of a second that continue their flights."""
     tasks = {"state_recovery": 0.6, "target_tracking": 0.4}
     env = QuadcopterVecEnv(256, task=tasks, seed=seed_for("training", seed))
-    model = APG("MlpPolicy", env, n_steps=100, continue_flights=True, seed=seed)
+    rate = LinearSchedule(4e-3, 8e-5, 1.0)
+    model = APG("MlpPolicy", env, n_steps=100, continue_flights=True, learning_rate=rate, seed=seed)
     evaluations = Evaluations(FROM_NOTHING, seed, 0.0, limit, rows)
     model.learn(256 * 100 * 1500, evaluations)
     evaluations.evaluate()
