@@ -11,6 +11,7 @@ import argparse
 from functools import partial
 
 import numpy as np
+from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -22,12 +23,14 @@ N_EPISODES = 100
 
 
 def swing_up(observations, limit=2.0):
-    """Add the energy that is missing to swing up, then balance; torques in N m, (n, 1)."""
+    """Add the energy that is missing to swing up, then balance; torques by their limit of 2 N m,
+    (n, 1).
+    """
     cosine, sine, rate = observations.T
     missing = 15.0 * (1.0 - cosine) - 0.5 * rate**2
     hold = -10.0 * np.arctan2(sine, cosine) - 2.0 * rate
     torque = np.where(cosine > 0.9, hold, 2.0 * np.sign(rate * missing))
-    return torque[:, None].clip(-limit, limit)
+    return torque[:, None].clip(-limit, limit) / 2.0
 
 
 class Flown:
@@ -43,12 +46,20 @@ class Flown:
 
 def make_env(seed):
     """Make 16 pendulums."""
-    return make_vec_env("Pendulum-v1", 16, seed=seed)
+    return make_pendulums(16, seed)
+
+
+def make_pendulums(n, seed):
+    """Make n pendulums with actions in [-1, 1], as cloning asks for."""
+    unit = {"min_action": np.float32(-1.0), "max_action": np.float32(1.0)}
+    return make_vec_env(
+        "Pendulum-v1", n, seed=seed, wrapper_class=RescaleAction, wrapper_kwargs=unit
+    )
 
 
 def report(name, controller):
     """Print the mean reward of fresh episodes, the same for all."""
-    env = make_vec_env("Pendulum-v1", N_EPISODES, seed=1_000_000)
+    env = make_pendulums(N_EPISODES, 1_000_000)
     rewards, _ = evaluate_policy(controller, env, N_EPISODES, return_episode_rewards=True)
     print(f"{name}: mean reward {np.mean(rewards):.1f}, worst {np.min(rewards):.0f}", flush=True)
 
@@ -101,6 +112,7 @@ settings = {
     "gamma": 0.95,
     "gae_lambda": 0.95,
     "learning_rate": LinearSchedule(1e-3, 5e-5, 1.0),
+    "policy_kwargs": {"log_std_init": -0.9},
     "seed": seed,
     "device": "cpu",
 }

@@ -35,7 +35,14 @@ arguments = parser.parse_args()
 # A mixture of recoveries and targets up to 25 m away, with a reward that is steep near the target
 thrown = QuadcopterVecEnv(480, task="thesis_recovery", seed=0)
 model = PPOBC(
-    "MlpPolicy", thrown, expert="pid", initial_policy=arguments.agent, seed=0, device="cpu"
+    "MlpPolicy",
+    thrown,
+    expert="pid",
+    initial_policy=arguments.agent,
+    # The imitation has learnt to act without noise; PPO has to explore.
+    policy_kwargs={"log_std_init": -0.916},
+    seed=0,
+    device="cpu",
 )
 
 # A rollout, at least
