@@ -195,7 +195,7 @@ def _restore(
     batch = _batch(env)
     # The model comes first, since the other expected arrays depend on it.
     _check(state, {"model": NO_BYTES})
-    model = load_zip(
+    model: Algorithm = load_zip(
         algorithm,
         io.BytesIO(state["model"].tobytes()),
         where="model",

@@ -161,7 +161,7 @@ def fly_all(
             own = settings.with_changes(**setting.own.get(name, {}))
             recording = Recording(name, colours[name])
             try:
-                recording.results = fly_settings(
+                recording.flights = fly_settings(
                     controller,
                     own,
                     [seed],

@@ -28,8 +28,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_quad.agents.agent_settings import env_kwargs
 from sb3_quad.agents.pretrained import agent_path
-from sb3_quad.agents.statistics import STATISTICS, share_statistics
 from sb3_quad.agents.zips import load_model
+from sb3_quad.algorithms.statistics import STATISTICS, share_statistics
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import import_packages, require
