@@ -16,6 +16,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 from sb3_quad.algorithms.apg import APG
+from sb3_quad.algorithms.networks import network_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.flight_cost import FlownStates, flight_cost
@@ -26,7 +27,7 @@ from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
 from sb3_quad.envs.simulation.tape import FlightTape
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
-from sb3_quad.fast.policy import Perceptrons, RecordedPolicy, network_of
+from sb3_quad.fast.policy import Perceptrons
 
 # What each quantity of the state varies by, so that the parts of a cost weigh about the same.
 SCALE = np.concatenate([np.ones(13), np.full(4, 100.0)])
@@ -418,10 +419,11 @@ def test_a_gradient_goes_through_a_policy_as_by_autograd(
 ):
     th.manual_seed(seed)
     policy = new_policy(inputs, outputs, widths, activation)
-    is_compiled = isinstance(network_of(policy), Perceptrons)
+    network = network_of(policy)
+    is_compiled = isinstance(network, Perceptrons)
     assert is_compiled == (activation is not nn.ELU or not widths)
     twin = deepcopy(policy)
-    recorded = RecordedPolicy(policy, calls, rows)
+    recorded = network.recorded(calls, rows)
     observed, given = th.randn(calls, rows, inputs), th.randn(calls, rows, outputs).double()
     for step in range(calls):
         actions = recorded.forward(step, observed[step].numpy())

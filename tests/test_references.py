@@ -17,6 +17,7 @@ from sb3_quad.envs.simulation.motions import read_points
 from sb3_quad.envs.simulation.references import Reference
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import QUATERNION, REFERENCE, STATE_SIZE, QuadcopterState
+from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
@@ -51,16 +52,19 @@ def watched(table, delay=0, aside=0.0, turned=0.0, flying=True):
     """Return the errors of a flight that is ``delay`` control steps late on the path of a table,
     ``aside`` m above it, its heading ``turned`` rad away.
     """
-    following = Following(1, DT)
+    following = Following(True)
+    itm = load_vehicle("itm")
     for step in range(delay, len(table)):
         array = np.zeros((STATE_SIZE, 1))
         array[:3, 0] = table[step - delay, :3] + (0.0, 0.0, aside)
         half = 0.5 * (math.atan2(table[step, 10], table[step, 9]) + turned)
         array[QUATERNION, 0] = math.cos(half), 0.0, 0.0, math.sin(half)
         array[REFERENCE, 0] = table[step]
-        following.update(step, QuadcopterState(array), np.array([flying]))
-    errors = following.errors(np.array([flying]))
-    return {name: float(values[0]) for name, values in errors.items()}
+        state = QuadcopterState(array)
+        if step == delay:
+            following.on_start(state, itm)
+        following.after_step(step, state, np.zeros((1, 4)), np.array([flying]))
+    return {name: float(values[0]) for name, values in following.results().items()}
 
 
 # Metrics
@@ -233,7 +237,7 @@ def test_a_heading_of_zero_at_rest_changes_no_bit_of_the_observation(reference):
 
 def test_a_scenario_moves_its_own_target():
     flown = scenario(
-        "target: [5, 0, 15], reference: {curve: circle, speed: 3}, duration: 3, episodes: 2"
+        "target: [5, 0, 15], reference: {curve: circle, speed: 3}, duration: 3, n_episodes: 2"
     )
     recorder = Recorder(2)
     flights = fly_scenario(GeometricExpert(), flown, "batch", [recorder])
@@ -245,7 +249,10 @@ def test_a_scenario_moves_its_own_target():
 
 
 def test_both_backends_measure_the_same():
-    flown = scenario("reference: {curve: lissajous, heading: path}, duration: 3, episodes: 2")
+    flown = scenario(
+        "task_kwargs: {target_distance: 0}, n_episodes: 2, duration: 3,"
+        "reference: {curve: lissajous, heading: path}"
+    )
     batch = fly_scenario(GeometricExpert(), flown)
     pybullet = fly_scenario(GeometricExpert(), flown, "pybullet")
     for name in FOLLOWED:
@@ -255,7 +262,7 @@ def test_both_backends_measure_the_same():
 def test_files_of_a_reference_lie_beside_the_suite(csv, tmp_path):
     suite = tmp_path / "mine.yaml"
     suite.write_text("name: x\nscenarios: [{name: a, reference: path.csv}]")
-    flown = load_suite(suite).with_changes(episodes=1).scenarios[0]
+    (flown,) = load_suite(suite).scenarios
     assert str(flown.reference.file) == csv
 
 

@@ -18,7 +18,7 @@ from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.agents.zips import load_model
-from sb3_quad.algorithms.controller import Controller
+from sb3_quad.algorithms.labelling import Labeller
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.callbacks import BestModel
@@ -121,7 +121,7 @@ def test_statistics_go_on_where_an_interrupted_run_left_them(tmp_path, algo, mon
 @pytest.fixture
 def zoo_agent(tmp_path):
     """A zip with its statistics next to it, as rl_zoo3 leaves them; and its labels."""
-    env = VecNormalize(make_vec_env("Pendulum-v1", 4, seed=0), clip_obs=1.0)
+    env = VecNormalize(make_vec_env("UnitPendulum-v0", 4, seed=0), clip_obs=1.0)
     model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, seed=0, device="cpu")
     model.learn(256)
     folder = tmp_path / "ppo" / "Pendulum-v1_1"
@@ -131,7 +131,7 @@ def zoo_agent(tmp_path):
     (folder / "Pendulum-v1" / "config.yml").write_text("normalize: true\n")
 
     def labels(observation):
-        return model.predict(env.normalize_obs(observation), deterministic=True)[0].clip(-2, 2)
+        return model.predict(env.normalize_obs(observation), deterministic=True)[0].clip(-1, 1)
 
     return folder / "Pendulum-v1.zip", labels
 
@@ -139,9 +139,9 @@ def zoo_agent(tmp_path):
 @pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize])
 def test_an_agent_with_statistics_labels_as_it_flies(zoo_agent, wrap):
     path, labels = zoo_agent
-    plain = make_vec_env("Pendulum-v1", 3, seed=1)
+    plain = make_vec_env("UnitPendulum-v0", 3, seed=1)
     env = wrap(plain)
-    labeller = Controller.for_env(str(path), env)
+    labeller = Labeller(str(path), env)
     observation = env.reset()
     for _ in range(5):
         raw = env.get_original_obs() if isinstance(env, VecNormalize) else observation
@@ -150,13 +150,13 @@ def test_an_agent_with_statistics_labels_as_it_flies(zoo_agent, wrap):
 
 
 def test_an_agent_without_statistics_sees_raw_observations_behind_them(tmp_path):
-    PPO("MlpPolicy", "Pendulum-v1", seed=0, device="cpu").save(tmp_path / "raw.zip")
-    env = VecNormalize(make_vec_env("Pendulum-v1", 3, seed=1))
-    labeller = Controller.for_env(tmp_path / "raw.zip", env)
+    PPO("MlpPolicy", "UnitPendulum-v0", seed=0, device="cpu").save(tmp_path / "raw.zip")
+    env = VecNormalize(make_vec_env("UnitPendulum-v0", 3, seed=1))
+    labeller = Labeller(tmp_path / "raw.zip", env)
     observation = env.reset()
     raw = env.get_original_obs()
     expected, _ = load_model(tmp_path / "raw.zip").predict(raw, deterministic=True)
-    np.testing.assert_array_equal(labeller.labels(observation), expected.clip(-2, 2))
+    np.testing.assert_array_equal(labeller.labels(observation), expected.clip(-1, 1))
 
 
 def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp_path, monkeypatch):
@@ -164,7 +164,7 @@ def test_statistics_that_are_missing_or_no_statistics_are_refused(zoo_agent, tmp
     file = path.parent / "Pendulum-v1" / "vecnormalize.pkl"
     file.write_bytes(pickle.dumps(np.zeros(3)))
     with pytest.raises(ConfigError, match=r"vecnormalize\.pkl: holds no VecNormalize"):
-        DAgger("MlpPolicy", "Pendulum-v1", expert=str(path)).learn(1)
+        DAgger("MlpPolicy", "UnitPendulum-v0", expert=str(path)).learn(1)
     file.write_bytes(pickle.dumps(Path(tmp_path)))
     with pytest.raises(ConfigError, match=r"pathlib.*may run anything"):
         resolve_expert(path)
@@ -200,7 +200,7 @@ def test_an_agent_goes_on_with_its_statistics_or_is_refused(run, tmp_path):
 
 
 def test_dagger_keeps_raw_rows_and_normalises_them_by_the_present_statistics(monkeypatch, tmp_path):
-    env: Any = VecNormalize(make_vec_env("Pendulum-v1", 4, seed=0))
+    env: Any = VecNormalize(make_vec_env("UnitPendulum-v0", 4, seed=0))
     learnt_from = []
     gradients = Perceptrons.gradients
 
@@ -313,15 +313,15 @@ def test_a_pipeline_whose_stages_do_not_fit_is_refused_before_the_first(tmp_path
 
 
 def test_an_expert_that_is_a_function_sees_raw_observations():
-    env = VecNormalize(make_vec_env("Pendulum-v1", 3, seed=1))
+    env = VecNormalize(make_vec_env("UnitPendulum-v0", 3, seed=1))
     seen = []
 
     def swing_back(observation):
         seen.append(observation.copy())
         return -0.5 * observation[:, 2:3]
 
-    labeller = Controller.for_env(swing_back, env)
+    labeller = Labeller(swing_back, env)
     labeller.labels(env.reset())
     np.testing.assert_array_equal(seen[-1], env.get_original_obs())
     with pytest.raises(ExpertError, match="make VecNormalize the outermost wrapper"):
-        Controller.for_env(swing_back, VecFrameStack(env, 2))
+        Labeller(swing_back, VecFrameStack(env, 2))
