@@ -94,7 +94,12 @@ def pytest_sessionstart(session):
     if not is_worker and not session.config.option.collectonly:
         # Workers would all compile the same code, and on a slow machine the first test of each
         # would take longer than a test may.
-        compile_all = "from sb3_quad import QuadcopterVecEnv; QuadcopterVecEnv(1)"
+        compile_all = (
+            "from sb3_quad import APG, DAgger, QuadcopterVecEnv\n"
+            "env = QuadcopterVecEnv(1)\n"
+            "DAgger('MlpPolicy', env, expert='geometric', n_steps=2).learn(2)\n"
+            "APG('MlpPolicy', env, n_steps=2).learn(2)\n"
+        )
         subprocess.run([sys.executable, "-c", compile_all], check=True)
 
 

@@ -1,8 +1,5 @@
 """APG: it learns, its zips are stock, it resumes, and what it cannot differentiate is refused."""
 
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +17,6 @@ from sb3_quad.envs.flight_cost import flight_cost
 from sb3_quad.envs.simulation.random import STEP
 
 TASKS = {"state_recovery": 0.5, "target_tracking": 0.5}
-EXAMPLE = Path(__file__).resolve().parent.parent / "examples/gradient_of_your_environment.py"
 
 
 def weights(model):
@@ -198,13 +194,6 @@ def test_a_gradient_that_is_not_finite_leaves_the_weights_alone():
     with pytest.raises(TrainingError, match="not finite"):
         agent.learn(20)
     assert all(th.equal(a, b) for a, b in zip(before, weights(agent), strict=True))
-
-
-def test_the_protocol_serves_an_environment_in_pytorch():
-    command = [sys.executable, str(EXAMPLE), "--updates", "60"]
-    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    before, after = (float(line.split("cost ")[1].split(",")[0]) for line in lines)
-    assert after < 0.5 * before
 
 
 @pytest.mark.parametrize(
