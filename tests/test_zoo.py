@@ -56,7 +56,7 @@ def test_the_flags_that_the_page_calls_the_same_are_there(command):
     parser = argparse.ArgumentParser()
     add_flags(parser, COMMANDS[command].FLAGS)
     flags = re.findall(r"`(--[\w-]+)`", line)
-    assert len(flags) > 10
+    assert flags
     assert {*flags} <= parser._option_string_actions.keys()
 
 
@@ -231,22 +231,7 @@ def test_it_shows_its_runs_and_ours(session, which):
 @with_zoo
 def test_ours_shows_its_runs(session, capsys):
     folder, _ = session
-    assert (
-        main(
-            [
-                "enjoy",
-                "--algo",
-                "dagger",
-                "--env",
-                ENV,
-                "-f",
-                str(folder / "logs"),
-                "--no-render",
-                "--load-best",
-            ]
-        )
-        == 0
-    )
+    assert main(["enjoy", str(folder / "logs" / "dagger" / f"{ENV}_1"), "--no-render"]) == 0
     assert "after 0.20 s" in capsys.readouterr().out
 
 

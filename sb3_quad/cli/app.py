@@ -28,8 +28,8 @@ EPILOG = """examples:
   # compare an agent and an expert in one table
   sb3-quad evaluate pid agent.zip --suite quick
   # watch the agent's flights in a window, or as a film
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -o film.mp4
+  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1
+  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1 -o film.mp4
   # make a page where anyone can throw the quadcopter
   sb3-quad demo
   # show all options of a command, with examples

@@ -28,8 +28,20 @@ SHORT_FLAGS = {
     "progress": "-P",
 }
 """rl-zoo's short names of some flags."""
-# Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
-SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
+_RUN = "name the folder of the run, or a zip in it"
+ELSEWHERE = {
+    "-optimize": "the command sb3-quad tune does that",
+    "--optimize-hyperparameters": "the command sb3-quad tune does that",
+    "--trained-agent": "the flag is --initial-policy",
+    "--algo": _RUN,
+    "--env": "an agent knows its task; --task or --scenario chooses another",
+    "--exp-id": _RUN,
+    "--folder": _RUN,
+    "--load-best": _RUN,
+    "--load-checkpoint": _RUN,
+    "--load-last-checkpoint": _RUN,
+}
+"""What does the part of a flag of rl_zoo3, for the error message."""
 
 
 class Parser(ArgumentParser):
@@ -64,8 +76,8 @@ class Parser(ArgumentParser):
     def _advice(self, option: str) -> str:
         """Say what the user may want instead of an unknown option."""
         valid = self._option_string_actions
-        if option in SEARCH_FLAGS:
-            return "the command sb3-quad tune does that"
+        if option in ELSEWHERE:
+            return ELSEWHERE[option]
         guess = did_you_mean(option, valid)
         if guess:
             return guess.strip()
