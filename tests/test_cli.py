@@ -138,7 +138,6 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys, monkeypatc
         "0.monitor.csv",
         f"{ENV}/config.yml",
         f"{ENV}/args.yml",
-        f"{ENV}/command.txt",
     }
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == 1200
     assert yaml.safe_load((run / ENV / "args.yml").read_text())["seed"] == 3
@@ -149,7 +148,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys, monkeypatc
     # The commands at the end can be pasted.
     lines = output.split("next:\n")[1].splitlines()
     assert len(lines) == 4
-    for line, more in zip(lines, ([], [], ["--episodes", "2", "--no-report"], []), strict=True):
+    for line, more in zip(lines, ([], [], ["-n", "2", "--no-report"], []), strict=True):
         words = shlex.split(line)
         arguments = words[next(k for k, word in enumerate(words) if word in COMMANDS) :]
         assert main([*arguments, *more]) == 0
@@ -412,7 +411,7 @@ def test_a_run_clones_the_flights_of_a_file_and_resumes_with_them(tmp_path):
 def test_closed_streams_cost_nothing(tmp_path, monkeypatch):
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
-    arguments = "evaluate pid --suite quick --scenario tracking --episodes 2 --no-report -o"
+    arguments = "evaluate pid --suite quick --scenario tracking -n 2 --no-report -o"
     assert main([*arguments.split(), str(tmp_path)]) == 0
     assert (tmp_path / "results.json").is_file()
 

@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrMapping
 
@@ -147,23 +147,9 @@ def explain(error: ValidationError) -> str:
         # The user knows the keys, and not the names of the alternatives of a union.
         parts = [str(part) for part in item["loc"]]
         key = ".".join(part for part in parts if not _ALTERNATIVE.fullmatch(part))
-        text = _message(item)
+        text = str(item["msg"]).removeprefix("Value error, ")
         if not text.startswith(key):
             text = f"{key}: {text}"
         # Each alternative of a union has its own errors. Only those of the first one are shown.
         lines.setdefault(key, text)
     return "; ".join(lines.values())
-
-
-def _message(item: StrMapping) -> str:
-    value = item["input"]
-    if str(item["type"]).startswith(("float_", "int_")) and isinstance(value, str):
-        return f"{value!r} must be a plain number, without a unit"
-    if item["type"] == "missing":
-        return "is missing"
-    message = str(item["msg"]).removeprefix("Value error, ")
-    if item["type"] == "literal_error":
-        # pydantic lists the valid values in quotes.
-        guess = did_you_mean(value, re.findall("'([^']+)'", item["ctx"]["expected"]))
-        message = f"{message}; {guess}".rstrip("; ")
-    return message

@@ -10,10 +10,10 @@ from argparse import (
     Namespace,
     RawDescriptionHelpFormatter,
 )
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import Annotated, Any, ClassVar, NoReturn, TypeAlias
 
-from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import BaseModel
 
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
@@ -120,37 +120,21 @@ SWITCH = {"action": "store_true"}
 SEVERAL = {"nargs": "+"}
 
 
-def _checked(kind: Any, text: str) -> Any:
-    """Return the number in a text, such as ``1e6``, as one of the type ``kind``."""
-    try:
-        return check(kind, parse_number(text), "it")
-    except ConfigError as error:
-        raise ArgumentTypeError(str(error)) from None
+def typed(kind: Any) -> Callable[[str], Any]:
+    """Return a function that reads a text such as ``1e6`` as a pydantic type."""
 
+    def read(text: str) -> Any:
+        try:
+            return check(kind, parse_number(text), "it")
+        except ConfigError as error:
+            raise ArgumentTypeError(str(error)) from None
 
-def whole(text: str) -> Any:
-    """Return a whole number."""
-    return _checked(Annotated[int, Field(gt=-(2**63), lt=2**63)], text)
-
-
-def natural(text: str) -> Any:
-    """Return a whole number of at least 0."""
-    return _checked(NonNegativeInt, text)
-
-
-def positive(text: str) -> Any:
-    """Return a whole number of at least 1."""
-    return _checked(PositiveInt, text)
-
-
-def above_zero(text: str) -> Any:
-    """Return a finite number above 0."""
-    return _checked(PositiveFloat, text)
+    return read
 
 
 def seed(text: str) -> int:
     """Return a whole number of at least 0, a random one for a negative number."""
-    number: int = whole(text)
+    number: int = typed(int)(text)
     if number < 0:
         number = random.SystemRandom().randrange(2**31)
     return number
@@ -162,9 +146,9 @@ KINDS = {bool: SWITCH, StrDict: PAIRS, str: str}
 Others are numbers, which the field's model checks.
 """
 Flags: TypeAlias = "Mapping[str, str | tuple[Any, ...] | Flags]"
-"""A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
-default if there is one, and the help; the help alone for a text without a default. A table in it
-holds flags that exclude each other.
+"""A table of arguments by names and metavar: the type (of pydantic, a function, or keywords of
+``add_argument``), the default if there is one, and the help; the help alone for a text without a
+default. A table in it holds flags that exclude each other.
 """
 
 
@@ -175,6 +159,8 @@ def add_flags(parser: Any, flags: Flags) -> None:
             add_flags(parser.add_mutually_exclusive_group(), entry)
             continue
         kind, *default, text = (str, entry) if isinstance(entry, str) else entry
+        if typing.get_origin(kind) is Annotated:
+            kind = typed(kind)
         arguments = kind if isinstance(kind, dict) else {"type": kind}
         names = words.split()
         if len(names) > 1 and not names[-1].startswith("-"):

@@ -2,7 +2,6 @@
 
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import stable_baselines3
@@ -12,7 +11,7 @@ from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.agents.zips import saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import make_folder, remove_half_written, write_text
+from sb3_quad.base.files import make_folder, remove_half_written
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml, write_yaml
 
@@ -47,8 +46,6 @@ class RunFolder:
         self.config = path / name / "config.yml"
         # The options; its env_kwargs are those of the evaluations.
         self.arguments = path / name / "args.yml"
-        # The command that was typed.
-        self.command = path / name / "command.txt"
 
     @property
     def result(self) -> Path:
@@ -67,22 +64,13 @@ class RunFolder:
             return 0
         return int(saved_data(self.model)["num_timesteps"])
 
-    def checkpoint(self, timesteps: int | str) -> Path:
-        """Return the path of the model after ``timesteps``."""
-        return self.path / f"rl_model_{timesteps}_steps.zip"
-
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
-        """Write config.yml, command.txt and args.yml.
+        """Write config.yml and args.yml.
 
         args.yml comes last, so that a run with it is complete.
         """
         self.config.parent.mkdir(exist_ok=True)
         write_yaml(self.config, settings)
-        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-        # A user's program may train, too.
-        if not command.startswith("sb3-quad"):
-            command = f"python {command}".replace("python __main__.py", "sb3-quad")
-        write_text(self.command, f"{command}\n")
         write_yaml(self.arguments, arguments)
 
     def read_yaml(self) -> tuple[StrDict, StrDict]:

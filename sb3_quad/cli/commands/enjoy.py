@@ -31,6 +31,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing
 from sb3_quad.base.types import StrDict
@@ -41,10 +43,7 @@ from sb3_quad.cli.parser import (
     SWITCH,
     TRUST,
     Flags,
-    above_zero,
     given,
-    natural,
-    positive,
 )
 
 # Width and height of the only panel, and of one of several, pixels.
@@ -72,11 +71,11 @@ FLAGS: Flags = {
         "controllers to fly, as described below",
     ),
     "-n --n-timesteps N": (
-        positive,
+        PositiveInt,
         "control steps, in as many episodes as needed (one episode)",
     ),
     "--stochastic": (SWITCH, "sample a policy's actions instead of flying their mean"),
-    "--seed N": (natural, 0, "seed of the first episode; later ones count up (0)"),
+    "--seed N": (NonNegativeInt, 0, "seed of the first episode; later ones count up (0)"),
     "--env-kwargs": (
         PAIRS,
         {},
@@ -86,7 +85,7 @@ FLAGS: Flags = {
     "--no-render": (SWITCH, "only fly and print the results"),
     "-o --output FILE": "write a film of all episodes (.mp4, .webp or .gif)",
     "--size WxH": (_size, "size of one controller's panel, pixels"),
-    "--speed X": (above_zero, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
+    "--speed X": (PositiveFloat, 1.0, "playback speed of film and window; 0.5 is slow motion (1)"),
     **TRUST,
     **OVERWRITE,
 }
