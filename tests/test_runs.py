@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -22,19 +21,6 @@ def test_runs_are_numbered_and_never_reused(tmp_path):
     (tmp_path / "dagger" / f"{ENV}_notes").mkdir()
     assert claim_run(tmp_path, "dagger", ENV).path.name == f"{ENV}_8"
     assert claim_run(tmp_path, "ppo", ENV).path.name == f"{ENV}_1"
-
-
-def test_a_run_that_never_began_keeps_no_half_written_file(tmp_path):
-    for number, age in ((1, 60), (2, 0), (3, 60)):
-        run = claim_run(tmp_path, "dagger", "Env-v0")
-        run.config.parent.mkdir()
-        half = run.config.with_name(f".config.yml.{number}.tmp")
-        half.write_text("n_times")
-        os.utime(half, (time.time() - age,) * 2)
-    run.arguments.write_text("algo: dagger")
-    claim_run(tmp_path, "dagger", "Env-v0")
-    # The second may be about to begin, the third has begun and cleans up when it goes on.
-    assert sorted(path.name[-6:] for path in tmp_path.rglob(".*.tmp")) == [".2.tmp", ".3.tmp"]
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ from argparse import (
     Namespace,
     RawDescriptionHelpFormatter,
 )
-from collections.abc import Callable, Container, Mapping
-from typing import Annotated, Any, ClassVar, NoReturn, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn, TypeAlias
 
 from pydantic import BaseModel
 
@@ -47,9 +47,6 @@ ELSEWHERE = {
 class Parser(ArgumentParser):
     """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
 
-    siblings: ClassVar[dict[str, Container[str]]] = {}
-    """The options of each command."""
-
     def __init__(self, **kwargs: Any) -> None:
         # This formatter keeps the line breaks of examples.
         super().__init__(allow_abbrev=False, formatter_class=RawDescriptionHelpFormatter, **kwargs)
@@ -81,9 +78,6 @@ class Parser(ArgumentParser):
         guess = did_you_mean(option, valid)
         if guess:
             return guess.strip()
-        commands = [f"sb3-quad {name}" for name, known in self.siblings.items() if option in known]
-        if commands:
-            return f"it belongs to {' and '.join(commands)}"
         if "--hyperparams" in valid and option.startswith("--"):
             return (
                 "hyperparameters are given as --hyperparams KEY:VALUE, "
@@ -159,7 +153,8 @@ def add_flags(parser: Any, flags: Flags) -> None:
             add_flags(parser.add_mutually_exclusive_group(), entry)
             continue
         kind, *default, text = (str, entry) if isinstance(entry, str) else entry
-        if typing.get_origin(kind) is Annotated:
+        # A type of pydantic, such as PositiveInt
+        if hasattr(kind, "__metadata__"):
             kind = typed(kind)
         arguments = kind if isinstance(kind, dict) else {"type": kind}
         names = words.split()

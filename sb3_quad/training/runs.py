@@ -11,7 +11,7 @@ from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.agents.zips import saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import make_folder, remove_half_written
+from sb3_quad.base.files import make_folder
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml, write_yaml
 
@@ -127,11 +127,6 @@ def claim_folder(parent: Path, name: str) -> Path:
     """
     make_folder(parent, "log folder", "-f")
     folders = _numbered(parent, name)
-    # A run that was killed before it had settings is abandoned, but another may be about to get
-    # some.
-    for folder in folders.values():
-        if not any(folder.glob("*/args.yml")):
-            remove_half_written(folder, seconds=3.0)
     # Numbers of removed runs before the last one are not reused.
     number = max(folders, default=0) + 1
     while True:
