@@ -138,6 +138,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys, monkeypatc
         "0.monitor.csv",
         f"{ENV}/config.yml",
         f"{ENV}/args.yml",
+        f"{ENV}/command.txt",
     }
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == 1200
     assert yaml.safe_load((run / ENV / "args.yml").read_text())["seed"] == 3

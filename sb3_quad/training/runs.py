@@ -2,6 +2,7 @@
 
 import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 import stable_baselines3
@@ -11,7 +12,7 @@ from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.agents.zips import saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import make_folder
+from sb3_quad.base.files import make_folder, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml, write_yaml
 
@@ -46,6 +47,8 @@ class RunFolder:
         self.config = path / name / "config.yml"
         # The options; its env_kwargs are those of the evaluations.
         self.arguments = path / name / "args.yml"
+        # The command that was typed, for the card of a published agent.
+        self.command = path / name / "command.txt"
 
     @property
     def result(self) -> Path:
@@ -65,12 +68,13 @@ class RunFolder:
         return int(saved_data(self.model)["num_timesteps"])
 
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
-        """Write config.yml and args.yml.
+        """Write config.yml, command.txt and args.yml.
 
         args.yml comes last, so that a run with it is complete.
         """
         self.config.parent.mkdir(exist_ok=True)
         write_yaml(self.config, settings)
+        write_text(self.command, f"{shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}\n")
         write_yaml(self.arguments, arguments)
 
     def read_yaml(self) -> tuple[StrDict, StrDict]:
