@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from pydantic import PositiveInt
 from stable_baselines3 import PPO
 
 from sb3_quad.agents.agent_settings import agent_settings
@@ -33,7 +34,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli import app
-from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags, positive
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags
 from sb3_quad.envs.simulation.frames import ObservationSettings
 from sb3_quad.envs.simulation.settings import FlightSettings, in_words
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
@@ -82,7 +83,7 @@ FLAGS: Flags = {
         None,
         "the command that trained it (command.txt of the run)",
     ),
-    "--episodes N": (positive, 960, "episodes of each task (960; recoveries: 4 times as many)"),
+    "--episodes N": (PositiveInt, 960, "episodes of each task (960; recoveries: 4 times as many)"),
     **TRUST,
     **OVERWRITE,
 }

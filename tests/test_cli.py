@@ -149,7 +149,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys, monkeypatc
     # The commands at the end can be pasted.
     lines = output.split("next:\n")[1].splitlines()
     assert len(lines) == 4
-    for line, more in zip(lines, ([], [], ["--episodes", "2", "--no-report"], []), strict=True):
+    for line, more in zip(lines, ([], [], ["-n", "2", "--no-report"], []), strict=True):
         words = shlex.split(line)
         arguments = words[next(k for k, word in enumerate(words) if word in COMMANDS) :]
         assert main([*arguments, *more]) == 0
@@ -412,7 +412,7 @@ def test_a_run_clones_the_flights_of_a_file_and_resumes_with_them(tmp_path):
 def test_closed_streams_cost_nothing(tmp_path, monkeypatch):
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
-    arguments = "evaluate pid --suite quick --scenario tracking --episodes 2 --no-report -o"
+    arguments = "evaluate pid --suite quick --scenario tracking -n 2 --no-report -o"
     assert main([*arguments.split(), str(tmp_path)]) == 0
     assert (tmp_path / "results.json").is_file()
 

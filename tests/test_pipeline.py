@@ -105,7 +105,10 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ({"correct_offset": 1.0, "conf_file": "robust/dagger.yml"}, "correct_offset"),
         ({"correct_offset": "position"}, "correct_offset"),
         ({"correct_offset": 0}, "correct_offset"),
-        ({"env": "Pendulum-v1", "conf_file": "pendulum.yml", "correct_offset": 1}, "Pendulum-v1"),
+        (
+            {"env": "Pendulum-v1", "conf_file": "pendulum.yml", "correct_offset": 1},
+            "correct_offset",
+        ),
         ({"name": "two"}, "name"),
     ],
 )

@@ -37,7 +37,7 @@ def test_tensorboard_has_the_hyperparameters_and_the_evaluations(tmp_path):
 def test_tracking_says_what_it_needs(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert main([*TRAIN, "-f", str(tmp_path / "logs"), "--track"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = capsys.readouterr().err.splitlines()[-1]
     assert "--track" in line and "[track]" in line and not [*tmp_path.iterdir()]
 
 
@@ -46,7 +46,7 @@ def test_weights_and_biases_has_settings_and_evaluations(tmp_path, monkeypatch, 
     wandb = pytest.importorskip("wandb", reason="needs wandb, the extra [track]")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "offline")
-    assert main([*TRAIN, "--track", "--seed", "3"]) == 0
+    assert main([*TRAIN, "--track", "-tb", "runs", "--seed", "3"]) == 0
     assert capsys.readouterr().err.count("eval/mean_reward") == 2  # history and summary
     (events,) = Path("wandb").glob("offline-run-*/files/runs/*/events.*")
     assert hyperparameters(events.parent)["seed"] == 3
@@ -55,5 +55,5 @@ def test_weights_and_biases_has_settings_and_evaluations(tmp_path, monkeypatch, 
         raise wandb.errors.UsageError("no key,\nsee wandb login")
 
     monkeypatch.setattr(wandb, "init", refuse)
-    assert main([*TRAIN, "--track", "-f", "refused"]) == 2
+    assert main([*TRAIN, "--track", "-tb", "runs", "-f", "refused"]) == 2
     assert "--track" in capsys.readouterr().err.splitlines()[-1] and not Path("refused").exists()

@@ -1,6 +1,4 @@
-"""Validation: data becomes a frozen model, or one line says which key is wrong, how, and what it
-means.
-"""
+"""Validation: data becomes a frozen model, or one line says which key is wrong and how."""
 
 from typing import Literal
 
@@ -12,17 +10,17 @@ from sb3_quad.base.validate import Frozen, validate
 
 
 class Rotor(Frozen):
-    thrust: float = Field(description="N")
+    thrust: float
 
 
 class Craft(Frozen):
-    mass: PositiveFloat = Field(description="m, kg")
+    mass: PositiveFloat
     count: int = 4
     length: float | Rotor | None = None
     rotors: tuple[Rotor, ...] = ()
     by_name: dict[str, Rotor] = Field(default_factory=dict)
     saved: Rotor | None = None
-    shape: Literal["cross", "plus"] = Field(default="plus", description="how it\nlooks")
+    shape: Literal["cross", "plus"] = "plus"
     fault: Literal["none", "hover", "expert"] = "none"
     second: Literal["none", "hover", "other"] = "none"
 
@@ -54,7 +52,7 @@ def test_data_become_a_frozen_model():
         ({"mass": 1, "cuont": 4}, "'count'"),  # what may be meant
         ({"mass": 1, "rotors": [{"thrust": 1}, {"thrust": "x"}]}, "rotors.1.thrust"),
         ({"mass": 1, "rotors": [{"thrust": 1, "thurst": 2}]}, "thurst"),
-        ({"mass": 1, "by_name": {"left": {}}}, "by_name.thrust"),
+        ({"mass": 1, "by_name": {"left": {}}}, "by_name.left.thrust"),
         ({"mass": 1, "saved": {}}, "saved.thrust"),
         ({"mass": 1, "length": [1]}, "length"),
         ({"count": "x", "mass": 1}, "count"),

@@ -322,7 +322,7 @@ def flyable(base: Vehicle, changes: StrMapping, where: str) -> Vehicle:
     try:
         return base.model_copy(update=changes)
     except ValidationError as error:
-        reason = explain(error, Vehicle)
+        reason = explain(error)
         raise ConfigError(f"{where}: some vehicles could not fly ({reason})") from None
 
 

@@ -4,7 +4,6 @@ Each message is one line that names the thing and the way out. The command line 
 with code 2.
 """
 
-import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -94,33 +93,12 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
 
 
 def did_you_mean(name: object, valid: Iterable[str]) -> str:
-    """A question with the valid name that ``name`` misspells, or up to three that have its words.
+    """A question with the valid name that ``name`` misspells; empty if none is near.
 
-    Empty if no name is near.
-
-    >>> did_you_mean("tracking", ["far_tracking", "state_recovery", "target_tracking"])
-    "did you mean 'far_tracking' or 'target_tracking'? "
+    >>> did_you_mean("state_recovry", ["state_recovery", "target_tracking"])
+    "did you mean 'state_recovery'? "
     """
-    guesses = " or ".join(map(repr, _guesses(str(name).lower(), sorted(valid))))
+    guesses = get_close_matches(str(name), sorted(valid), n=1, cutoff=0.65)
     if not guesses:
         return ""
-    return f"did you mean {guesses}? "
-
-
-def _guesses(text: str, names: list[str]) -> list[str]:
-    words = _words(text)
-    longer = [name for name in names if words <= _words(name.lower())]
-    if words and 1 <= len(longer) <= 3:
-        return longer
-    by_lower_case = {name.lower(): name for name in names}
-    # Few typos change the first letter. Among all names, difflib finds those of three letters and
-    # any two loss weights, such as bc_coef and vf_coef, too similar, so they need a closer match.
-    initial = text.lstrip("-")[:1]
-    same_initial = [name for name in by_lower_case if name.lstrip("-").startswith(initial)]
-    close = get_close_matches(text, same_initial, n=1, cutoff=0.65)
-    close = close or get_close_matches(text, by_lower_case, n=1, cutoff=0.75)
-    return [by_lower_case[name] for name in close]
-
-
-def _words(text: str) -> set[str]:
-    return set(re.findall(r"[^\W_]+", text))
+    return f"did you mean {guesses[0]!r}? "

@@ -1,7 +1,6 @@
 """Files that appear whole or not at all, with a clear error if a folder cannot be written to."""
 
 import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -83,13 +82,11 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         lock.release()
 
 
-def remove_half_written(folder: Path, seconds: float = 0.0) -> None:
-    """Remove files that a killed process was writing, at least this many seconds ago."""
-    latest = time.time() - seconds
+def remove_half_written(folder: Path) -> None:
+    """Remove files that a killed process was writing."""
     for temporary in folder.rglob(".*.tmp"):
         with suppress(OSError):
-            if temporary.stat().st_mtime <= latest:
-                temporary.unlink()
+            temporary.unlink()
 
 
 def write_text(path: StrPath, text: str) -> None:
@@ -174,8 +171,3 @@ def save_model(model: Any, path: StrPath) -> None:
 def one_line(error: BaseException) -> str:
     """Return the message of an exception as one line of at most 200 characters."""
     return (" ".join(str(error).split()) or type(error).__name__)[:200]
-
-
-def kind_and_line(error: BaseException) -> str:
-    """Return the class of an exception and :func:`one_line`, for errors that may be any."""
-    return f"{type(error).__name__}: {one_line(error)}"

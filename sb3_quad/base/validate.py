@@ -8,9 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PydanticUserError, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PydanticUserError,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
-from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrMapping
 
@@ -26,6 +34,8 @@ _EXPECTED = {
     "int": "a whole number",
 }
 """What a value must be, by the kind of pydantic's error; the first that applies."""
+# Names of a union's alternatives in the place of an error: `int`, `list[str]`, `Vehicle`
+_ALTERNATIVE = re.compile(r"int|float|str|bool|none|literal|[A-Z]\w+|.*[\[(].*")
 _CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -35,6 +45,14 @@ class Frozen(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, given: Any) -> Any:
+        """Name the nearest key, which pydantic would not."""
+        if isinstance(given, dict):
+            refuse_unknown("key", given, cls.model_fields)
+        return given
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
@@ -52,7 +70,7 @@ def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -
         if not isinstance(where, str):
             location = error.errors()[0]["loc"] or ("",)
             where = where(str(location[0]))
-        raise _kind(error)(f"{where}: {explain(error, model)}") from None
+        raise _kind(error)(f"{where}: {explain(error)}") from None
 
 
 def _kind(error: ValidationError) -> type[ConfigError]:
@@ -122,66 +140,16 @@ def read_record(path: Path, model: type[Model]) -> Model:
         raise ConfigError(f"{path}: {error}; name another folder, or remove it") from None
 
 
-def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return one line that says for each key what is wrong, what the key means, and the nearest
-    valid key.
-    """
+def explain(error: ValidationError) -> str:
+    """Return one line that says for each key what is wrong."""
     lines: dict[str, str] = {}
     for item in error.errors():
-        inner, key, meaning = _locate(model, item["loc"])
-        text = _message(item) + meaning
-        if item["type"] == "extra_forbidden":
-            text = unknown("key", item["loc"][-1], inner.model_fields)
+        # The user knows the keys, and not the names of the alternatives of a union.
+        parts = [str(part) for part in item["loc"]]
+        key = ".".join(part for part in parts if not _ALTERNATIVE.fullmatch(part))
+        text = str(item["msg"]).removeprefix("Value error, ")
         if not text.startswith(key):
             text = f"{key}: {text}"
         # Each alternative of a union has its own errors. Only those of the first one are shown.
         lines.setdefault(key, text)
     return "; ".join(lines.values())
-
-
-def _message(item: StrMapping) -> str:
-    value = item["input"]
-    if str(item["type"]).startswith(("float_", "int_")) and isinstance(value, str):
-        return f"{value!r} must be a plain number, without a unit"
-    if item["type"] == "missing":
-        return "is missing"
-    message = str(item["msg"]).removeprefix("Value error, ")
-    if item["type"] == "literal_error":
-        # pydantic lists the valid values in quotes.
-        guess = did_you_mean(value, re.findall("'([^']+)'", item["ctx"]["expected"]))
-        message = f"{message}; {guess}".rstrip("; ")
-    return message
-
-
-def _locate(
-    model: type[BaseModel], location: tuple[int | str, ...]
-) -> tuple[type[BaseModel], str, str]:
-    """Return the innermost model at a location, the dotted key, and the meaning of its field in
-    brackets.
-    """
-    names = []
-    meaning = ""
-    for part in location:
-        field = model.model_fields.get(str(part))
-        if isinstance(part, int):
-            names.append(str(part))
-        elif field is not None:
-            names.append(part)
-            # A docstring may have several lines.
-            words = " ".join((field.description or "").split())
-            meaning = f" ({words})" if words else ""
-            model = _model_in(field.annotation) or model
-        # Anything else is the name of a union's alternative, which the user does not know.
-    return model, ".".join(names), meaning
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the first model in a type such as ``dict[str, Model]`` or ``Model | None``."""
-    arguments = typing.get_args(annotation)
-    if not arguments and isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in arguments:
-        inner = _model_in(argument)
-        if inner is not None:
-            return inner
-    return None

@@ -13,7 +13,7 @@ from pathlib import Path
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
-from sb3_quad.base.files import kind_and_line
+from sb3_quad.base.files import one_line
 from sb3_quad.base.process import interrupts_leave, trusting
 from sb3_quad.cli import commands
 from sb3_quad.cli.parser import TRACEBACK, Parser, add_flags
@@ -28,8 +28,8 @@ EPILOG = """examples:
   # compare an agent and an expert in one table
   sb3-quad evaluate pid agent.zip --suite quick
   # watch the agent's flights in a window, or as a film
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -o film.mp4
+  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1
+  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1 -o film.mp4
   # make a page where anyone can throw the quadcopter
   sb3-quad demo
   # show all options of a command, with examples
@@ -64,7 +64,6 @@ def make_parser() -> Parser:
             name, help=text.partition("\n\n")[0], description=text, epilog=heading + rest
         )
         add_flags(subparser, {**command.FLAGS, **TRACEBACK})
-        subparser.siblings[name] = subparser._option_string_actions
     return parser
 
 
@@ -132,6 +131,7 @@ def _unexpected(error: BaseException) -> str:
     """Return the message of an exception that no check foresaw, with the place that raised it."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'a file'}: {error.strerror}"
-    text = "; ".join([kind_and_line(error), *getattr(error, "__notes__", ())])
+    message = f"{type(error).__name__}: {one_line(error)}"
+    text = "; ".join([message, *getattr(error, "__notes__", ())])
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{text} ({Path(last.filename).name}, line {last.lineno}; add --traceback for all of it)"

@@ -10,10 +10,10 @@ from argparse import (
     Namespace,
     RawDescriptionHelpFormatter,
 )
-from collections.abc import Container, Mapping
-from typing import Annotated, Any, ClassVar, NoReturn, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn, TypeAlias
 
-from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import BaseModel
 
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
@@ -28,15 +28,24 @@ SHORT_FLAGS = {
     "progress": "-P",
 }
 """rl-zoo's short names of some flags."""
-# Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
-SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
+_RUN = "name the folder of the run, or a zip in it"
+ELSEWHERE = {
+    "-optimize": "the command sb3-quad tune does that",
+    "--optimize-hyperparameters": "the command sb3-quad tune does that",
+    "--trained-agent": "the flag is --initial-policy",
+    "--algo": _RUN,
+    "--env": "an agent knows its task; --task or --scenario chooses another",
+    "--exp-id": _RUN,
+    "--folder": _RUN,
+    "--load-best": _RUN,
+    "--load-checkpoint": _RUN,
+    "--load-last-checkpoint": _RUN,
+}
+"""What does the part of a flag of rl_zoo3, for the error message."""
 
 
 class Parser(ArgumentParser):
     """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
-
-    siblings: ClassVar[dict[str, Container[str]]] = {}
-    """The options of each command."""
 
     def __init__(self, **kwargs: Any) -> None:
         # This formatter keeps the line breaks of examples.
@@ -64,14 +73,11 @@ class Parser(ArgumentParser):
     def _advice(self, option: str) -> str:
         """Say what the user may want instead of an unknown option."""
         valid = self._option_string_actions
-        if option in SEARCH_FLAGS:
-            return "the command sb3-quad tune does that"
+        if option in ELSEWHERE:
+            return ELSEWHERE[option]
         guess = did_you_mean(option, valid)
         if guess:
             return guess.strip()
-        commands = [f"sb3-quad {name}" for name, known in self.siblings.items() if option in known]
-        if commands:
-            return f"it belongs to {' and '.join(commands)}"
         if "--hyperparams" in valid and option.startswith("--"):
             return (
                 "hyperparameters are given as --hyperparams KEY:VALUE, "
@@ -108,37 +114,21 @@ SWITCH = {"action": "store_true"}
 SEVERAL = {"nargs": "+"}
 
 
-def _checked(kind: Any, text: str) -> Any:
-    """Return the number in a text, such as ``1e6``, as one of the type ``kind``."""
-    try:
-        return check(kind, parse_number(text), "it")
-    except ConfigError as error:
-        raise ArgumentTypeError(str(error)) from None
+def typed(kind: Any) -> Callable[[str], Any]:
+    """Return a function that reads a text such as ``1e6`` as a pydantic type."""
 
+    def read(text: str) -> Any:
+        try:
+            return check(kind, parse_number(text), "it")
+        except ConfigError as error:
+            raise ArgumentTypeError(str(error)) from None
 
-def whole(text: str) -> Any:
-    """Return a whole number."""
-    return _checked(Annotated[int, Field(gt=-(2**63), lt=2**63)], text)
-
-
-def natural(text: str) -> Any:
-    """Return a whole number of at least 0."""
-    return _checked(NonNegativeInt, text)
-
-
-def positive(text: str) -> Any:
-    """Return a whole number of at least 1."""
-    return _checked(PositiveInt, text)
-
-
-def above_zero(text: str) -> Any:
-    """Return a finite number above 0."""
-    return _checked(PositiveFloat, text)
+    return read
 
 
 def seed(text: str) -> int:
     """Return a whole number of at least 0, a random one for a negative number."""
-    number: int = whole(text)
+    number: int = typed(int)(text)
     if number < 0:
         number = random.SystemRandom().randrange(2**31)
     return number
@@ -150,9 +140,9 @@ KINDS = {bool: SWITCH, StrDict: PAIRS, str: str}
 Others are numbers, which the field's model checks.
 """
 Flags: TypeAlias = "Mapping[str, str | tuple[Any, ...] | Flags]"
-"""A table of arguments by names and metavar: the type (or keywords of ``add_argument``), the
-default if there is one, and the help; the help alone for a text without a default. A table in it
-holds flags that exclude each other.
+"""A table of arguments by names and metavar: the type (of pydantic, a function, or keywords of
+``add_argument``), the default if there is one, and the help; the help alone for a text without a
+default. A table in it holds flags that exclude each other.
 """
 
 
@@ -163,6 +153,9 @@ def add_flags(parser: Any, flags: Flags) -> None:
             add_flags(parser.add_mutually_exclusive_group(), entry)
             continue
         kind, *default, text = (str, entry) if isinstance(entry, str) else entry
+        # A type of pydantic, such as PositiveInt
+        if hasattr(kind, "__metadata__"):
+            kind = typed(kind)
         arguments = kind if isinstance(kind, dict) else {"type": kind}
         names = words.split()
         if len(names) > 1 and not names[-1].startswith("-"):

@@ -6,7 +6,7 @@ constructor. There, ``lin_1e-3`` falls linearly to 0 over the training; a learni
 of its value, which it reaches in the last of n updates.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,7 +33,7 @@ from sb3_quad.base.validate import Frozen, check, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.simulation.tasks import TASK_NAMES, in_words
+from sb3_quad.envs.simulation.tasks import TASK_NAMES
 from sb3_quad.envs.vehicles.layout import Turn, find_turn
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, first_vehicle
 from sb3_quad.training.algorithms import (
@@ -51,9 +51,6 @@ SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind = Literal["batch", "dummy", "subproc"]
 NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
-# For dummy and subproc. PyBullet allows about this many in a process.
-MAX_SINGLE = 1000
-
 
 Whole = Annotated[
     int,
@@ -221,15 +218,6 @@ class TrainingConfig(Frozen):
             raise ConfigError(
                 f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
             )
-        if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
-            raise ConfigError(
-                f"n_envs: {self.n_envs} with vec_env {self.vec_env}, must be at most {MAX_SINGLE}"
-            )
-        if "NormalizeObservation" in str(self.env_wrapper):
-            raise ConfigError(
-                "env_wrapper: NormalizeObservation has separate statistics in each environment, "
-                "also to evaluate in; remove it, and give normalize: true"
-            )
         return self
 
     @model_validator(mode="after")
@@ -249,11 +237,6 @@ class TrainingConfig(Frozen):
         if self.rollout_steps < 1:
             key = "train_freq" if self.is_off_policy else "n_steps"
             raise ConfigError(f"{key} is {self.keyword(key)}, must be at least 1")
-        if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
-            raise ConfigError(
-                f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; "
-                "give steps"
-            )
         if self.noise_type and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
         if self.expert and not takes_expert(self.algorithm):
@@ -313,18 +296,10 @@ def describe(job: TrainingJob) -> str:
     line = f"{config.algo} on {config.env_id}: {timesteps:,} timesteps"
     if timesteps != config.n_timesteps:
         line += f" ({config.n_timesteps:,} were asked for)"
-    line += (
-        f", rollouts of {config.rollout_steps} steps"
-        f", {config.n_envs} environments ({config.vec_env})"
-    )
-    task = config.env_kwargs.get("task")
-    if isinstance(task, Mapping):
-        line += f", tasks {in_words(task)}"
-    if config.expert:
-        line += f", expert {config.expert}"
-    line += f", seed {job.seed}"
-    if job.initial_policy:
-        line += f", from {job.initial_policy}"
+    line += f", {config.n_envs} environments ({config.vec_env}), seed {job.seed}"
+    for word, source in (("expert", config.expert), ("from", job.initial_policy)):
+        if source:
+            line += f", {word} {source}"
     return line
 
 
@@ -433,7 +408,7 @@ def with_absolute_paths(env_id: str, settings: StrDict) -> StrDict:
     if env_id in ENVIRONMENTS:
         for key in ENV_KEYS & settings.keys():
             settings[key] = {
-                name: _absolute(value) if name in FILE_KEYS else value
+                name: _absolute(name, value) if name in FILE_KEYS else value
                 for name, value in parse_mapping(settings[key], key).items()
             }
     if isinstance(settings.get("demonstrations"), str):
@@ -445,18 +420,13 @@ def with_absolute_paths(env_id: str, settings: StrDict) -> StrDict:
     return settings
 
 
-def _absolute(value: Any) -> Any:
-    if isinstance(value, (list, tuple)):
-        return [_absolute(entry) for entry in value]
+def _absolute(name: str, value: Any) -> Any:
     if isinstance(value, dict):
-        value = dict(value)
-        if "distribution" in value:
-            value["distribution"] = _absolute(value["distribution"])
-        # A file is never a name, even without a suffix.
-        if isinstance(value.get("file"), str):
-            value["file"] = str(Path(value["file"]).absolute())
-        return value
-    if isinstance(value, (str, Path)) and VEHICLES.is_path(value):
+        return {key: _absolute(key, entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_absolute(name, entry) for entry in value]
+    # A file is never a name, even without a suffix.
+    if isinstance(value, (str, Path)) and (name == "file" or VEHICLES.is_path(value)):
         return str(Path(value).absolute())
     return value
 

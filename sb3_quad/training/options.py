@@ -5,10 +5,9 @@ Cheap to import, so that ``--help`` is quick.
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import AfterValidator, BeforeValidator, NonNegativeFloat, PositiveInt
 
 from sb3_quad.base.errors import ConfigError, raised_as
-from sb3_quad.base.imports import require
 from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict, StrMapping
@@ -102,13 +101,4 @@ class JobOptions(RunOptions):
     progress: bool = False
     """progress bar; without it, a line each minute"""
     track: bool = False
-    """track with Weights & Biases, see docs/zoo.md; -tb is runs unless you give it"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _tracked(cls, given: StrDict) -> StrDict:
-        """Weights & Biases shows TensorBoard's logs, so TensorBoard needs a folder."""
-        if not given.get("track"):
-            return given
-        require("wandb", "track", "--track")
-        return {**given, "tensorboard_log": given.get("tensorboard_log") or "runs"}
+    """track with Weights & Biases, which needs -tb, see docs/zoo.md"""

@@ -19,7 +19,7 @@ from sb3_quad.base.files import locked, save_model
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen, Share, validate
 from sb3_quad.base.yaml_files import write_yaml
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.evaluation.learning_curves import read_curve
@@ -41,16 +41,10 @@ from sb3_quad.training.options import (
     KEPT_BY_STAGES,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_links, refuse_outside
-from sb3_quad.training.trainer import resume, train, trained_seconds
+from sb3_quad.training.trainer import resume, train
 
 STATUS_FILE = "pipeline.yml"
 State = Literal["new", "begun", "done"]
-
-
-class Requirement(Frozen):
-    """The least that a stage must reach in its best evaluation before the next stage begins."""
-
-    success_rate: float = Field(default=0.0, ge=0, le=1)
 
 
 class Stage(Frozen):
@@ -72,8 +66,8 @@ class Stage(Frozen):
     """best: the agent of the best evaluation, by best_by of its settings"""
     correct_offset: PositiveFloat | None = None
     """offset correction after the stage: α of Eq. 4.10, such as 0.7; 1: only the offset"""
-    require: Requirement = Requirement()
-    """the pipeline stops if this is missed"""
+    require: dict[Literal["success_rate"], Share] = {}
+    """the least that its best evaluation must reach; otherwise the pipeline stops"""
     eval_freq: int | None = None
     """timesteps between evaluations of this stage"""
     eval_episodes: PositiveInt | None = None
@@ -108,9 +102,8 @@ class Pipeline(Frozen):
     @field_validator("stages")
     @classmethod
     def _different_names(cls, stages: list[Stage]) -> list[Stage]:
-        names = [stage.name for stage in stages]
-        if len({*names}) < len(names):
-            raise ValueError(f"{', '.join(names)}: give each a name of its own")
+        if len({stage.name for stage in stages}) < len(stages):
+            raise ValueError("give each stage a name of its own")
         return stages
 
 
@@ -128,7 +121,7 @@ class StageResult(NamedTuple):
 
     :param run: its run folder.
     :param agent: the zip that is passed on.
-    :param seconds: time of training; if the stage was resumed, since then.
+    :param seconds: time of training; if it was resumed, since then; 0 if it was done before.
     """
 
     run: str
@@ -250,7 +243,7 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         # The evaluations of a stage may differ from those of the pipeline.
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**own, **job, "config": config}, where)
-        if stage.require.success_rate > 0.0 and made.eval_episodes == 0:
+        if stage.require and made.eval_episodes == 0:
             raise ConfigError(f"{where}: require: needs evaluations; give --eval-episodes")
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
@@ -258,15 +251,12 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
 
 def _check_correction(stage: Stage, config: TrainingConfig) -> None:
     """Check that the offset of a stage's agent can be corrected, if it is to be."""
-    if not stage.correct_offset:
-        return
-    if not config.task:
-        raise ConfigError(f"correct_offset: {config.env_id} is not an environment of this package")
-    if config.env_wrapper or config.vec_env_wrapper:
-        raise ConfigError("correct_offset: flies without wrappers; remove them")
-    if config.flight_settings.size != OBSERVATION_SIZE:
+    wrapped = config.env_wrapper or config.vec_env_wrapper
+    fits = config.task and not wrapped and config.flight_settings.size == OBSERVATION_SIZE
+    if stage.correct_offset and not fits:
         raise ConfigError(
-            f"correct_offset is for agents that see the {OBSERVATION_SIZE} features alone"
+            "correct_offset: is for agents in this package's environments without wrappers, "
+            f"which see the {OBSERVATION_SIZE} features alone; remove it"
         )
 
 
@@ -311,7 +301,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                 state = state_of(runs, number, job.config.n_timesteps)
                 if state == "done":
                     run = runs[number]
-                    seconds = trained_seconds(run)
+                    seconds = 0.0
                 else:
                     report(f"stage {number + 1} of {len(jobs)}, {stage.name}: {describe(job)}")
                     if state == "begun":
@@ -361,10 +351,11 @@ def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Pa
     if run.evaluations.is_file():
         rates = np.nan_to_num(read_curve(run.path).values("success"))
         success = rates.max() if stage.pass_on == "best" else rates[-1]
-        if success < stage.require.success_rate:
+        required = stage.require.get("success_rate", 0.0)
+        if success < required:
             raise TrainingError(
                 f"stage {stage.name!r}: success {success:.3f} "
-                f"misses what it requires ({stage.require}); its run is {run.path}"
+                f"misses what it requires, {required}; its run is {run.path}"
             )
     agent = run.model
     if stage.pass_on == "best" and run.best_model.is_file():

@@ -12,7 +12,7 @@ from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.agents.zips import saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import make_folder, remove_half_written, write_text
+from sb3_quad.base.files import make_folder, write_text
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml, write_yaml
 
@@ -47,7 +47,7 @@ class RunFolder:
         self.config = path / name / "config.yml"
         # The options; its env_kwargs are those of the evaluations.
         self.arguments = path / name / "args.yml"
-        # The command that was typed.
+        # The command that was typed, for the card of a published agent.
         self.command = path / name / "command.txt"
 
     @property
@@ -67,22 +67,6 @@ class RunFolder:
             return 0
         return int(saved_data(self.model)["num_timesteps"])
 
-    def checkpoint(self, timesteps: int | str) -> Path:
-        """Return the path of the model after ``timesteps``."""
-        return self.path / f"rl_model_{timesteps}_steps.zip"
-
-    def latest_checkpoint(self) -> Path:
-        """Return the path of the latest checkpoint.
-
-        :raises ConfigError: the run has no checkpoint.
-        """
-        checkpoints = _numbered(self.path, "rl_model")
-        if not checkpoints:
-            raise ConfigError(
-                f"{self.path}: holds no checkpoint; train with --save-freq to have some"
-            )
-        return self.checkpoint(max(checkpoints))
-
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
 
@@ -90,11 +74,7 @@ class RunFolder:
         """
         self.config.parent.mkdir(exist_ok=True)
         write_yaml(self.config, settings)
-        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-        # A user's program may train, too.
-        if not command.startswith("sb3-quad"):
-            command = f"python {command}".replace("python __main__.py", "sb3-quad")
-        write_text(self.command, f"{command}\n")
+        write_text(self.command, f"{shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}\n")
         write_yaml(self.arguments, arguments)
 
     def read_yaml(self) -> tuple[StrDict, StrDict]:
@@ -151,11 +131,6 @@ def claim_folder(parent: Path, name: str) -> Path:
     """
     make_folder(parent, "log folder", "-f")
     folders = _numbered(parent, name)
-    # A run that was killed before it had settings is abandoned, but another may be about to get
-    # some.
-    for folder in folders.values():
-        if not any(folder.glob("*/args.yml")):
-            remove_half_written(folder, seconds=3.0)
     # Numbers of removed runs before the last one are not reused.
     number = max(folders, default=0) + 1
     while True:
@@ -213,28 +188,3 @@ def refuse_links(folder: Path) -> None:
     """
     for path in folder.rglob("*"):
         refuse_outside(path, str(folder), folder)
-
-
-def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
-    """Find a run by rl-zoo's ``--exp-id``.
-
-    :param exp_id: number of the run; 0: the latest that has an agent.
-    :raises ConfigError: there is no such run; the message names the existing ones.
-    """
-    parent = Path(log_folder) / algo
-    name = file_name(env_id)
-    folders = _numbered(parent, name)
-    if not folders:
-        raise ConfigError(
-            f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f"
-        )
-    if exp_id <= 0:
-        with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
-        exp_id = max(with_agent or folders)
-    if exp_id not in folders:
-        raise ConfigError(
-            f"{parent}: there is no run {name}_{exp_id}; "
-            f"there is {', '.join(folder.name for folder in folders.values())}; "
-            "give another with --exp-id"
-        )
-    return RunFolder(folders[exp_id], name)

@@ -26,12 +26,12 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.agents.transfer import transfer_policy
-from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.labelling import Labeller
 from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
+from sb3_quad.base.imports import require
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import Report, StrDict
@@ -40,7 +40,6 @@ from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.callbacks.hyperparameters import HyperparameterLog
 from sb3_quad.callbacks.snapshot import SnapshotFile
-from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.training.algorithms import instance
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config, load_agent
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
@@ -109,11 +108,11 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     """Continue an interrupted or killed run in its folder.
 
     Settings, seed, optimiser, dataset and step count stay the same. A run that has not reached its
-    first rollout is started; a complete one returns its result.
+    first rollout is started.
 
     :param changes: options of the job to change, such as ``progress``.
-    :raises SB3QuadError: a folder without such a run, one that another process trains, or with
-        damaged files; otherwise as :func:`train`.
+    :raises SB3QuadError: a folder without such a run, or with a complete one; one that another
+        process trains, or with damaged files; otherwise as :func:`train`.
     """
     run = open_run(run_folder)
     refuse_links(run.path)
@@ -133,12 +132,6 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         locked(run.path, "run folder"),
         _environments(job) as (env, eval_envs),
     ):
-        if run.timesteps >= config.n_timesteps:
-            report(
-                f"complete, {run.timesteps:,} timesteps; to train its agent further: "
-                f"-i {shlex.quote(str(run.path))}"
-            )
-            return TrainingResult(job, run, load_model(run.model, job.device), trained_seconds(run))
         if run.not_begun:
             model = build_model(job, env)
         else:
@@ -189,8 +182,7 @@ def _user_callbacks(config: TrainingConfig) -> list[BaseCallback]:
 def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     """Make the algorithm of a job, with the policy that it starts from.
 
-    :raises ConfigError: settings that the algorithm refuses, or for which this machine has too
-        little memory; an agent that does not fit.
+    :raises ConfigError: settings that the algorithm refuses; an agent that does not fit.
     :raises ExpertError: an expert that fails at its first query.
     """
     config = job.config
@@ -208,7 +200,15 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     takes_agent = "initial_policy" in inspect.signature(config.algorithm).parameters
     if takes_agent:
         keywords["initial_policy"] = agent
-    model = _construct(config, env, keywords)
+    try:
+        model = config.algorithm(config.policy, env, **keywords)
+    except SB3QuadError:
+        raise
+    except (ValueError, AssertionError) as error:
+        # SB3 raises these for invalid arguments.
+        raise ConfigError(
+            f"{config.algo} cannot be made with these settings ({one_line(error)})"
+        ) from error
     # Query the expert once, so that it fails before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
         Labeller(keywords.get("expert"), env).labels(env.reset())
@@ -225,31 +225,6 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     # SB3 has seeded the environments with the seed of the policy.
     env.seed(seed_for("training", job.seed))
     return model
-
-
-def _construct(config: TrainingConfig, env: VecEnv, keywords: StrDict) -> BaseAlgorithm:
-    """Call the algorithm's constructor; errors that do not concern its arguments are left as they
-    are.
-
-    :raises ConfigError: arguments that it refuses, or too little memory.
-    """
-    try:
-        return config.algorithm(config.policy, env, **keywords)
-    except SB3QuadError:
-        raise
-    except (ValueError, AssertionError) as error:
-        # SB3 raises these for invalid arguments.
-        raise ConfigError(
-            f"{config.algo} cannot be made with these settings ({one_line(error)})"
-        ) from error
-    except (MemoryError, RuntimeError) as error:
-        # PyTorch raises a plain RuntimeError when memory is short.
-        if isinstance(error, RuntimeError) and "memory" not in str(error):
-            raise
-        raise ConfigError(
-            f"{config.algo}: n_steps by n_envs, buffer_size or dataset_capacity is more than this "
-            f"machine's memory ({one_line(error)})"
-        ) from None
 
 
 @dataclass
@@ -294,11 +269,10 @@ class _Training:
             ),
         ]
         self.best: BestModel | None = None
-        others = dict(self.eval_envs)
-        own = others.pop(OWN_TASK, None)
-        if own is not None:
+        if self.eval_envs:
+            others = dict(self.eval_envs)
             self.best = BestModel(
-                own,
+                others.pop(OWN_TASK),
                 job.eval_freq if job.eval_freq > 0 else NEVER,
                 job.eval_episodes,
                 seed_for("evaluation", job.seed),
@@ -311,7 +285,8 @@ class _Training:
             )
             self.callbacks.append(self.best)
         if job.save_freq > 0:
-            self.callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint("{steps}"))))
+            checkpoint = run.path / "rl_model_{steps}_steps.zip"
+            self.callbacks.append(Checkpoint(job.save_freq, str(checkpoint)))
         self.callbacks += self.user_callbacks
         self.callbacks.append(ProgressBarCallback() if job.progress else ProgressLine(self.report))
 
@@ -348,14 +323,10 @@ class _Training:
 
     def _learn(self) -> None:
         config = self.job.config
-        log_interval = self.job.log_interval
-        # An off-policy algorithm counts episodes here, n_envs of which end at about the same time.
-        if config.is_off_policy:
-            log_interval *= config.n_envs
         self.model.learn(
             config.n_timesteps - self.model.num_timesteps,
             callback=self.callbacks,
-            log_interval=log_interval,
+            log_interval=self.job.log_interval,
             tb_log_name=f"{config.algo}_{self.run.path.name}",
             reset_num_timesteps=self.model.num_timesteps == 0,
         )
@@ -417,13 +388,6 @@ class _Training:
         error.__notes__ = [*getattr(error, "__notes__", ()), where.removeprefix("; ")]
 
 
-def trained_seconds(run: RunFolder) -> float:
-    """Return the wall-clock time that a complete run took, as its evaluations say, or 0."""
-    if not run.evaluations.is_file():
-        return 0.0
-    return float(read_curve(run.path).seconds[-1])
-
-
 @contextmanager
 def tracked(job: TrainingJob) -> Iterator[None]:
     """Track the block in a run of Weights & Biases, if the job asks for it.
@@ -435,10 +399,11 @@ def tracked(job: TrainingJob) -> Iterator[None]:
     if not job.track:
         yield
         return
-    # wandb is an extra, which JobOptions has checked. It reads the project, the group and the tags
-    # from WANDB_PROJECT, WANDB_RUN_GROUP and WANDB_TAGS.
-    import wandb
-
+    # It reads the project, the group and the tags from WANDB_PROJECT, WANDB_RUN_GROUP and
+    # WANDB_TAGS.
+    wandb = require("wandb", "track", "--track")
+    if job.tensorboard_log is None:
+        raise ConfigError("--track: shows what TensorBoard would; give -tb FOLDER, too")
     config = job.config
     try:
         run = wandb.init(

@@ -206,12 +206,10 @@ def test_two_signals_within_the_update_leave_the_dataset_of_the_snapshot(
     assert result.exit_code == 130 and the_same(resume(str(result.run.path), quiet).run, whole)
 
 
-def test_a_complete_run_says_so_and_shows_its_table(whole, capsys):
+def test_a_complete_run_is_not_resumed_and_stays_as_it_is(whole, capsys):
     before = {path: path.stat().st_mtime_ns for path in whole.path.rglob("*")}
-    assert main(["train", "--resume", str(whole.path)]) == 0
-    shown = capsys.readouterr().out
-    assert f"-i {whole.path}" in shown
-    assert "fresh episodes" in shown
+    assert main(["train", "--resume", str(whole.path)]) == 2
+    assert f"-i {whole.path}" in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in whole.path.rglob("*")} == before
 
 

@@ -21,10 +21,11 @@ import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
+from pydantic import NonNegativeInt
+
 from sb3_quad.base.errors import CannotHover
 from sb3_quad.cli.parser import (
     Flags,
-    natural,
 )
 
 if TYPE_CHECKING:
@@ -38,14 +39,14 @@ RPM = 60.0 / (2.0 * math.pi)
 FLAGS: Flags = {
     "vehicle VEHICLE": "name or YAML file",
     "-n --n-episodes N": (
-        natural,
+        NonNegativeInt,
         480,
         "episodes of each task and expert, with the true state (480)",
     ),
     "--flights FOLDER": (
         "fly the motor commands of these logs instead (CSV; columns: docs/vehicles.md)"
     ),
-    "--seed N": (natural, 0, "seed of the episodes, which no search or training uses (0)"),
+    "--seed N": (NonNegativeInt, 0, "seed of the episodes, which no search or training uses (0)"),
 }
 
 

@@ -39,6 +39,8 @@ the same command continues where it stopped.
 import sys
 from argparse import Namespace
 
+from pydantic import NonNegativeInt, PositiveInt
+
 from sb3_quad.cli.parser import (
     PROGRESS,
     SEVERAL,
@@ -47,7 +49,6 @@ from sb3_quad.cli.parser import (
     YES_OR_NO,
     Flags,
     given,
-    whole,
 )
 
 FLAGS: Flags = {
@@ -60,11 +61,11 @@ FLAGS: Flags = {
     ),
     "-o --output FOLDER": "folder for the results (evaluations/SUITE)",
     "--scenario NAME": (SEVERAL, [], "fly only these scenarios of the suite"),
-    "-n --n-episodes N": (whole, "episodes of each scenario (the suite's number)"),
-    "--seed N": (whole, "seed of each scenario (the suite's seed)"),
+    "-n --n-episodes N": (PositiveInt, "episodes of each scenario (the suite's number)"),
+    "--seed N": (NonNegativeInt, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
     "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
-    "--workers N": (whole, 1, "number of parallel processes (1)"),
+    "--workers N": (PositiveInt, 1, "number of parallel processes (1)"),
     "--overwrite": (SWITCH, "remove the results that the folder holds"),
     "--reward MODULE:FUNCTION": (
         "show the mean of a reward of your own, function(state, actions) per control step"

@@ -21,14 +21,16 @@ import sys
 from argparse import Namespace
 from pathlib import Path
 
-from sb3_quad.cli.parser import SWITCH, TRUST, Flags, positive
+from pydantic import PositiveInt
+
+from sb3_quad.cli.parser import SWITCH, TRUST, Flags
 
 FLAGS: Flags = {
     "what": {
         "sweep SWEEP": ({"nargs": "?"}, "YAML file, or the name of a sweep of the package"),
         "--resume FOLDER": "continue the sweep in its folder, with --trust",
     },
-    "--workers N": (positive, "number of parallel runs (as many as there are cores)"),
+    "--workers N": (PositiveInt, "number of parallel runs (as many as there are cores)"),
     "--address WHERE": (
         "Ray cluster: auto, host:port or ray://host:port (a new one on this machine)"
     ),

@@ -36,6 +36,8 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+from pydantic import PositiveInt
+
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     PAIRS,
@@ -46,7 +48,6 @@ from sb3_quad.cli.parser import (
     Flags,
     field_flags,
     given,
-    positive,
     refuse_with_resume,
     seed,
 )
@@ -89,7 +90,7 @@ SETTINGS_FLAGS: Flags = {
         "any id that Gymnasium knows, with --vec-env dummy or subproc"
     ),
     "-params --hyperparams": (PAIRS, "settings to change, such as n_steps:500"),
-    "--num-threads N": (positive, "threads (the cores; one where PyTorch computes)"),
+    "--num-threads N": (PositiveInt, "threads (the cores; one where PyTorch computes)"),
     "--gym-packages MODULE": (SEVERAL, [], "modules that register further environments"),
     **TRUST,
     **PROGRESS,

@@ -30,11 +30,13 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+from pydantic import NonNegativeInt, PositiveInt
+
 from sb3_quad.base.errors import refuse_unknown
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import CONF_FILE, SETTINGS_FLAGS, plan, prepare
-from sb3_quad.cli.parser import Flags, given, natural, positive, seed
+from sb3_quad.cli.parser import Flags, given, seed
 from sb3_quad.training.options import DEFAULT_ALGO
 
 # Episodes per evaluation by --vec-env.
@@ -42,20 +44,24 @@ EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 FLAGS: Flags = {
     **CONF_FILE,
     **SETTINGS_FLAGS,
-    "--n-trials N": (natural, 500, "trials of this process; 0 only writes the results (500)"),
+    "--n-trials N": (
+        NonNegativeInt,
+        500,
+        "trials of this process; 0: only the results (500)",
+    ),
     "--sampler NAME": (str, "TPESampler", "Optuna's class that proposes trials (TPESampler)"),
     "--pruner NAME": (
         str,
         "MedianPruner",
         "Optuna's class that stops poor trials early (MedianPruner); NopPruner: none",
     ),
-    "--n-evaluations N": (positive, 10, "evaluations per trial, for the pruner (10)"),
+    "--n-evaluations N": (PositiveInt, 10, "evaluations per trial, for the pruner (10)"),
     "--storage WHERE": "URL of a database, or a journal file (study.db in the new folder)",
     "--study-name NAME": "name of the study in the storage (ALGO_ENV)",
     "--search-space FILE": "YAML file of settings to vary (the package's file for the algorithm)",
     "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
     "--seed N": (seed, 0, "seed of trainings and sampler, negative for a random one (0)"),
-    "--eval-episodes N": (positive, "episodes per evaluation (batch: 240, else 48)"),
+    "--eval-episodes N": (PositiveInt, "episodes per evaluation (batch: 240, else 48)"),
 }
 
 
