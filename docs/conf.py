@@ -39,7 +39,10 @@ autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False
 linkcheck_anchors = False
 # Other packages document their names themselves.
-nitpick_ignore_regex = [("py:.*", r"(?!sb3_quad).*"), ("py:class", r".*\.(Bounded|a_number|StopSignals|Perceptrons)")]
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!sb3_quad).*"),
+    ("py:class", r".*\.(Bounded|a_number|StopSignals|Perceptrons)"),
+]
 
 # The reference must have every name in the __all__ of these.
 PACKAGES = ("sb3_quad", "sb3_quad.envs", "sb3_quad.callbacks", "sb3_quad.envs.vehicles")

@@ -1,6 +1,5 @@
 """APG: it learns, its zips are stock, it resumes, and what it cannot differentiate is refused."""
 
-
 import numpy as np
 import pytest
 import torch as th

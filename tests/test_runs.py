@@ -9,7 +9,7 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes, write_text
-from sb3_quad.training.runs import claim_run, open_run
+from sb3_quad.training.runs import claim_run, find_run, open_run
 
 ENV = "QuadTargetTracking-v0"
 
@@ -21,6 +21,14 @@ def test_runs_are_numbered_and_never_reused(tmp_path):
     (tmp_path / "dagger" / f"{ENV}_notes").mkdir()
     assert claim_run(tmp_path, "dagger", ENV).path.name == f"{ENV}_8"
     assert claim_run(tmp_path, "ppo", ENV).path.name == f"{ENV}_1"
+
+
+def test_the_latest_run_is_the_latest_with_an_agent(tmp_path):
+    first, empty = (claim_run(tmp_path, "dagger", ENV) for _ in range(2))
+    assert find_run(tmp_path, "dagger", ENV).path == empty.path
+    first.model.write_bytes(b"")
+    assert find_run(tmp_path, "dagger", ENV).path == first.path
+    assert find_run(tmp_path, "dagger", ENV, 2).path == empty.path
 
 
 @pytest.mark.slow

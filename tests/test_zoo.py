@@ -231,7 +231,22 @@ def test_it_shows_its_runs_and_ours(session, which):
 @with_zoo
 def test_ours_shows_its_runs(session, capsys):
     folder, _ = session
-    assert main(["enjoy", str(folder / "logs" / "dagger" / f"{ENV}_1"), "--no-render"]) == 0
+    assert (
+        main(
+            [
+                "enjoy",
+                "--algo",
+                "dagger",
+                "--env",
+                ENV,
+                "-f",
+                str(folder / "logs"),
+                "--no-render",
+                "--load-best",
+            ]
+        )
+        == 0
+    )
     assert "after 0.20 s" in capsys.readouterr().out
 
 

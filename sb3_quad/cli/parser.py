@@ -28,18 +28,10 @@ SHORT_FLAGS = {
     "progress": "-P",
 }
 """rl-zoo's short names of some flags."""
-_RUN = "name the folder of the run, or a zip in it"
 ELSEWHERE = {
     "-optimize": "the command sb3-quad tune does that",
     "--optimize-hyperparameters": "the command sb3-quad tune does that",
     "--trained-agent": "the flag is --initial-policy",
-    "--algo": _RUN,
-    "--env": "an agent knows its task; --task or --scenario chooses another",
-    "--exp-id": _RUN,
-    "--folder": _RUN,
-    "--load-best": _RUN,
-    "--load-checkpoint": _RUN,
-    "--load-last-checkpoint": _RUN,
 }
 """What does the part of a flag of rl_zoo3, for the error message."""
 

@@ -67,6 +67,22 @@ class RunFolder:
             return 0
         return int(saved_data(self.model)["num_timesteps"])
 
+    def checkpoint(self, timesteps: int | str) -> Path:
+        """Return the path of the model after ``timesteps``."""
+        return self.path / f"rl_model_{timesteps}_steps.zip"
+
+    def latest_checkpoint(self) -> Path:
+        """Return the path of the latest checkpoint.
+
+        :raises ConfigError: the run has no checkpoint.
+        """
+        checkpoints = _numbered(self.path, "rl_model")
+        if not checkpoints:
+            raise ConfigError(
+                f"{self.path}: holds no checkpoint; train with --save-freq to have some"
+            )
+        return self.checkpoint(max(checkpoints))
+
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
 
@@ -188,3 +204,28 @@ def refuse_links(folder: Path) -> None:
     """
     for path in folder.rglob("*"):
         refuse_outside(path, str(folder), folder)
+
+
+def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
+    """Find a run by rl-zoo's ``--exp-id``.
+
+    :param exp_id: number of the run; 0: the latest that has an agent.
+    :raises ConfigError: there is no such run; the message names the existing ones.
+    """
+    parent = Path(log_folder) / algo
+    name = file_name(env_id)
+    folders = _numbered(parent, name)
+    if not folders:
+        raise ConfigError(
+            f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f"
+        )
+    if exp_id <= 0:
+        with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
+        exp_id = max(with_agent or folders)
+    if exp_id not in folders:
+        raise ConfigError(
+            f"{parent}: there is no run {name}_{exp_id}; "
+            f"there is {', '.join(folder.name for folder in folders.values())}; "
+            "give another with --exp-id"
+        )
+    return RunFolder(folders[exp_id], name)
