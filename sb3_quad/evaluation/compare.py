@@ -29,7 +29,7 @@ from sb3_quad.evaluation.reward import OwnReward, load_reward
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
-from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.evaluation.tables import Table
 
 THESIS_VEHICLE = "itm"  # the thesis has metrics of no other one
 
@@ -195,10 +195,8 @@ def _task_table(
     names = []
     if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):
         names = [name for name in thesis_columns if name in scenario.published]
-    columns = [*map(Column, metrics), *(Column(name, source="thesis") for name in names)]
-    cells = [*map(metric_cells, metrics.values())]
-    rows = metric_rows(scenario, cells, [scenario.published[name] for name in names])
-
+    published = [scenario.published[name] for name in names]
+    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], published)
     title = f"{task}: {n_episodes} fresh episodes, the same for all"
     if not any(np.hstack(levels(how.noise)).any() for how in settings.values()):
         title += ", true state"
@@ -206,4 +204,5 @@ def _task_table(
     if others.count(first) < len(others):
         for label, vehicle in vehicles.items():
             caption += f"; {label} flies {vehicle.name}"
-    return Table(columns, rows, title=title, caption=caption)
+    heads = ["", *metrics, *(f"thesis: {name}" for name in names)]
+    return Table(heads, rows, title, caption)

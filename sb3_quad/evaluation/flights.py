@@ -274,7 +274,7 @@ def fly_settings(
             actions = _ask(pilot, observation, flying, (step - 1) * control_step)
             # What measures sees only the state after a step.
             for hook in given:
-                hook.before_step(state, observation, fleet.total_wrench().T, flying)
+                hook.before_step(state, observation, flying)
             observation, rewards, _ = fleet.step(actions)
             state = fleet.true_state()
             # This step also counts for the flights that it has ended.

@@ -25,16 +25,11 @@ class Hook:
         """See the state in which the flights start."""
 
     def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
+        self, state: QuadcopterState, observation: Float32Array, flying: BoolArray
     ) -> None:
         """See the state before a control step.
 
         :param observation: (n, observation size).
-        :param wrench: (n, WRENCH_SIZE), that acts during the step.
         :param flying: (n,), the flights that are still in the air.
         """
 
@@ -231,11 +226,7 @@ class Demonstrations(Hook):
         self._actions: list[Float32Array] = []
 
     def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
+        self, state: QuadcopterState, observation: Float32Array, flying: BoolArray
     ) -> None:
         self._flying = flying
         self._observations.append(observation[flying])

@@ -78,8 +78,7 @@ def paths_plot(flights: Flights, colours: Colours) -> Figure:
                 stride = -(-len(path) // LINE_POINTS)
                 axes.plot(*path[::stride].T, color=colours[label], label=label, linewidth=1.8)
                 # A target that rests is a point, one that moves is a line.
-                target = track.targets[:, [i, j]]
-                axes.plot(*target.T, ".-", color=TARGET, label="target", zorder=1)
+                axes.plot(*track.targets[:, [i, j]].T, ".-", color=TARGET, label="target", zorder=1)
                 if track.lost:
                     axes.plot(*path[-1], "X", color=colours[label], markersize=9)
     legend(figure)

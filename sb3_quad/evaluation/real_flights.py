@@ -29,7 +29,7 @@ from sb3_quad.envs.simulation.state import (
 )
 from sb3_quad.envs.vehicles.layout import find_turn
 from sb3_quad.envs.vehicles.vehicle import GRAVITY, Vehicle, first_vehicle
-from sb3_quad.evaluation.tables import Table, text_table
+from sb3_quad.evaluation.tables import Table
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s
@@ -241,4 +241,4 @@ def error_table(logs: Sequence[Log], vehicle: Vehicle) -> Table:
     thrusts = np.concatenate([log.thrusts[log.flying] for log in logs])
     clipped = (np.abs(vehicle.thrust_to_action(thrusts)) > 1.0).mean()
     caption = f"{clipped:.1%} of the commands are beyond the rotors' limits, and clipped"
-    return text_table(title, HEADINGS, rows)._replace(caption=caption)
+    return Table(HEADINGS, rows, title, caption)

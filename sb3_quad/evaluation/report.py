@@ -19,7 +19,7 @@ from sb3_quad.evaluation.plots import (
     success_plot,
 )
 from sb3_quad.evaluation.results import REPORT, Results, load_results
-from sb3_quad.evaluation.scenarios.load import axis_label
+from sb3_quad.evaluation.scenarios.load import axis_name
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 FIGURES = "figures"
@@ -44,7 +44,7 @@ def write_report(folder: StrPath) -> Path:
     ]
     for heading, scenarios in scenario_groups(results):
         parts += [f"## {escape(heading)}", escape(scenarios[0].description)]
-        parts.append(group_table(results, results.colours, heading, scenarios).markdown())
+        parts.append(group_table(results, heading, scenarios).markdown())
         for name, figure in _figures(results, scenarios, place):
             picture = f"{FIGURES}/{name}.png"
             save_figure(figure, place / picture)
@@ -69,7 +69,7 @@ def _figures(
     if first.group is not None:
         cells = _cells(results, scenarios)
         for number, key in enumerate(first.cell):
-            title = axis_label(key)
+            title = axis_name(key).replace("_", " ")
             yield f"{first.group}_{number}", success_plot(cells, key, title, results.colours)
         return
     metrics = {}

@@ -55,7 +55,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.cli.output import console
     from sb3_quad.envs.vehicles.vehicle import load_vehicle
     from sb3_quad.evaluation.compare import compare
-    from sb3_quad.evaluation.tables import text_table
+    from sb3_quad.evaluation.tables import Table
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
 
@@ -71,7 +71,7 @@ def run(options: Namespace) -> int:
     except CannotHover as error:
         print("cannot hover:", error, file=sys.stderr)
         return 1
-    console().print(text_table(vehicle.name, ("", ""), _parameters(vehicle), align="left"))
+    console().print(Table(("", ""), _parameters(vehicle), vehicle.name, align="left"))
     for warning in warnings(vehicle):
         print("unusual:", warning)
     if options.flights is not None:

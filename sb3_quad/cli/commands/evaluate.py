@@ -19,8 +19,6 @@ examples:
     --suite thesis -o evaluations/mine
   # a quick look, in less than a minute
   sb3-quad evaluate pid agent.zip --suite quick
-  # in two processes
-  sb3-quad evaluate agent.zip --suite robustness --workers 2
   # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
   # the mean of your own reward next to the task's
@@ -64,7 +62,6 @@ FLAGS: Flags = {
     "--seed N": (whole, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
     "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
-    "--workers N": (whole, 1, "number of parallel processes (1)"),
     "--overwrite": (SWITCH, "remove the results that the folder holds"),
     "--reward MODULE:FUNCTION": (
         "show the mean of a reward of your own, function(state, actions) per control step"
@@ -94,12 +91,10 @@ def run(options: Namespace) -> int:
             folder,
             progress=show,
             report=warn,
-            **given(options, "backend", "workers", "overwrite", "reward"),
+            **given(options, "backend", "overwrite", "reward"),
         )
-    # Each controller once, in the order of the command line.
-    flown = list(dict.fromkeys(entry.controller for entry in results.entries))
-    if flown:
-        console().print(*overview(results, flown))
+    if results.entries:
+        console().print(*overview(results))
         print(f"results in {folder}: results.json, episodes.csv, flights/")
         if options.report:
             # Matplotlib takes a second.
@@ -107,9 +102,6 @@ def run(options: Namespace) -> int:
 
             print("report in", write_report(folder))
     for failure in results.failures:
-        print(
-            f"failed: {failure.controller}, {failure.scenario or 'every scenario'}: "
-            f"{failure.message}",
-            file=sys.stderr,
-        )
+        who = f"failed: {failure.controller}, {failure.scenario}:"
+        print(who, failure.message, file=sys.stderr)
     return int(bool(results.failures))
