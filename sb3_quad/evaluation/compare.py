@@ -1,14 +1,11 @@
 """Controllers on the same episodes of some tasks, in one table for each task."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Group
 
-from sb3_quad.agents.agent_settings import settings_of_model
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.seeds import seed_for
@@ -16,13 +13,8 @@ from sb3_quad.base.types import StrDict, StrMapping
 from sb3_quad.envs.simulation.settings import FlightSettings, levels
 from sb3_quad.envs.simulation.tasks import Task, in_words
 from sb3_quad.envs.vehicles.vehicle import first_vehicle, load_vehicle
-from sb3_quad.evaluation.controllers import ControllerSpec
-from sb3_quad.evaluation.flights import (
-    episode_seeds,
-    fly_settings,
-    refuse_several_limits,
-    warn_of_differences,
-)
+from sb3_quad.evaluation.controllers import known_settings
+from sb3_quad.evaluation.flights import episode_seeds, fly_settings, warn_of_differences
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.reward import OwnReward, load_reward
@@ -66,9 +58,8 @@ def compare(
 
     Each agent flies as it was trained: with the vehicle, the noise and the observation that its zip
     or ``model.flight_settings`` names. Experts, functions and agents that name none fly the vehicle
-    and the noise of the first agent that names them. So do controllers that a factory makes, except
-    that a model keeps its own observation. Experts see the true state. A warning names those that
-    fly another vehicle than they know.
+    and the noise of the first agent that names them. Experts see the true state. A warning names
+    those that fly another vehicle than they know.
 
     >>> from sb3_quad.evaluation.compare import compare
     >>> result = compare({"PID": "pid", "agent": "itm-recovery"}, ["state_recovery"], n_episodes=48)
@@ -120,17 +111,7 @@ def compare(
     published = [name for scenario in suite.scenarios for name in scenario.published]
     refuse_unknown("thesis column", thesis_columns, {*published})
     own_reward = load_reward(reward)
-    settings = _settings(controllers, env_kwargs)
-    pilots = {}
-    for label, how in settings.items():
-        pilot = resolve_expert(controllers[label], how.vehicle, "controller", how.rotor_layout)
-        own = settings_of_model(pilot)
-        # What a model from a factory observes is known only now.
-        if own is not None:
-            settings[label] = how.with_changes(**{**own.carried, **env_kwargs})
-        refuse_several_limits(settings[label])
-        warn_of_differences(label, pilot, settings[label])
-        pilots[label] = pilot
+    settings, pilots = _load(controllers, env_kwargs)
 
     comparison = Comparison()
     comparison.tables = []
@@ -146,30 +127,32 @@ def compare(
     return comparison
 
 
-def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, FlightSettings]:
-    """Return the flight settings of each controller, except for the task."""
+def _load(
+    controllers: StrMapping, env_kwargs: StrMapping
+) -> tuple[dict[str, FlightSettings], StrDict]:
+    """Return the flight settings of each controller, except for the task, and the controllers."""
     shared: StrDict = {}
     own = {}
+    pilots = {}
     for label, controller in controllers.items():
-        if isinstance(controller, (str, Path)):
-            path = agent_path(str(controller))
-            known = ControllerSpec(path, path).own
-        else:
-            known = settings_of_model(controller)
-        if known is not None:
-            # On another vehicle, the agent still has its rotors where it knows them.
-            own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
-            # The first agent decides for all controllers that do not say how they fly.
-            if not shared:
-                shared = {
-                    "vehicle": known.vehicle,
-                    "vehicles": known.vehicles,
-                    "noise": known.noise,
-                }
+        pilot = resolve_expert(controller, env_kwargs.get("vehicle", "itm"), "controller")
+        known = known_settings(controller, pilot)
+        if known is None:
+            continue
+        pilots[label] = pilot
+        # On another vehicle, the agent still has its rotors where it knows them.
+        own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
+        # The first agent decides for all controllers that do not say how they fly.
+        if not shared:
+            shared = {name: getattr(known, name) for name in ("vehicle", "vehicles", "noise")}
     settings = {}
-    for label in controllers:
-        settings[label] = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
-    return settings
+    for label, controller in controllers.items():
+        how = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
+        if label not in pilots:
+            pilots[label] = resolve_expert(controller, how.vehicle, "controller", how.rotor_layout)
+        warn_of_differences(label, pilots[label], how)
+        settings[label] = how
+    return settings, pilots
 
 
 def _task_table(

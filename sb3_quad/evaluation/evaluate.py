@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.agents.agent_settings import settings_of_model
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
 from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
-from sb3_quad.evaluation.controllers import ControllerSpec, controller_record
+from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, known_settings
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
 from sb3_quad.evaluation.flights import Flights, fly_settings
@@ -220,13 +219,12 @@ def _fly(
     """
     flown = scenario.flown_by(spec.own and spec.own.vehicle)
     controller = resolve_expert(spec.spec, flown.nominal_vehicle(), "controller")
-    observed = spec.observed
     # A model from a factory says only now what it observes.
-    known = settings_of_model(controller)
-    if known is not None:
-        observed = known.carried
+    known = known_settings(spec.spec, controller)
     recorder = Recorder(RECORDED)
-    flights = fly_scenario(controller, flown, backend, [recorder], observed, reward)
+    flights = fly_scenario(
+        controller, flown, backend, [recorder], known and known.carried, reward
+    )
     entry = Entry(
         controller=spec.label,
         scenario=scenario.name,

@@ -34,7 +34,6 @@ EPISODES = (
     "recovery_time",
     "cross_track_error",
     *FOLLOWED,
-    "overshoot",
 )
 
 

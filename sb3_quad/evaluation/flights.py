@@ -69,9 +69,6 @@ class Flights:
     #: By tolerance (m): time after which |r - r_T| stays within it to the end, s, (n,); NaN if the
     #: flight ended outside or was lost.
     settling_time: Mapping[float, FloatArray]
-    #: (n,), largest |r - r_T| since it was first within 0.1 m, or the tightest tolerance, m;
-    #: NaN if it never was
-    overshoot: FloatArray
     path_length: FloatArray  #: (n,), m, over the whole episode
     final_error: FloatArray  #: (n,), |r - r_T| at the end, m
     #: (n, 3), r - r_T at the end, world frame, m; NaN if the flight was lost
@@ -179,20 +176,10 @@ def fly(
             environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", MAX_EPISODE_STEPS)
     settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
-    refuse_several_limits(settings)
     warn_of_differences(name, controller, settings)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
-
-
-def refuse_several_limits(settings: FlightSettings) -> None:
-    """Refuse a limit for each row, since flights end together."""
-    if isinstance(settings.max_episode_steps, list):
-        raise ConfigError(
-            f"max_episode_steps {settings.max_episode_steps}: must be one number, the limit of all"
-            " flights"
-        )
 
 
 def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
@@ -240,6 +227,9 @@ def fly_settings(
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
     refuse_unknown("backend", [backend], FLEETS)
+    limit = settings.max_episode_steps
+    if isinstance(limit, list):
+        raise ConfigError(f"max_episode_steps {limit}: must be one number, for all flights")
     plan = plan or Plan()
     course = Course(plan.waypoints, plan.radius)
     demonstrations = Demonstrations()

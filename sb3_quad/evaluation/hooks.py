@@ -10,7 +10,7 @@ from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, S
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
-NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance if it is not among them
+NEAR = 0.1  # m; settling is judged by it, or by the tightest tolerance if it is not among them
 # A vehicle is stable while its tilt (rad) and its rate of roll and pitch together (rad/s) are below
 # these for at least HOLD (s).
 TILT = np.radians(45.0)
@@ -93,8 +93,7 @@ class Arrivals(Hook):
     """When flights come within T tolerances of their targets; on a course, of the last waypoint.
 
     ``time_to``: time until |r - r_T| is first within a tolerance, s. ``settling_time``: time since
-    when it has stayed within it, s; NaN if the flight is lost. ``overshoot``: the largest
-    |r - r_T|, m, since it was first within :func:`arrival_tolerance`. NaN if that has not happened.
+    when it has stayed within it, s; NaN if the flight is lost. NaN if that has not happened.
 
     :param tolerances: m.
     :param course: sees each step before this hook does.
@@ -111,12 +110,6 @@ class Arrivals(Hook):
         self._distance = state.distance
         self._time_to = np.full((len(self._tolerances), state.n), np.nan)
         self._settling_time = self._time_to.copy()
-        self._overshoot = np.full(state.n, np.nan)
-        self._first = self._overshoot.copy()
-        if self._tolerances:
-            # A view, which shows later arrivals.
-            near = arrival_tolerance(self._tolerances)
-            self._first = self._time_to[[*self._tolerances].index(near)]
         self._update(0.0)
 
     def after_step(
@@ -132,8 +125,6 @@ class Arrivals(Hook):
         inside = distance <= self._limits
         np.fmin(self._time_to, np.where(inside, time, np.nan), out=self._time_to)
         self._settling_time = _since(self._settling_time, inside, time)
-        arrived = np.isfinite(self._first)
-        np.fmax(self._overshoot, distance, out=self._overshoot, where=arrived)
 
     def results(self) -> Mapping[str, Any]:
         # A lost flight has no time after which it stays at its target.
@@ -141,12 +132,11 @@ class Arrivals(Hook):
         return {
             "time_to": dict(zip(self._tolerances, self._time_to, strict=True)),
             "settling_time": dict(zip(self._tolerances, settling_time, strict=True)),
-            "overshoot": self._overshoot,
         }
 
 
 def arrival_tolerance(tolerances: Iterable[float]) -> float:
-    """Return the tolerance, m, by which overshoot and the settling time are judged."""
+    """Return the tolerance, m, by which settling is judged."""
     return min(tolerances, key=lambda tolerance: (tolerance != NEAR, tolerance))
 
 

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_quad.evaluation.flights import TOLERANCES
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.hooks import arrival_tolerance
 from sb3_quad.evaluation.metrics import Metrics, Moment
@@ -53,7 +52,6 @@ OWN_REWARD = Row("mean own reward")
 FLOWN = Row("time flown", "s")
 LIMIT = Row("physical limit of the settling time", "s")
 OVERSHOOT_RATE = Row("overshoot rate", "%")
-OVERSHOOT = Row("farthest after arrival, median", "m")
 PATH = Row("mean path", "m")
 MEDIAN = Row("final error, median", "m", decimals=3)
 QUANTILE = Row("final error, 95 %", "m", decimals=3)
@@ -77,7 +75,6 @@ ROWS = {
     "reward": REWARD,
     "own_reward": OWN_REWARD,
     "flown": FLOWN,
-    "overshoot": OVERSHOOT,
     "path": PATH,
     "cross_track_error": CROSS_TRACK_ERROR,
     "final_error_median": MEDIAN,
@@ -85,7 +82,6 @@ ROWS = {
     "recovery_time": RECOVERY_TIME,
     **dict(zip(FOLLOWED, FOLLOWING, strict=True)),
 }
-MOST_TOLERANCES = 6
 CAPTION = "in brackets: 95 % intervals"
 
 Cells = Mapping[Row, str]
@@ -133,9 +129,7 @@ def metric_cells(metrics: Metrics) -> Cells:
 
 
 def _measured(row: Row, value: Any) -> str:
-    """A number, an :class:`Estimate` or a :class:`Moment` as a row shows it."""
-    if isinstance(value, float):
-        return row.number(value)
+    """An :class:`Estimate` or a :class:`Moment` as a row shows it."""
     if not isinstance(value, Moment):
         # A share has as many digits as it takes for a single flight to show.
         if row.unit == "%":
@@ -244,13 +238,6 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     # An episode that starts at its target does not fly to it.
     if not scenario.has_way:
         return [*shares, FLOWN, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
-    tolerances = {*scenario.tolerances}
-    if len(tolerances) > MOST_TOLERANCES:
-        # Only the main and the published ones; a plot shows the others.
-        kept = {min(tolerances), *TOLERANCES}
-        for published in scenario.published.values():
-            kept |= {*published.time_to}
-        tolerances &= kept
-    settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
-    times = map(time_row, sorted(tolerances))
+    settling = [settling_row(arrival_tolerance(scenario.tolerances)), LIMIT, OVERSHOOT_RATE]
+    times = map(time_row, scenario.tolerances)
     return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]

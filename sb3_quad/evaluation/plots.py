@@ -16,7 +16,6 @@ from sb3_quad.base.files import write_bytes
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.learning_curves import Curve
-from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.tables import colours_of
 
 # Inches of a panel
@@ -45,21 +44,6 @@ def save_figure(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=path.suffix[1:], dpi=DPI, bbox_inches="tight")
     write_bytes(path, buffer.getvalue())
-
-
-@styled
-def arrivals_plot(metrics: Mapping[str, Metrics], colours: Colours) -> Figure:
-    """Draw the mean times to each tolerance, cf. Figs. 4.6 and 4.7, with 95 % intervals."""
-    figure, axes = new_axes("tolerance (m)", "time (s)")
-    for label, measured in metrics.items():
-        # There is no point if no flight arrives.
-        means = [dict(arrival.time or {}) for arrival in measured.arrivals]
-        tolerances = [arrival.tolerance for arrival in measured.arrivals]
-        times = pd.DataFrame(means, tolerances, ["value", "low", "high"], np.float64)
-        band(axes, colours[label], label, times, **POINTS)
-    axes.set_ylim(bottom=0.0)
-    legend(figure)
-    return figure
 
 
 @styled

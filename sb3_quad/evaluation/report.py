@@ -12,12 +12,7 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import CAPTION, group_table, scenario_groups
-from sb3_quad.evaluation.plots import (
-    arrivals_plot,
-    paths_plot,
-    save_figure,
-    success_plot,
-)
+from sb3_quad.evaluation.plots import paths_plot, save_figure, success_plot
 from sb3_quad.evaluation.results import REPORT, Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_name
 from sb3_quad.evaluation.scenarios.scenario import Scenario
@@ -72,21 +67,14 @@ def _figures(
             title = axis_name(key).replace("_", " ")
             yield f"{first.group}_{number}", success_plot(cells, key, title, results.colours)
         return
-    metrics = {}
     flights = {}
     for label in results.colours:
         entry = results.entry(label, first.name)
         if entry is not None:
-            metrics[label] = entry.metrics
             flights[label] = read_tracks(folder / entry.flights)
     # A scenario in which all controllers failed has no flights to draw.
-    if not flights:
-        return
-    yield f"{first.name}_paths", paths_plot(flights, results.colours)
-    # An episode that starts at its target does not fly to it.
-    has_way = first.has_way and not first.waypoints
-    if has_way and first.reference is None and len(first.tolerances) > 2:
-        yield f"{first.name}_times", arrivals_plot(metrics, results.colours)
+    if flights:
+        yield f"{first.name}_paths", paths_plot(flights, results.colours)
 
 
 def _cells(results: Results, scenarios: Sequence[Scenario]) -> pd.DataFrame:
