@@ -3,21 +3,20 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from rich.console import Group
 
 from sb3_quad.agents.resolve import resolve_expert
-from sb3_quad.base.errors import ConfigError, refuse_unknown
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrDict, StrMapping
-from sb3_quad.envs.simulation.settings import FlightSettings, levels
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.tasks import Task, in_words
 from sb3_quad.envs.vehicles.vehicle import first_vehicle, load_vehicle
 from sb3_quad.evaluation.controllers import known_settings
 from sb3_quad.evaluation.flights import episode_seeds, fly_settings, warn_of_differences
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
-from sb3_quad.evaluation.reward import OwnReward, load_reward
+from sb3_quad.evaluation.reward import Reward
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
@@ -50,7 +49,7 @@ def compare(
     tasks: Any = ("target_tracking", "state_recovery"),
     n_episodes: int = 240,
     seed: int | None = None,
-    reward: OwnReward = None,
+    reward: Reward | None = None,
     thesis_columns: Sequence[str] = (),
     **env_kwargs: Any,
 ) -> Comparison:
@@ -81,8 +80,7 @@ def compare(
     :param seed: seed of the episodes, as for :func:`~sb3_quad.evaluation.flights.fly`; None: one
         that no training flies.
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) as
-        :func:`~sb3_quad.evaluation.flights.fly` takes it, or ``"package.module:function"``. Its
-        mean is shown below that of the task.
+        :func:`~sb3_quad.evaluation.flights.fly` takes it. Its mean is shown below that of the task.
     :param thesis_columns: columns of the thesis to add if its vehicle flies one of its tasks:
         ``"expert"``, ``"IL-agent"``, ``"RL-agent"``.
     :param env_kwargs: fields of
@@ -101,25 +99,21 @@ def compare(
     if isinstance(tasks, (str, Mapping, Task)):
         tasks = [tasks]
     names = [in_words(task) for task in tasks]
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"compare: several tasks are named {name}; name them differently")
+    if len({*names}) < len(names):
+        raise ConfigError(f"compare: tasks {', '.join(names)}: name each differently")
     if seed is None:
         seed = seed_for("table")
     seeds = episode_seeds(seed, n_episodes)
     suite = load_suite("thesis")
-    published = [name for scenario in suite.scenarios for name in scenario.published]
-    refuse_unknown("thesis column", thesis_columns, {*published})
-    own_reward = load_reward(reward)
     settings, pilots = _load(controllers, env_kwargs)
 
     comparison = Comparison()
     comparison.tables = []
     for name, task in zip(names, tasks, strict=True):
         metrics = {}
-        for label, pilot in pilots.items():
-            how = settings[label].with_changes(task=task)
-            metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
+        for label, own in settings.items():
+            how = own.with_changes(task=task)
+            metrics[label] = summarise(fly_settings(pilots[label], how, seeds, reward=reward))
             comparison.setdefault(label, {})[name] = metrics[label]
         comparison.tables.append(
             _task_table(name, metrics, settings, suite, thesis_columns, n_episodes)
@@ -168,7 +162,7 @@ def _task_table(
     :param suite: the thesis's suite, which has the rows and the published metrics.
     """
     vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
-    first, *others = vehicles.values()
+    first = next(iter(vehicles.values()))
     # Tasks of your own have the rows of target tracking.
     scenario = suite.scenario(THESIS_SCENARIOS.get(task, "tracking"))
     reference = settings[next(iter(settings))].reference
@@ -181,10 +175,8 @@ def _task_table(
     published = [scenario.published[name] for name in names]
     rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], published)
     title = f"{task}: {n_episodes} fresh episodes, the same for all"
-    if not any(np.hstack(levels(how.noise)).any() for how in settings.values()):
-        title += ", true state"
     caption = CAPTION
-    if others.count(first) < len(others):
+    if any(vehicle != first for vehicle in vehicles.values()):
         for label, vehicle in vehicles.items():
             caption += f"; {label} flies {vehicle.name}"
     heads = ["", *metrics, *(f"thesis: {name}" for name in names)]

@@ -28,7 +28,6 @@ EPISODES = (
     "target",
     "flown",
     "reward",
-    "own_reward",
     "final_error",
     "final_offset",
     "recovery_time",

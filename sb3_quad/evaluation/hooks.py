@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.files import write_arrays
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
@@ -23,15 +22,6 @@ class Hook:
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         """See the state in which the flights start."""
-
-    def before_step(
-        self, state: QuadcopterState, observation: Float32Array, flying: BoolArray
-    ) -> None:
-        """See the state before a control step.
-
-        :param observation: (n, observation size).
-        :param flying: (n,), the flights that are still in the air.
-        """
 
     def after_step(
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
@@ -204,32 +194,3 @@ class Motion(Hook):
             "recovery_time": self._recovery_time,
             "cross_track_error": self._cross_track_error,
         }
-
-
-class Demonstrations(Hook):
-    """Keeps the observations and the actions of all control steps, clipped as the environment clips
-    them.
-    """
-
-    def __init__(self) -> None:
-        self._observations: list[Float32Array] = []
-        self._actions: list[Float32Array] = []
-
-    def before_step(
-        self, state: QuadcopterState, observation: Float32Array, flying: BoolArray
-    ) -> None:
-        self._flying = flying
-        self._observations.append(observation[flying])
-
-    def after_step(
-        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
-    ) -> None:
-        self._actions.append(actions[self._flying].clip(-1.0, 1.0))
-
-    def write(self, path: StrPath) -> None:
-        """Write ``observations`` and ``actions``, a row for each step, into an ``.npz`` file."""
-        write_arrays(
-            path,
-            observations=np.concatenate(self._observations),
-            actions=np.concatenate(self._actions),
-        )

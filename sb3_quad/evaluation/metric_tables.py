@@ -228,13 +228,13 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     shares = [SUCCESS, SURVIVAL]
     rewards = [REWARD, OWN_REWARD]
     if scenario.waypoints:
-        return [*shares, OWN_REWARD, REACHED, COMPLETED, COURSE_TIME]
+        return [*shares, REACHED, COMPLETED, COURSE_TIME]
     if len(scenario.cell) > 1:
-        return [SUCCESS, OWN_REWARD]
+        return [SUCCESS]
     if scenario.reference is not None:
         return [*shares, *rewards, *FOLLOWING]
     if scenario.group is not None:
-        return [*shares, OWN_REWARD, MEDIAN]
+        return [*shares, MEDIAN]
     # An episode that starts at its target does not fly to it.
     if not scenario.has_way:
         return [*shares, FLOWN, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]

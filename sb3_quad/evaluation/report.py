@@ -33,7 +33,6 @@ def write_report(folder: StrPath) -> Path:
     parts = [
         f"# Suite {escape(results.suite)}",
         escape(results.description),
-        escape(f"Own reward: {results.reward}" if results.reward else ""),
         f"{n_flights:,} flights in {len(results.scenarios)} scenarios, flown by sb3_quad "
         f"{results.package_version}; {CAPTION}.",
     ]
@@ -44,12 +43,6 @@ def write_report(folder: StrPath) -> Path:
             picture = f"{FIGURES}/{name}.png"
             save_figure(figure, place / picture)
             parts.append(f"![{name}]({picture})")
-    parts.append("## Controllers")
-    for record in results.controllers:
-        zip_file = f", {record.algorithm}, SHA-256 {record.content}" if record.content else ""
-        parts.append(escape(f"- {record.label}: {record.spec}{zip_file}"))
-    for failure in results.failures:
-        parts.append(escape(f"- {failure.controller}, {failure.scenario}: {failure.message}"))
     write_text(place / REPORT, "\n\n".join(filter(None, parts)) + "\n")
     return place / REPORT
 
@@ -64,8 +57,8 @@ def _figures(
     if first.group is not None:
         cells = _cells(results, scenarios)
         for number, key in enumerate(first.cell):
-            title = axis_name(key).replace("_", " ")
-            yield f"{first.group}_{number}", success_plot(cells, key, title, results.colours)
+            name = f"{first.group}_{number}"
+            yield name, success_plot(cells, key, axis_name(key), results.colours)
         return
     flights = {}
     for label in results.colours:

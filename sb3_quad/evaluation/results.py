@@ -33,11 +33,8 @@ FLIGHTS = "flights"
 REPORT = "report.md"
 WRITTEN = (RESULTS, EPISODES, REPORT)
 # Names of the columns of episodes.csv, for arrays of several numbers
-_PARTS = {
-    "target": "x y z".split(),
-    "final_offset": "x y z".split(),
-    "start": "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z".split(),
-}
+_START = "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z"
+_PARTS = {"target": "xyz", "final_offset": "xyz", "start": _START.split()}
 
 
 class ControllerRecord(Frozen):
@@ -68,14 +65,6 @@ class Entry(Frozen):
     """path of the .npz, relative to the folder"""
 
 
-class Failure(Frozen):
-    """A controller that did not get through a scenario."""
-
-    controller: str
-    scenario: str
-    message: str
-
-
 class Results(Frozen):
     """A folder of results."""
 
@@ -84,14 +73,12 @@ class Results(Frozen):
     description: str
     source: str = "published"
     """where the scenarios' published metrics come from"""
-    backend: str = "batch"
-    reward: str = ""
-    """your own reward, as given; empty: none"""
     package_version: str
     controllers: list[ControllerRecord]
     scenarios: list[Scenario]
     entries: list[Entry] = []
-    failures: list[Failure] = []
+    failures: list[str] = []
+    """controller, scenario, and what went wrong, in one line each"""
 
     @property
     def colours(self) -> dict[str, str]:

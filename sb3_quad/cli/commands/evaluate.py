@@ -21,10 +21,6 @@ examples:
   sb3-quad evaluate pid agent.zip --suite quick
   # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
-  # the mean of your own reward next to the task's
-  sb3-quad evaluate pid agent.zip --reward my_package.rewards:calm
-  # the same episodes on PyBullet
-  sb3-quad evaluate pid --suite quick --backend pybullet
   # two scenarios with another vehicle
   sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery \
     --vehicle crazyflie -o evaluations/crazyflie
@@ -44,7 +40,6 @@ from sb3_quad.cli.parser import (
     TRUST,
     YES_OR_NO,
     Flags,
-    given,
     whole,
 )
 
@@ -61,11 +56,7 @@ FLAGS: Flags = {
     "-n --n-episodes N": (whole, "episodes of each scenario (the suite's number)"),
     "--seed N": (whole, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
-    "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
     "--overwrite": (SWITCH, "remove the results that the folder holds"),
-    "--reward MODULE:FUNCTION": (
-        "show the mean of a reward of your own, function(state, actions) per control step"
-    ),
     "--report": (YES_OR_NO, True, "write report.md and its plots (yes)"),
     **TRUST,
     **PROGRESS,
@@ -89,9 +80,9 @@ def run(options: Namespace) -> int:
             suite,
             parse_controllers(options.controllers),
             folder,
+            options.overwrite,
             progress=show,
             report=warn,
-            **given(options, "backend", "overwrite", "reward"),
         )
     if results.entries:
         console().print(*overview(results))
@@ -102,6 +93,5 @@ def run(options: Namespace) -> int:
 
             print("report in", write_report(folder))
     for failure in results.failures:
-        who = f"failed: {failure.controller}, {failure.scenario}:"
-        print(who, failure.message, file=sys.stderr)
+        print("failed:", failure, file=sys.stderr)
     return int(bool(results.failures))
