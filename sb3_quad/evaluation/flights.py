@@ -279,7 +279,9 @@ def fly_settings(
 
         if record is not None:
             write_arrays(record, observations=np.concatenate(seen), actions=np.concatenate(done))
-        measured = _results(measuring)
+        measured: StrDict = {}
+        for hook in measuring:
+            measured |= hook.results()
         # Neither a course nor a moving target has a straight line to deviate from.
         measured["cross_track_error"][following.moves | (plan.waypoints.size > 0)] = np.nan
         offset = state.position - state.target
@@ -306,10 +308,3 @@ def _ask(
         return pilot.actions(observation, flying)
     except ControllerError as error:
         raise ControllerError(f"{error}, after {time:.2f} s") from error
-
-
-def _results(hooks: Sequence[Hook]) -> StrDict:
-    results: StrDict = {}
-    for hook in hooks:
-        results |= hook.results()
-    return results

@@ -23,7 +23,6 @@ WIDTH = 5.0
 HEIGHT = 3.3
 DPI = 150
 SHOWN_FLIGHTS = 4  # of a controller, from above and from the side
-LINE_POINTS = 200  # maximum number of points of a flight
 TARGET = "#1a9a45"
 POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
 STYLE = matplotlib.rc_params_from_file(
@@ -59,8 +58,7 @@ def paths_plot(flights: Flights, colours: Colours) -> Figure:
         for label, tracks in flights.items():
             for track in tracks[:SHOWN_FLIGHTS]:
                 path = track.position[:, [i, j]]
-                stride = -(-len(path) // LINE_POINTS)
-                axes.plot(*path[::stride].T, color=colours[label], label=label, linewidth=1.8)
+                axes.plot(*path.T, color=colours[label], label=label, linewidth=1.8)
                 # A target that rests is a point, one that moves is a line.
                 axes.plot(*track.targets[:, [i, j]].T, ".-", color=TARGET, label="target", zorder=1)
                 if track.lost:
@@ -77,7 +75,9 @@ def success_plot(cells: pd.DataFrame, key: str, title: str, colours: Colours) ->
     :param cells: success of each controller, a column by its label, over the varied quantities.
     :param key: the quantity; ``title``: of its axis.
     """
-    figure, axes = new_axes(title, "success")
+    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xlabel=title, ylabel="success")
     for label in cells:
         shares = cells[label].dropna().groupby(key).agg(["mean", "min", "max"])
         band(axes, colours[str(label)], str(label), shares, **POINTS)
@@ -129,14 +129,6 @@ def _mean_and_range(runs: Sequence[Curve], name: str) -> pd.DataFrame:
     if table.empty:
         return pd.DataFrame(columns=["mean", "min", "max"], dtype=np.float64)
     return table.agg(["mean", "min", "max"], axis="columns")
-
-
-def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
-    """Return a figure of one panel, and its axes."""
-    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
-    axes = figure.subplots()
-    axes.set(xlabel=x_label, ylabel=y_label)
-    return figure, axes
 
 
 def band(axes: Axes, colour: str, label: str, table: pd.DataFrame, **style: Any) -> None:

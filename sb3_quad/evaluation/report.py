@@ -29,12 +29,10 @@ def write_report(folder: StrPath) -> Path:
     """
     place = Path(folder)
     results = load_results(folder)
-    n_flights = sum(entry.metrics.n for entry in results.entries)
     parts = [
         f"# Suite {escape(results.suite)}",
         escape(results.description),
-        f"{n_flights:,} flights in {len(results.scenarios)} scenarios, flown by sb3_quad "
-        f"{results.package_version}; {CAPTION}.",
+        f"Flown by sb3_quad {results.package_version}; {CAPTION}.",
     ]
     for heading, scenarios in scenario_groups(results):
         parts += [f"## {escape(heading)}", escape(scenarios[0].description)]

@@ -42,12 +42,10 @@ class OwnRewards(Hook):
         # The function may do anything.
         with raised_as(ControllerError, f"{name}: fails"):
             values = np.asarray(self._reward(state, actions), dtype=np.float64)
-        if values.shape != (state.n,):
-            raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
-        wrong = np.flatnonzero(self._flying & ~np.isfinite(values))
-        if wrong.size:
+        # What it gives for lost flights does not matter.
+        if values.shape != (state.n,) or not np.isfinite(values[self._flying]).all():
             raise ControllerError(
-                f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite"
+                f"{name}: gives an array {values.shape}, must be finite and ({state.n},)"
             )
         self._total += np.where(self._flying, values, 0.0)
         self._flying = flying

@@ -190,12 +190,14 @@ class Scenario(Frozen):
         """
         if own is None or self.vehicle is not None:
             return self
-        vehicle = first_vehicle(own)
-        return validate(
-            Scenario,
-            self.model_dump() | {"vehicle": vehicle},
-            f"scenario {self.name}, flown by {vehicle.name}",
-        )
+        return self.changed({"vehicle": first_vehicle(own)})
+
+    def changed(self, changes: StrDict) -> "Scenario":
+        """Return the scenario with other values of some keys.
+
+        :raises ConfigError: it is impossible with them.
+        """
+        return validate(Scenario, self.model_dump() | changes, f"scenario {self.name}")
 
     def episode_seeds(self) -> list[int]:
         """The seeds of the episodes, for ``reset(seed=…)`` of one environment."""
@@ -288,18 +290,15 @@ class Suite(Frozen):
         """
         chosen: StrDict = {"n_episodes": n_episodes, "seed": seed, "vehicle": vehicle}
         changes = {key: value for key, value in chosen.items() if value is not None}
-        flown_by = ""
         if vehicle is not None:
             changes |= {"vehicles": None, "published": {}}
-            flown_by = f", flown by {vehicle}"
         known = set[str]()
         changed = []
         for scenario in self.scenarios:
             own = {scenario.name, scenario.group or scenario.name}
             known |= own
             if not names or own & {*names}:
-                data = scenario.model_dump() | changes
-                changed.append(validate(Scenario, data, f"scenario {scenario.name}{flown_by}"))
+                changed.append(scenario.changed(changes))
         refuse_unknown("scenario", names, known)
         return self.model_copy(update={"scenarios": changed})
 
