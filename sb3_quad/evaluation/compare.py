@@ -106,6 +106,8 @@ def compare(
     seeds = episode_seeds(seed, n_episodes)
     suite = load_suite("thesis")
     settings, pilots = _load(controllers, env_kwargs)
+    for label, how in settings.items():
+        warn_of_differences(label, pilots[label], how)
 
     comparison = Comparison()
     comparison.tables = []
@@ -144,7 +146,6 @@ def _load(
         how = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
         if label not in pilots:
             pilots[label] = resolve_expert(controller, how.vehicle, "controller", how.rotor_layout)
-        warn_of_differences(label, pilots[label], how)
         settings[label] = how
     return settings, pilots
 

@@ -83,7 +83,7 @@ class Arrivals(Hook):
     """When flights come within T tolerances of their targets; on a course, of the last waypoint.
 
     ``time_to``: time until |r - r_T| is first within a tolerance, s. ``settling_time``: time since
-    when it has stayed within it, s; NaN if the flight is lost. NaN if that has not happened.
+    when it has stayed within it, s; NaN if the flight is lost. Both are NaN if it never was.
 
     :param tolerances: m.
     :param course: sees each step before this hook does.

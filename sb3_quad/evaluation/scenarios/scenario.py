@@ -154,15 +154,18 @@ class Scenario(Frozen):
             raise ValueError("waypoints: give them or target, not both")
         tasks, _ = resolve_tasks(self.task, self.task_kwargs)
         points = np.array([tasks[0, T.start_position :][:3], *self.targets])
-        if self.reference is not None and (self.waypoints or self.reference.function is not None):
-            raise ValueError(
-                "reference: must be a curve or file, no function, and goes with no waypoints;"
-                " the curve polynomial has waypoints of its own"
-            )
         lowest = points[:, 2].min()
+        if self.reference is not None:
+            if self.waypoints or self.reference.function is not None:
+                raise ValueError(
+                    "reference: must be a curve or file, no function, and goes with no waypoints;"
+                    " the curve polynomial has waypoints of its own"
+                )
+            heights = self.reference.tracks(vehicle.control_step).table[:, 2]
+            lowest = min(lowest, points[-1, 2] + heights.min())
         if lowest <= vehicle.collision_radius:
             raise ValueError(
-                f"start_position, target: touch the ground at z = {lowest:.3g} m; z must exceed"
+                f"start_position, target, reference: touch the ground at z = {lowest:.3g} m; z must exceed"
                 f" {vehicle.collision_radius:g} m"
             )
         farthest = np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)
