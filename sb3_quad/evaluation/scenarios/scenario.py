@@ -165,8 +165,8 @@ class Scenario(Frozen):
             lowest = min(lowest, points[-1, 2] + heights.min())
         if lowest <= vehicle.collision_radius:
             raise ValueError(
-                f"start_position, target, reference: touch the ground at z = {lowest:.3g} m; z must exceed"
-                f" {vehicle.collision_radius:g} m"
+                f"start_position, target, reference: touch the ground at z = {lowest:.3g} m;"
+                f" z must exceed {vehicle.collision_radius:g} m"
             )
         farthest = np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)
         most = tasks[:, T.max_distance].min()
