@@ -39,7 +39,8 @@ autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False
 linkcheck_anchors = False
 # Other packages document their names themselves.
-nitpick_ignore_regex = [
+IGNORED = "Bounded|a_number|StopSignals|Perceptrons"
+nitpick_ignore_regex = [("py:.*", r"(?!sb3_quad).*"), ("py:class", rf".*\.({IGNORED})")]
     ("py:.*", r"(?!sb3_quad).*"),
     ("py:class", r".*\.(Bounded|a_number|StopSignals|Perceptrons)"),
 ]

@@ -54,7 +54,7 @@ from sb3_quad.evaluation.metric_tables import (
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.results import file_name
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
+from sb3_quad.evaluation.tables import Table
 from sb3_quad.export.network import check_policy
 from sb3_quad.training.runs import MADE_WITH, open_run
 
@@ -242,12 +242,14 @@ def write_card(
             vehicle=vehicle,
             vehicles=vehicles,
         )
-        cells = {**metric_cells(metrics), LIMIT: Cell(scenario.physical_limit, words="–")}
+        cells = dict(metric_cells(metrics))
+        if scenario.physical_limit is not None:
+            cells[LIMIT] = LIMIT.number(scenario.physical_limit)
         # These begin at their targets, so times to them are meaningless.
         if task not in TARGETS:
-            cells |= dict.fromkeys(TIMES, Cell(words="–"))
-        rows.append(Row(task, "", [cells.get(row, Cell(words="–")) for row in SHOWN]))
-    columns = [Column(row.heading) for row in SHOWN]
+            cells |= dict.fromkeys(TIMES, "–")
+        rows.append([task, *(cells.get(row, "–") for row in SHOWN)])
+    heads = ["", *(row.heading for row in SHOWN)]
     known = {key: settings[key] for key in ObservationSettings.model_fields if key in settings}
     seen = ObservationSettings.model_validate(known).model_dump(exclude_defaults=True)
     flies = f"the vehicle `{vehicle.name}`" if vehicles is None else str(vehicles)
@@ -262,9 +264,9 @@ def write_card(
         noise=in_words(settings["noise"]),
         recoveries=f"{measured[RECOVERY].n:,}",
         targets=f"{targets:,}",
-        table=Table(columns, rows).markdown(),
+        table=Table(heads, rows).markdown(),
         command=command,
-        facts=text_table("", ("", ""), facts.items()).markdown(),
+        facts=Table(("", ""), [*facts.items()]).markdown(),
     )
 
 

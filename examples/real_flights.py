@@ -17,7 +17,7 @@ from rich.console import Console
 from sb3_quad import load_vehicle
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.evaluation.real_flights import error_table, open_loop, read_logs
-from sb3_quad.evaluation.tables import text_table
+from sb3_quad.evaluation.tables import Table
 
 STEP = 0.01  # s, of the estimates
 AXES = ("roll", "pitch", "yaw", "thrust")
@@ -111,9 +111,8 @@ def lag_table(runs):
         for value, width in zip(whole, spread, strict=True):
             texts.append(f"{value:.3g} ± {width:.2g}")
         rows.append([name, *texts])
-    return text_table(
-        "from commands to motion", ("axis", "lag, ms", "of it delay, ms", "slope"), rows
-    )
+    heads = ("axis", "lag, ms", "of it delay, ms", "slope")
+    return Table(heads, rows, "from commands to motion")
 
 
 def estimates(runs, axis):

@@ -22,7 +22,7 @@ from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.statistics import bootstrap, mean, share
-from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.evaluation.tables import Table
 from sb3_quad.experts.pid import PIDExpert
 
 BACKENDS = ("batch", "pybullet")
@@ -214,21 +214,11 @@ def test_the_conventions_give_the_specified_metrics():
     assert metrics.success.value == 1.0
 
 
-@pytest.mark.parametrize("suite", ["thesis", "robustness", "trajectories"])
-def test_an_own_reward_stands_in_the_table_of_every_scenario(suite):
-    def distance(state, actions):
-        return state.distance
-
-    cells = metric_cells(summarise(fly(hover, n_episodes=2, max_episode_steps=2, reward=distance)))
-    for scenario in load_suite(suite).scenarios:
-        assert "mean own reward" in [row.name for row in metric_rows(scenario, [cells])]
-
-
 def table_of(metrics, name, beside):
     scenario = load_suite("thesis").scenario(name)
     published = [scenario.published[each] for each in beside]
     rows = metric_rows(scenario, [metric_cells(metrics)], published)
-    return Table([Column("agent"), *(Column(each, source="thesis") for each in beside)], rows)
+    return Table(["", "agent", *beside], rows)
 
 
 def test_metrics_and_tables_say_how_many_arrived():
@@ -243,7 +233,6 @@ def test_metrics_and_tables_say_how_many_arrived():
         flown=np.full(n, 15.0),
         time_to={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 5.0, np.nan, 6.0])},
         settling_time={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 6.0, np.nan, np.nan])},
-        overshoot=np.full(n, np.nan),
         path_length=np.full(n, 10.0),
         final_error=np.array([0.1, 0.2, 9.0, 0.3]),
         final_offset=np.array([[0.1, 0, 0], [0.2, 0, 0], [np.nan] * 3, [0.3, 0, 0]]),
@@ -268,7 +257,7 @@ def test_metrics_and_tables_say_how_many_arrived():
     for part in ("25.0 (", "75.0 (", "5.00 (", ", 75 % arrive", "never", "0.290", "7.75"):
         assert part in text
     one_lost = metrics.model_copy(update={"success": share([False] + [True] * 3839)})
-    assert metric_cells(one_lost)[SUCCESS].number == "99.97"  # not 100
+    assert metric_cells(one_lost)[SUCCESS].startswith("99.97 ")  # not 100
 
 
 def test_a_bootstrap_of_many_values_needs_little_memory_and_blocks_change_no_number(monkeypatch):

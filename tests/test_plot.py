@@ -27,7 +27,7 @@ def runs(tmp_path):
 def test_a_curve_holds_the_means_of_the_evaluations(runs):
     curve = read_curve(runs / "Env_2")
     np.testing.assert_array_equal(curve.values("success"), [0.5, 1.0])
-    np.testing.assert_array_equal(curve.reward, [-6.0, -2.0])
+    np.testing.assert_array_equal(curve.measures["reward"], [-6.0, -2.0])
     np.testing.assert_array_equal(curve.seconds, [120.0, 240.0])
 
 

@@ -37,7 +37,7 @@ assert main(["train", "--resume", str(run)]) == 0
 with locked(run, "run folder"):
     assert main(["train", "--resume", str(run)]) == 2
 evaluate = "evaluate pid geometric --suite quick -n 2 --scenario recovery --no-report"
-assert main([*evaluate.split(), "--workers", "2"]) == 0
+assert main(evaluate.split()) == 0
 """
 
 

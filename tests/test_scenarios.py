@@ -15,7 +15,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
-from sb3_quad.evaluation.scenarios.load import SUITES, axis_label, load_suite, parse_suite
+from sb3_quad.evaluation.scenarios.load import SUITES, axis_name, load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 
@@ -114,8 +114,7 @@ def test_vary_is_a_grid_of_named_cells():
     for cell in cells:
         assert cell.group == "s"
         assert cell.cell == {"noise": cell.noise, "start.tilt": cell.start.tilt}
-    assert axis_label("start.tilt") == "tilt (deg)"
-    assert axis_label("randomize.gusts.std") == "gusts (std, N)"
+    assert axis_name("randomize.gusts.std") == "gusts"
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,7 @@ from sb3_quad.cli import main
 ROOT = Path(__file__).resolve().parent.parent
 ON_PYBULLET = ("base.bullet", "envs.bullet", "envs.quadcopter_env", "envs.rendering", "show")
 NEEDS_PYBULLET = tuple(f"sb3_quad.{name}" for name in ON_PYBULLET)
-LINE = (
-    "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, --backend pybullet, enjoy) "
-    "needs pybullet "
-)
+LINE = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, enjoy) needs pybullet "
 
 
 def modules():
@@ -69,7 +66,6 @@ def without_pybullet(monkeypatch):
     "command",
     [
         "enjoy pid --no-render",
-        "evaluate pid geometric --suite quick --backend pybullet -o out",
         "train --algo ppo --vec-env subproc -n 100 --n-envs 2",
     ],
 )

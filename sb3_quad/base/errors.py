@@ -37,10 +37,6 @@ class ControllerError(SB3QuadError, RuntimeError):
     """A controller that fails in flight. Says when, and what it raised or returned."""
 
 
-class WorkerDied(SB3QuadError, RuntimeError):
-    """A worker process that ended before its task: killed, crashed, or out of memory."""
-
-
 class ExportError(SB3QuadError, RuntimeError):
     """An exported policy whose actions differ from the trained one's, or that cannot be checked."""
 

@@ -1,35 +1,26 @@
 """Controllers on the same episodes of some tasks, in one table for each task."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Group
 
-from sb3_quad.agents.agent_settings import settings_of_model
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.resolve import resolve_expert
-from sb3_quad.base.errors import ConfigError, refuse_unknown
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrDict, StrMapping
-from sb3_quad.envs.simulation.settings import FlightSettings, levels
+from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.tasks import Task, in_words
 from sb3_quad.envs.vehicles.vehicle import first_vehicle, load_vehicle
-from sb3_quad.evaluation.controllers import ControllerSpec
-from sb3_quad.evaluation.flights import (
-    episode_seeds,
-    fly_settings,
-    refuse_several_limits,
-    warn_of_differences,
-)
+from sb3_quad.evaluation.controllers import known_settings
+from sb3_quad.evaluation.flights import episode_seeds, fly_settings, warn_of_differences
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
-from sb3_quad.evaluation.reward import OwnReward, load_reward
+from sb3_quad.evaluation.reward import Reward
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
-from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.evaluation.tables import Table
 
 THESIS_VEHICLE = "itm"  # the thesis has metrics of no other one
 
@@ -58,7 +49,7 @@ def compare(
     tasks: Any = ("target_tracking", "state_recovery"),
     n_episodes: int = 240,
     seed: int | None = None,
-    reward: OwnReward = None,
+    reward: Reward | None = None,
     thesis_columns: Sequence[str] = (),
     **env_kwargs: Any,
 ) -> Comparison:
@@ -66,9 +57,8 @@ def compare(
 
     Each agent flies as it was trained: with the vehicle, the noise and the observation that its zip
     or ``model.flight_settings`` names. Experts, functions and agents that name none fly the vehicle
-    and the noise of the first agent that names them. So do controllers that a factory makes, except
-    that a model keeps its own observation. Experts see the true state. A warning names those that
-    fly another vehicle than they know.
+    and the noise of the first agent that names them. Experts see the true state. A warning names
+    those that fly another vehicle than they know.
 
     >>> from sb3_quad.evaluation.compare import compare
     >>> result = compare({"PID": "pid", "agent": "itm-recovery"}, ["state_recovery"], n_episodes=48)
@@ -90,8 +80,7 @@ def compare(
     :param seed: seed of the episodes, as for :func:`~sb3_quad.evaluation.flights.fly`; None: one
         that no training flies.
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) as
-        :func:`~sb3_quad.evaluation.flights.fly` takes it, or ``"package.module:function"``. Its
-        mean is shown below that of the task.
+        :func:`~sb3_quad.evaluation.flights.fly` takes it. Its mean is shown below that of the task.
     :param thesis_columns: columns of the thesis to add if its vehicle flies one of its tasks:
         ``"expert"``, ``"IL-agent"``, ``"RL-agent"``.
     :param env_kwargs: fields of
@@ -110,35 +99,23 @@ def compare(
     if isinstance(tasks, (str, Mapping, Task)):
         tasks = [tasks]
     names = [in_words(task) for task in tasks]
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"compare: several tasks are named {name}; name them differently")
+    if len({*names}) < len(names):
+        raise ConfigError(f"compare: tasks {', '.join(names)}: name each differently")
     if seed is None:
         seed = seed_for("table")
     seeds = episode_seeds(seed, n_episodes)
     suite = load_suite("thesis")
-    published = [name for scenario in suite.scenarios for name in scenario.published]
-    refuse_unknown("thesis column", thesis_columns, {*published})
-    own_reward = load_reward(reward)
-    settings = _settings(controllers, env_kwargs)
-    pilots = {}
+    settings, pilots = _load(controllers, env_kwargs)
     for label, how in settings.items():
-        pilot = resolve_expert(controllers[label], how.vehicle, "controller", how.rotor_layout)
-        own = settings_of_model(pilot)
-        # What a model from a factory observes is known only now.
-        if own is not None:
-            settings[label] = how.with_changes(**{**own.carried, **env_kwargs})
-        refuse_several_limits(settings[label])
-        warn_of_differences(label, pilot, settings[label])
-        pilots[label] = pilot
+        warn_of_differences(label, pilots[label], how)
 
     comparison = Comparison()
     comparison.tables = []
     for name, task in zip(names, tasks, strict=True):
         metrics = {}
-        for label, pilot in pilots.items():
-            how = settings[label].with_changes(task=task)
-            metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
+        for label, own in settings.items():
+            how = own.with_changes(task=task)
+            metrics[label] = summarise(fly_settings(pilots[label], how, seeds, reward=reward))
             comparison.setdefault(label, {})[name] = metrics[label]
         comparison.tables.append(
             _task_table(name, metrics, settings, suite, thesis_columns, n_episodes)
@@ -146,30 +123,31 @@ def compare(
     return comparison
 
 
-def _settings(controllers: StrMapping, env_kwargs: StrMapping) -> dict[str, FlightSettings]:
-    """Return the flight settings of each controller, except for the task."""
+def _load(
+    controllers: StrMapping, env_kwargs: StrMapping
+) -> tuple[dict[str, FlightSettings], StrDict]:
+    """Return the flight settings of each controller, except for the task, and the controllers."""
     shared: StrDict = {}
     own = {}
+    pilots = {}
     for label, controller in controllers.items():
-        if isinstance(controller, (str, Path)):
-            path = agent_path(str(controller))
-            known = ControllerSpec(path, path).own
-        else:
-            known = settings_of_model(controller)
-        if known is not None:
-            # On another vehicle, the agent still has its rotors where it knows them.
-            own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
-            # The first agent decides for all controllers that do not say how they fly.
-            if not shared:
-                shared = {
-                    "vehicle": known.vehicle,
-                    "vehicles": known.vehicles,
-                    "noise": known.noise,
-                }
+        pilot = resolve_expert(controller, env_kwargs.get("vehicle", "itm"), "controller")
+        known = known_settings(controller, pilot)
+        if known is None:
+            continue
+        pilots[label] = pilot
+        # On another vehicle, the agent still has its rotors where it knows them.
+        own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
+        # The first agent decides for all controllers that do not say how they fly.
+        if not shared:
+            shared = {name: getattr(known, name) for name in ("vehicle", "vehicles", "noise")}
     settings = {}
-    for label in controllers:
-        settings[label] = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
-    return settings
+    for label, controller in controllers.items():
+        how = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
+        if label not in pilots:
+            pilots[label] = resolve_expert(controller, how.vehicle, "controller", how.rotor_layout)
+        settings[label] = how
+    return settings, pilots
 
 
 def _task_table(
@@ -185,7 +163,7 @@ def _task_table(
     :param suite: the thesis's suite, which has the rows and the published metrics.
     """
     vehicles = {label: first_vehicle(how.vehicle) for label, how in settings.items()}
-    first, *others = vehicles.values()
+    first = next(iter(vehicles.values()))
     # Tasks of your own have the rows of target tracking.
     scenario = suite.scenario(THESIS_SCENARIOS.get(task, "tracking"))
     reference = settings[next(iter(settings))].reference
@@ -195,15 +173,12 @@ def _task_table(
     names = []
     if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):
         names = [name for name in thesis_columns if name in scenario.published]
-    columns = [*map(Column, metrics), *(Column(name, source="thesis") for name in names)]
-    cells = [*map(metric_cells, metrics.values())]
-    rows = metric_rows(scenario, cells, [scenario.published[name] for name in names])
-
+    published = [scenario.published[name] for name in names]
+    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], published)
     title = f"{task}: {n_episodes} fresh episodes, the same for all"
-    if not any(np.hstack(levels(how.noise)).any() for how in settings.values()):
-        title += ", true state"
     caption = CAPTION
-    if others.count(first) < len(others):
+    if any(vehicle != first for vehicle in vehicles.values()):
         for label, vehicle in vehicles.items():
             caption += f"; {label} flies {vehicle.name}"
-    return Table(columns, rows, title=title, caption=caption)
+    heads = ["", *metrics, *(f"thesis: {name}" for name in names)]
+    return Table(heads, rows, title, caption)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
+from sb3_quad.agents.agent_settings import agent_settings, settings_of_model, unlike_trained
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.resolve import EXPERTS, import_factory
 from sb3_quad.agents.zips import saved_algorithm
@@ -78,6 +78,19 @@ class ControllerSpec:
             f"{self.label}: {self.spec} does not say how its agent flies; it flies {flown.name},"
             " with the scaling of Table A.2"
         )
+
+
+def known_settings(controller: Any, model: Any) -> FlightSettings | None:
+    """Return how a controller was trained to fly; None: it does not say.
+
+    :param controller: as it was given, such as the path of a zip.
+    :param model: what was loaded.
+    """
+    known = settings_of_model(model)
+    # Zips of rl_zoo3 have their settings beside them.
+    if known is None and isinstance(controller, (str, Path)):
+        known = ControllerSpec("", agent_path(str(controller))).own
+    return known
 
 
 def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:

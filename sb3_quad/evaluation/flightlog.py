@@ -10,14 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_quad.base.files import read_arrays
-from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, StrPath
-from sb3_quad.envs.simulation.state import (
-    FORCE_BODY,
-    FORCE_WORLD,
-    TORQUE_BODY,
-    TORQUE_WORLD,
-    QuadcopterState,
-)
+from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, StrPath
+from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.following import FOLLOWED
@@ -34,13 +28,11 @@ EPISODES = (
     "target",
     "flown",
     "reward",
-    "own_reward",
     "final_error",
     "final_offset",
     "recovery_time",
     "cross_track_error",
     *FOLLOWED,
-    "overshoot",
 )
 
 
@@ -55,26 +47,8 @@ class Recorder(Hook):
         self._stride = max(1, round(1.0 / (SAMPLE_RATE * vehicle.control_step)))
         self._log: list[Arrays] = []
         self._samples = np.zeros(min(self._m, state.n), dtype=np.int64)
-        self._wrench = np.zeros((len(self._samples), 6))
         # There is no action at the start.
         self._sample(state, np.full((state.n, 4), np.nan), np.ones(state.n, bool))
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        if not wrench.any():
-            return
-        # Sum forces in the world frame and torques in the body frame until the next sample.
-        rows = wrench[: self._m]
-        rotation = state.rotation[: self._m]
-        self._wrench += np.hstack([rows[:, FORCE_WORLD], rows[:, TORQUE_BODY]])
-        self._wrench[:, :3] += np.einsum("nij,nj->ni", rotation, rows[:, FORCE_BODY])
-        # World to body: the transposed rotation.
-        self._wrench[:, 3:] += np.einsum("nji,nj->ni", rotation, rows[:, TORQUE_WORLD])
 
     def after_step(
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
@@ -86,12 +60,10 @@ class Recorder(Hook):
         rows = flying[: self._m]
         values = {name: getattr(state, name) for name in STATES}
         values["action"] = actions
-        values["wrench"] = self._wrench / self._stride
         for name, array in values.items():
             values[name] = np.where(rows[:, None], array[: self._m], np.nan)
         self._log.append(values)
         self._samples[rows] = len(self._log)
-        self._wrench[:] = 0.0
 
     def arrays(self) -> Arrays:
         """Return the arrays of trajectories, as long as the longest flight."""
@@ -128,23 +100,9 @@ read_flights = read_arrays  # by name; with the prefix ``episode_`` only the met
 class Track(NamedTuple):
     """One flight, k samples."""
 
-    times: FloatArray  # (k,), s
-    position: Float32Array  # (k, 3), world frame, m; target likewise
-    target: Float32Array
-    # (k, 6), mean since the previous sample: force, world frame, N; torque, body frame, N m
-    wrench: Float32Array
+    position: Float32Array  # (k, 3), world frame, m
+    targets: Float32Array  # (n, 3), one after the other, likewise
     lost: bool
-
-    @property
-    def error(self) -> FloatArray:
-        """|r - r_T|, (k,), m."""
-        return np.asarray(np.linalg.norm(self.position - self.target, axis=1))
-
-    @property
-    def targets(self) -> Float32Array:
-        """The targets, one after the other, (n, 3), m."""
-        # The first target counts as a change, from NaN.
-        return self.target[np.diff(self.target, axis=0, prepend=np.nan).any(axis=1)]
 
 
 def read_tracks(path: StrPath) -> list[Track]:
@@ -155,14 +113,9 @@ def read_tracks(path: StrPath) -> list[Track]:
     arrays = read_arrays(path)
     tracks = []
     for number, samples in enumerate(arrays["samples"]):
-        flown = slice(samples)
-        tracks.append(
-            Track(
-                arrays["time"][flown],
-                arrays["position"][number, flown],
-                arrays["target"][number, flown],
-                arrays["wrench"][number, flown],
-                str(arrays["episode_outcome"][number]) in LOST,
-            )
-        )
+        target = arrays["target"][number, :samples]
+        # The first target counts as a change, from NaN.
+        changes = np.diff(target, axis=0, prepend=np.nan).any(axis=1)
+        lost = str(arrays["episode_outcome"][number]) in LOST
+        tracks.append(Track(arrays["position"][number, :samples], target[changes], lost))
     return tracks

@@ -5,7 +5,6 @@ the end of the first control step after which |r - r_T| is within it. The path l
 whole episode of 15 s, not only of the way until arrival.
 """
 
-import inspect
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -23,7 +22,8 @@ from sb3_quad.agents.agent_settings import (
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.controller import Controller
 from sb3_quad.algorithms.labelling import warn_of_vehicle
-from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown, unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown
+from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import (
     BoolArray,
@@ -42,7 +42,7 @@ from sb3_quad.envs.simulation.state import TARGET
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.following import Following
-from sb3_quad.evaluation.hooks import Arrivals, Course, Demonstrations, Hook, Motion
+from sb3_quad.evaluation.hooks import Arrivals, Course, Hook, Motion
 from sb3_quad.evaluation.reward import OwnRewards, Reward
 from sb3_quad.evaluation.scenarios.sample import Plan
 
@@ -69,9 +69,6 @@ class Flights:
     #: By tolerance (m): time after which |r - r_T| stays within it to the end, s, (n,); NaN if the
     #: flight ended outside or was lost.
     settling_time: Mapping[float, FloatArray]
-    #: (n,), largest |r - r_T| since it was first within 0.1 m, or the tightest tolerance, m;
-    #: NaN if it never was
-    overshoot: FloatArray
     path_length: FloatArray  #: (n,), m, over the whole episode
     final_error: FloatArray  #: (n,), |r - r_T| at the end, m
     #: (n, 3), r - r_T at the end, world frame, m; NaN if the flight was lost
@@ -157,9 +154,6 @@ def fly(
     :raises ControllerError: a controller of another kind, or a controller or reward that fails in
         flight.
     """
-    valid = {*inspect.signature(fly).parameters, *FlightSettings.model_fields} - {"environment"}
-    for key in environment.keys() - valid:
-        raise ConfigError(f"fly: {unknown('keyword', key, valid)}")
     seeds = episode_seeds(seed, n_episodes)
     limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
     if min(limits, default=1.0) <= 0.0:
@@ -179,20 +173,10 @@ def fly(
             environment["rotor_layout"] = own.layout
     environment.setdefault("max_episode_steps", MAX_EPISODE_STEPS)
     settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
-    refuse_several_limits(settings)
     warn_of_differences(name, controller, settings)
     return fly_settings(
         controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
     )
-
-
-def refuse_several_limits(settings: FlightSettings) -> None:
-    """Refuse a limit for each row, since flights end together."""
-    if isinstance(settings.max_episode_steps, list):
-        raise ConfigError(
-            f"max_episode_steps {settings.max_episode_steps}: must be one number, the limit of all"
-            " flights"
-        )
 
 
 def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
@@ -240,9 +224,13 @@ def fly_settings(
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
     refuse_unknown("backend", [backend], FLEETS)
+    limit = settings.max_episode_steps
+    if isinstance(limit, list):
+        raise ConfigError(f"max_episode_steps {limit}: must be one number, for all flights")
     plan = plan or Plan()
     course = Course(plan.waypoints, plan.radius)
-    demonstrations = Demonstrations()
+    seen: list[Float32Array] = []
+    done: list[Float32Array] = []
     with closing(FLEETS[backend](seeds, settings)) as fleet:
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
@@ -250,10 +238,7 @@ def fly_settings(
         )
         following = Following(fleet.moves)
         measuring = [course, Arrivals(tolerances, course), Motion(), following, OwnRewards(reward)]
-        given = list(hooks)
-        if record is not None:
-            given.append(demonstrations)
-        watching = [*measuring, *given]
+        watching = [*measuring, *hooks]
         control_step = fleet.vehicle_list[0].control_step
         observation = fleet.begin(plan.start)
         # The state is a live view: copy what later steps need.
@@ -272,9 +257,10 @@ def fly_settings(
             if step - 1 in plan.wrenches:
                 fleet.wrench[:] = plan.wrenches[step - 1].T
             actions = _ask(pilot, observation, flying, (step - 1) * control_step)
-            # What measures sees only the state after a step.
-            for hook in given:
-                hook.before_step(state, observation, fleet.total_wrench().T, flying)
+            if record is not None:
+                seen.append(observation[flying])
+                # As the environment clips them.
+                done.append(actions[flying].clip(-1.0, 1.0))
             observation, rewards, _ = fleet.step(actions)
             state = fleet.true_state()
             # This step also counts for the flights that it has ended.
@@ -292,8 +278,10 @@ def fly_settings(
                 observation = fleet.observe()
 
         if record is not None:
-            demonstrations.write(record)
-        measured = _results(measuring)
+            write_arrays(record, observations=np.concatenate(seen), actions=np.concatenate(done))
+        measured: StrDict = {}
+        for hook in measuring:
+            measured |= hook.results()
         # Neither a course nor a moving target has a straight line to deviate from.
         measured["cross_track_error"][following.moves | (plan.waypoints.size > 0)] = np.nan
         offset = state.position - state.target
@@ -320,10 +308,3 @@ def _ask(
         return pilot.actions(observation, flying)
     except ControllerError as error:
         raise ControllerError(f"{error}, after {time:.2f} s") from error
-
-
-def _results(hooks: Sequence[Hook]) -> StrDict:
-    results: StrDict = {}
-    for hook in hooks:
-        results |= hook.results()
-    return results

@@ -5,12 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.files import write_arrays
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrPath
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
-NEAR = 0.1  # m; overshoot is judged by it, or by the tightest tolerance if it is not among them
+NEAR = 0.1  # m; settling is judged by it, or by the tightest tolerance if it is not among them
 # A vehicle is stable while its tilt (rad) and its rate of roll and pitch together (rad/s) are below
 # these for at least HOLD (s).
 TILT = np.radians(45.0)
@@ -23,20 +22,6 @@ class Hook:
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         """See the state in which the flights start."""
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        """See the state before a control step.
-
-        :param observation: (n, observation size).
-        :param wrench: (n, WRENCH_SIZE), that acts during the step.
-        :param flying: (n,), the flights that are still in the air.
-        """
 
     def after_step(
         self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
@@ -98,8 +83,7 @@ class Arrivals(Hook):
     """When flights come within T tolerances of their targets; on a course, of the last waypoint.
 
     ``time_to``: time until |r - r_T| is first within a tolerance, s. ``settling_time``: time since
-    when it has stayed within it, s; NaN if the flight is lost. ``overshoot``: the largest
-    |r - r_T|, m, since it was first within :func:`arrival_tolerance`. NaN if that has not happened.
+    when it has stayed within it, s; NaN if the flight is lost. Both are NaN if it never was.
 
     :param tolerances: m.
     :param course: sees each step before this hook does.
@@ -116,12 +100,6 @@ class Arrivals(Hook):
         self._distance = state.distance
         self._time_to = np.full((len(self._tolerances), state.n), np.nan)
         self._settling_time = self._time_to.copy()
-        self._overshoot = np.full(state.n, np.nan)
-        self._first = self._overshoot.copy()
-        if self._tolerances:
-            # A view, which shows later arrivals.
-            near = arrival_tolerance(self._tolerances)
-            self._first = self._time_to[[*self._tolerances].index(near)]
         self._update(0.0)
 
     def after_step(
@@ -137,8 +115,6 @@ class Arrivals(Hook):
         inside = distance <= self._limits
         np.fmin(self._time_to, np.where(inside, time, np.nan), out=self._time_to)
         self._settling_time = _since(self._settling_time, inside, time)
-        arrived = np.isfinite(self._first)
-        np.fmax(self._overshoot, distance, out=self._overshoot, where=arrived)
 
     def results(self) -> Mapping[str, Any]:
         # A lost flight has no time after which it stays at its target.
@@ -146,12 +122,11 @@ class Arrivals(Hook):
         return {
             "time_to": dict(zip(self._tolerances, self._time_to, strict=True)),
             "settling_time": dict(zip(self._tolerances, settling_time, strict=True)),
-            "overshoot": self._overshoot,
         }
 
 
 def arrival_tolerance(tolerances: Iterable[float]) -> float:
-    """Return the tolerance, m, by which overshoot and the settling time are judged."""
+    """Return the tolerance, m, by which settling is judged."""
     return min(tolerances, key=lambda tolerance: (tolerance != NEAR, tolerance))
 
 
@@ -219,36 +194,3 @@ class Motion(Hook):
             "recovery_time": self._recovery_time,
             "cross_track_error": self._cross_track_error,
         }
-
-
-class Demonstrations(Hook):
-    """Keeps the observations and the actions of all control steps, clipped as the environment clips
-    them.
-    """
-
-    def __init__(self) -> None:
-        self._observations: list[Float32Array] = []
-        self._actions: list[Float32Array] = []
-
-    def before_step(
-        self,
-        state: QuadcopterState,
-        observation: Float32Array,
-        wrench: FloatArray,
-        flying: BoolArray,
-    ) -> None:
-        self._flying = flying
-        self._observations.append(observation[flying])
-
-    def after_step(
-        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
-    ) -> None:
-        self._actions.append(actions[self._flying].clip(-1.0, 1.0))
-
-    def write(self, path: StrPath) -> None:
-        """Write ``observations`` and ``actions``, a row for each step, into an ``.npz`` file."""
-        write_arrays(
-            path,
-            observations=np.concatenate(self._observations),
-            actions=np.concatenate(self._actions),
-        )

@@ -27,11 +27,6 @@ class Curve(NamedTuple):
     # them, and losses of the update before each evaluation, NaN if there was none.
     measures: Mapping[str, FloatArray]
 
-    @property
-    def reward(self) -> FloatArray:
-        """Mean reward per episode, (k,)."""
-        return self.measures["reward"]
-
     def values(self, name: str) -> FloatArray:
         """Return a measure, (k,); NaN if the run does not have it."""
         return self.measures.get(name, np.full(len(self.timesteps), np.nan))

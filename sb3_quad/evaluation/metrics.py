@@ -64,13 +64,11 @@ class Metrics(Frozen):
     """mean time flown until the loss or the end, s"""
     arrivals: list[Arrival]
     """by tolerance, the tightest first"""
-    overshoot: float | None
-    """median of the largest |r - r_T| since arrival, m"""
     path: Estimate | None
     """mean length of the path over the whole episode, m"""
     final_error: Estimate | None
     """mean |r - r_T| at the end, m"""
-    final_error_median: float | None
+    final_error_median: Estimate | None
     """m"""
     final_error_95: Estimate | None
     """95 % quantile of the final error, m"""
@@ -116,10 +114,9 @@ def summarise(flights: Flights) -> Metrics:
         own_reward=mean(flights.own_reward),
         flown=bootstrap(flights.flown),
         arrivals=[_arrival(flights, tolerance) for tolerance in sorted(flights.time_to)],
-        overshoot=_median(flights.overshoot),
         path=mean(flights.path_length[survived]),
         final_error=mean(error),
-        final_error_median=_median(error),
+        final_error_median=mean(error, np.median),
         final_error_95=mean(error, partial(np.quantile, q=0.95)),
         recovery_time=_moment(flights.recovery_time),
         cross_track_error=mean(flights.cross_track_error[survived]),
@@ -142,8 +139,3 @@ def _arrival(flights: Flights, tolerance: float) -> Arrival:
 
 def _moment(times: FloatArray) -> Moment:
     return Moment(share=share(np.isfinite(times)), time=mean(times))
-
-
-def _median(values: FloatArray) -> float | None:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else None

@@ -16,7 +16,6 @@ from sb3_quad.base.files import write_bytes
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.learning_curves import Curve
-from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.tables import colours_of
 
 # Inches of a panel
@@ -24,7 +23,6 @@ WIDTH = 5.0
 HEIGHT = 3.3
 DPI = 150
 SHOWN_FLIGHTS = 4  # of a controller, from above and from the side
-LINE_POINTS = 200  # maximum number of points of a flight
 TARGET = "#1a9a45"
 POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
 STYLE = matplotlib.rc_params_from_file(
@@ -48,21 +46,6 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 @styled
-def arrivals_plot(metrics: Mapping[str, Metrics], colours: Colours) -> Figure:
-    """Draw the mean times to each tolerance, cf. Figs. 4.6 and 4.7, with 95 % intervals."""
-    figure, axes = new_axes("tolerance (m)", "time (s)")
-    for label, measured in metrics.items():
-        # There is no point if no flight arrives.
-        means = [dict(arrival.time or {}) for arrival in measured.arrivals]
-        tolerances = [arrival.tolerance for arrival in measured.arrivals]
-        times = pd.DataFrame(means, tolerances, ["value", "low", "high"], np.float64)
-        band(axes, colours[label], label, times, **POINTS)
-    axes.set_ylim(bottom=0.0)
-    legend(figure)
-    return figure
-
-
-@styled
 def paths_plot(flights: Flights, colours: Colours) -> Figure:
     """Draw the first flights of each controller from above and from the side, with their targets.
 
@@ -75,11 +58,9 @@ def paths_plot(flights: Flights, colours: Colours) -> Figure:
         for label, tracks in flights.items():
             for track in tracks[:SHOWN_FLIGHTS]:
                 path = track.position[:, [i, j]]
-                stride = -(-len(path) // LINE_POINTS)
-                axes.plot(*path[::stride].T, color=colours[label], label=label, linewidth=1.8)
+                axes.plot(*path.T, color=colours[label], label=label, linewidth=1.8)
                 # A target that rests is a point, one that moves is a line.
-                target = track.targets[:, [i, j]]
-                axes.plot(*target.T, ".-", color=TARGET, label="target", zorder=1)
+                axes.plot(*track.targets[:, [i, j]].T, ".-", color=TARGET, label="target", zorder=1)
                 if track.lost:
                     axes.plot(*path[-1], "X", color=colours[label], markersize=9)
     legend(figure)
@@ -94,7 +75,9 @@ def success_plot(cells: pd.DataFrame, key: str, title: str, colours: Colours) ->
     :param cells: success of each controller, a column by its label, over the varied quantities.
     :param key: the quantity; ``title``: of its axis.
     """
-    figure, axes = new_axes(title, "success")
+    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xlabel=title, ylabel="success")
     for label in cells:
         shares = cells[label].dropna().groupby(key).agg(["mean", "min", "max"])
         band(axes, colours[str(label)], str(label), shares, **POINTS)
@@ -146,14 +129,6 @@ def _mean_and_range(runs: Sequence[Curve], name: str) -> pd.DataFrame:
     if table.empty:
         return pd.DataFrame(columns=["mean", "min", "max"], dtype=np.float64)
     return table.agg(["mean", "min", "max"], axis="columns")
-
-
-def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
-    """Return a figure of one panel, and its axes."""
-    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
-    axes = figure.subplots()
-    axes.set(xlabel=x_label, ylabel=y_label)
-    return figure, axes
 
 
 def band(axes: Axes, colour: str, label: str, table: pd.DataFrame, **style: Any) -> None:

@@ -29,7 +29,7 @@ from sb3_quad.envs.simulation.state import (
 )
 from sb3_quad.envs.vehicles.layout import find_turn
 from sb3_quad.envs.vehicles.vehicle import GRAVITY, Vehicle, first_vehicle
-from sb3_quad.evaluation.tables import Table, text_table
+from sb3_quad.evaluation.tables import Table
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s
@@ -49,10 +49,11 @@ FULL_PWM = 65_535.0
 CAPTURE_COLUMNS = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
 GYRO_COLUMNS = ["imu_gyro_x", "imu_gyro_y", "imu_gyro_z"]
 THRUSTS = ["thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4"]
-PWM = ["motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4", "pwr_pm_vbat"]
+PWM = ["motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4"]
+BATTERY = "pwr_pm_vbat"
 NEEDED = (
     f"a log is a CSV file with the columns t, {', '.join(CAPTURE_COLUMNS + GYRO_COLUMNS)}, "
-    f"and thrusts in N ({', '.join(THRUSTS)}) or {', '.join(PWM)}"
+    f"and thrusts in N ({', '.join(THRUSTS)}) or {', '.join(PWM)}, {BATTERY}"
 )
 QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
 HEADINGS = ("root mean square of the error", "simulated", "nothing changes", "velocity, rates stay")
@@ -87,7 +88,7 @@ def read_log(path: Path, step: float) -> Log:
     measured = ["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS]
     with raised_as(ConfigError, f"{path}: not a table of numbers"):
         table = pd.read_csv(path).astype(float)
-    commands = THRUSTS if THRUSTS[0] in table else PWM
+    commands = THRUSTS if THRUSTS[0] in table else [*PWM, BATTERY]
     missing = {*measured, *commands} - {*table}
     if missing:
         raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
@@ -97,6 +98,8 @@ def read_log(path: Path, step: float) -> Log:
     refuse_gaps(path, table[measured])
     time = table["t"]
     refuse_falling_times(path, time)
+    if commands is not THRUSTS:
+        table[THRUSTS] = motor_thrusts(table[PWM].to_numpy(), table[[BATTERY]].to_numpy())
     # q and -q are the same attitude, but interpolation between them would pass through others.
     quaternions = table[CAPTURE_COLUMNS[QUATERNION]]
     cosines = (quaternions * quaternions.shift()).sum(axis=1)
@@ -107,12 +110,6 @@ def read_log(path: Path, step: float) -> Log:
     def resampled(names: list[str], behind: float = 0.0) -> FloatArray:
         return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
 
-    def commanded(behind: float = 0.0) -> FloatArray:
-        thrusts = resampled(commands, behind)
-        if commands is PWM:
-            thrusts = motor_thrusts(thrusts[:, :4], thrusts[:, 4:])
-        return thrusts
-
     motion = resampled(CAPTURE_COLUMNS + GYRO_COLUMNS)
     attitude = motion[:, QUATERNION]
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
@@ -121,7 +118,7 @@ def read_log(path: Path, step: float) -> Log:
     gaps = np.diff(time, append=time.iloc[-1])
     flying &= gaps[np.searchsorted(time, grid, side="right") - 1] < LONGEST_GAP
     # Some logs are extrapolated after the radio was lost.
-    flying &= np.isfinite(commanded()).all(axis=1)
+    flying &= np.isfinite(resampled(THRUSTS)).all(axis=1)
     # Three elements of Rᵀ dR/dt are the body rates.
     rotation = rotation_matrices(attitude)
     turning = np.einsum("nji,njk->nik", rotation, np.gradient(rotation, step, axis=0))
@@ -134,7 +131,7 @@ def read_log(path: Path, step: float) -> Log:
     offset = float(min(OFFSETS, key=disagreement))
     motion[:, BODY_RATES] = resampled(GYRO_COLUMNS, offset)
 
-    thrusts = commanded(offset)
+    thrusts = resampled(THRUSTS, offset)
     flying &= np.isfinite(thrusts).all(axis=1)
     if flying.any():
         force = np.gradient(motion[:, VELOCITY], step, axis=0)
@@ -225,20 +222,23 @@ def errors(prediction: FloatArray, end: FloatArray) -> FloatArray:
     """Return the root mean squares of the errors, in the order of ``QUANTITIES``, (4,)."""
     gap = prediction - end
     cosine = np.abs((prediction * end)[:, QUATERNION].sum(axis=1))
-    norms = [np.linalg.norm(gap[:, part], axis=1) for part in (POSITION, VELOCITY, BODY_RATES)]
-    norms.insert(2, np.degrees(2.0 * np.arccos(np.minimum(cosine, 1.0))))
-    return np.asarray(np.sqrt(np.square(norms).mean(axis=1)))
+    position, velocity, rates = (
+        np.linalg.norm(gap[:, part], axis=1) for part in (POSITION, VELOCITY, BODY_RATES)
+    )
+    angle = np.degrees(2.0 * np.arccos(np.minimum(cosine, 1.0)))
+    return np.asarray(np.sqrt(np.square([position, velocity, angle, rates]).mean(axis=1)))
 
 
 def error_table(logs: Sequence[Log], vehicle: Vehicle) -> Table:
     """Return the errors of a vehicle in open loop, over all windows of all logs."""
     rows = []
     for time, predictions, end in open_loop(logs, vehicle):
-        rms_errors = np.transpose([errors(prediction, end) for prediction in predictions])
-        for quantity, values in zip(QUANTITIES, rms_errors, strict=True):
-            rows.append([f"{quantity}, after {time:g} s", *(f"{value:.3g}" for value in values)])
+        values = [errors(prediction, end) for prediction in predictions]
+        for number, quantity in enumerate(QUANTITIES):
+            texts = [f"{value[number]:.3g}" for value in values]
+            rows.append([f"{quantity}, after {time:g} s", *texts])
     title = f"{vehicle.name}: {len(end)} windows of {len(logs)} logs, open loop"
     thrusts = np.concatenate([log.thrusts[log.flying] for log in logs])
     clipped = (np.abs(vehicle.thrust_to_action(thrusts)) > 1.0).mean()
     caption = f"{clipped:.1%} of the commands are beyond the rotors' limits, and clipped"
-    return text_table(title, HEADINGS, rows)._replace(caption=caption)
+    return Table(HEADINGS, rows, title, caption)

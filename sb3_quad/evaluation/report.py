@@ -12,14 +12,9 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import CAPTION, group_table, scenario_groups
-from sb3_quad.evaluation.plots import (
-    arrivals_plot,
-    paths_plot,
-    save_figure,
-    success_plot,
-)
+from sb3_quad.evaluation.plots import paths_plot, save_figure, success_plot
 from sb3_quad.evaluation.results import REPORT, Results, load_results
-from sb3_quad.evaluation.scenarios.load import axis_label
+from sb3_quad.evaluation.scenarios.load import axis_name
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 FIGURES = "figures"
@@ -34,27 +29,18 @@ def write_report(folder: StrPath) -> Path:
     """
     place = Path(folder)
     results = load_results(folder)
-    n_flights = sum(entry.metrics.n for entry in results.entries)
     parts = [
         f"# Suite {escape(results.suite)}",
         escape(results.description),
-        escape(f"Own reward: {results.reward}" if results.reward else ""),
-        f"{n_flights:,} flights in {len(results.scenarios)} scenarios, flown by sb3_quad "
-        f"{results.package_version}; {CAPTION}.",
+        f"Flown by sb3_quad {results.package_version}; {CAPTION}.",
     ]
     for heading, scenarios in scenario_groups(results):
         parts += [f"## {escape(heading)}", escape(scenarios[0].description)]
-        parts.append(group_table(results, results.colours, heading, scenarios).markdown())
+        parts.append(group_table(results, heading, scenarios).markdown())
         for name, figure in _figures(results, scenarios, place):
             picture = f"{FIGURES}/{name}.png"
             save_figure(figure, place / picture)
             parts.append(f"![{name}]({picture})")
-    parts.append("## Controllers")
-    for record in results.controllers:
-        zip_file = f", {record.algorithm}, SHA-256 {record.content}" if record.content else ""
-        parts.append(escape(f"- {record.label}: {record.spec}{zip_file}"))
-    for failure in results.failures:
-        parts.append(escape(f"- {failure.controller}, {failure.scenario}: {failure.message}"))
     write_text(place / REPORT, "\n\n".join(filter(None, parts)) + "\n")
     return place / REPORT
 
@@ -69,24 +55,17 @@ def _figures(
     if first.group is not None:
         cells = _cells(results, scenarios)
         for number, key in enumerate(first.cell):
-            title = axis_label(key)
-            yield f"{first.group}_{number}", success_plot(cells, key, title, results.colours)
+            name = f"{first.group}_{number}"
+            yield name, success_plot(cells, key, axis_name(key), results.colours)
         return
-    metrics = {}
     flights = {}
     for label in results.colours:
         entry = results.entry(label, first.name)
         if entry is not None:
-            metrics[label] = entry.metrics
             flights[label] = read_tracks(folder / entry.flights)
     # A scenario in which all controllers failed has no flights to draw.
-    if not flights:
-        return
-    yield f"{first.name}_paths", paths_plot(flights, results.colours)
-    # An episode that starts at its target does not fly to it.
-    has_way = first.has_way and not first.waypoints
-    if has_way and first.reference is None and len(first.tolerances) > 2:
-        yield f"{first.name}_times", arrivals_plot(metrics, results.colours)
+    if flights:
+        yield f"{first.name}_paths", paths_plot(flights, results.colours)
 
 
 def _cells(results: Results, scenarios: Sequence[Scenario]) -> pd.DataFrame:

@@ -33,25 +33,8 @@ FLIGHTS = "flights"
 REPORT = "report.md"
 WRITTEN = (RESULTS, EPISODES, REPORT)
 # Names of the columns of episodes.csv, for arrays of several numbers
-_PARTS = {
-    "target": "xyz",
-    "final_offset": "xyz",
-    "start": [
-        "x",
-        "y",
-        "z",
-        "qw",
-        "qx",
-        "qy",
-        "qz",
-        "vx",
-        "vy",
-        "vz",
-        "rate_x",
-        "rate_y",
-        "rate_z",
-    ],
-}
+_START = "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z"
+_PARTS = {"target": "xyz", "final_offset": "xyz", "start": _START.split()}
 
 
 class ControllerRecord(Frozen):
@@ -75,53 +58,27 @@ class Entry(Frozen):
     """label"""
     scenario: str
     """name"""
-    seed: int
-    """seed of the scenario; the files hold that of each episode"""
-    backend: str
-    seconds: float
-    """wall-clock time of the flights"""
-    date: str
-    """day of the flights, UTC, year-month-day"""
     metrics: Metrics
     physical_limit: float | None = None
     """Scenario.physical_limit of the settling time, s"""
     flights: str
     """path of the .npz, relative to the folder"""
 
-    @property
-    def name(self) -> tuple[str, str]:
-        """Scenario and controller."""
-        return self.scenario, self.controller
-
-
-class Failure(Frozen):
-    """A controller that could not be loaded, or did not get through a scenario."""
-
-    controller: str
-    scenario: str | None
-    """None: the controller could not be loaded"""
-    message: str
-
 
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[8] = 8
+    schema_version: Literal[9] = 9
     suite: str
     description: str
     source: str = "published"
     """where the scenarios' published metrics come from"""
-    reward: str = ""
-    """your own reward, as given; empty: none"""
     package_version: str
     controllers: list[ControllerRecord]
     scenarios: list[Scenario]
-    entries: list[Entry]
-    failures: list[Failure] = []
-    digest: str = ""
-    """hash of all inputs; an interrupted evaluation resumes only if it is unchanged"""
-    finished: bool = True
-    """whether all flights were flown"""
+    entries: list[Entry] = []
+    failures: list[str] = []
+    """controller, scenario, and what went wrong, in one line each"""
 
     @property
     def colours(self) -> dict[str, str]:
@@ -131,17 +88,9 @@ class Results(Frozen):
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """Return the entry of a controller's label and a scenario's name; None if it failed."""
         for entry in self.entries:
-            if entry.name == (scenario, controller):
+            if (entry.controller, entry.scenario) == (controller, scenario):
                 return entry
         return None
-
-    def write(self, folder: Path, finished: bool) -> None:
-        """Write ``results.json``.
-
-        :param finished: whether all flights were flown.
-        """
-        results = self.model_copy(update={"finished": finished})
-        write_text(folder / RESULTS, results.model_dump_json(indent=2))
 
 
 def load_results(folder: StrPath) -> Results:
@@ -172,11 +121,10 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
             "controller": entry.controller,
             "scenario": entry.scenario,
             "episode": range(entry.metrics.n),
+            "waypoints_reached": np.isfinite(arrays["episode_waypoints"]).sum(axis=1),
         }
         tolerances = [f"{tolerance:g}" for tolerance in arrays.pop("episode_tolerances")]
         parts = {**_PARTS, "time_to": tolerances, "settling_time": tolerances}
-        waypoints = arrays["episode_waypoints"]
-        columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
         for key, values in arrays.items():
             name = key.removeprefix("episode_")
             if values.ndim == 1:

@@ -6,8 +6,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ConfigError, ControllerError, raised_as
-from sb3_quad.base.imports import import_name
+from sb3_quad.base.errors import ControllerError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.vehicle import Vehicle
@@ -17,32 +16,6 @@ Reward: TypeAlias = Callable[[QuadcopterState, Float32Array], npt.ArrayLike]
 """A reward of your own: a function from the state after a control step and the actions (n, 4) that
 led to it to rewards (n,).
 """
-
-
-OwnReward: TypeAlias = str | Reward | None
-"""A reward of your own as it is given: a function or ``package.module:function``; None: none."""
-
-
-def load_reward(reward: OwnReward) -> Reward | None:
-    """Return a user's reward.
-
-    :param reward: a function, returned as it is; or ``package.module:function``.
-    :raises ConfigError: it cannot be imported, or is not a function.
-    """
-    if not isinstance(reward, str):
-        return reward
-    function = import_name(reward, "reward")
-    if not callable(function):
-        raise ConfigError(f"reward {reward}: is not a function reward(state, actions)")
-    return function  # type: ignore[no-any-return]
-
-
-def reward_name(reward: OwnReward) -> str:
-    """Return the name of a reward of your own; empty if there is none."""
-    if reward is None or isinstance(reward, str):
-        return reward or ""
-    # Instances of a class have no ``__name__``.
-    return str(getattr(reward, "__name__", type(reward).__name__))
 
 
 class OwnRewards(Hook):
@@ -63,16 +36,16 @@ class OwnRewards(Hook):
     ) -> None:
         if self._reward is None:
             return
-        name = f"reward {reward_name(self._reward)}"
+        # Instances of a class have no ``__name__``.
+        own = getattr(self._reward, "__name__", type(self._reward).__name__)
+        name = f"reward {own}"
         # The function may do anything.
         with raised_as(ControllerError, f"{name}: fails"):
             values = np.asarray(self._reward(state, actions), dtype=np.float64)
-        if values.shape != (state.n,):
-            raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
-        wrong = np.flatnonzero(self._flying & ~np.isfinite(values))
-        if wrong.size:
+        # What it gives for lost flights does not matter.
+        if values.shape != (state.n,) or not np.isfinite(values[self._flying]).all():
             raise ControllerError(
-                f"{name}: gives {values[wrong][0]} in row {wrong[0]}, must be finite"
+                f"{name}: gives an array {values.shape}, must be finite and ({state.n},)"
             )
         self._total += np.where(self._flying, values, 0.0)
         self._flying = flying

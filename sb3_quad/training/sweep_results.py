@@ -10,9 +10,9 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation import metric_tables
 from sb3_quad.evaluation.flights import Flights
-from sb3_quad.evaluation.metric_tables import estimate_cell
+from sb3_quad.evaluation.metric_tables import estimate_text
 from sb3_quad.evaluation.statistics import over_seeds
-from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.evaluation.tables import Table
 
 # The rows of the measures.
 ROWS = {
@@ -81,7 +81,7 @@ def compare(scenario: str, flights: pd.DataFrame) -> Table:
     """
     columns = []
     for name, runs in flights.groupby(level="configuration", sort=False):
-        columns.append(Column(f"{name} (n = {runs.index.unique('seed').size})"))
+        columns.append(f"{name} (n = {runs.index.unique('seed').size})")
     rows = []
     for measure, row in ROWS.items():
         statistic = np.nanmedian if STATISTICS[measure] == "median" else np.nanmean
@@ -91,15 +91,15 @@ def compare(scenario: str, flights: pd.DataFrame) -> Table:
         for _, runs in flights[measure].groupby(level="configuration", sort=False):
             # A row for each seed, a column for each episode.
             values = runs.droplevel("configuration").unstack()
-            cells.append(estimate_cell(row, over_seeds(values.to_numpy(), statistic)))
+            cells.append(estimate_text(row, over_seeds(values.to_numpy(), statistic)))
             if first is None:
                 first = values
             paired = (values - first).dropna(how="all")
-            differences.append(estimate_cell(row, over_seeds(paired.to_numpy())))
+            differences.append(estimate_text(row, over_seeds(paired.to_numpy())))
         # No row for what the environment does not report.
-        if any(cell.ends for cell in cells):
-            rows.append(row._replace(cells=cells))
+        if {*cells} != {"–"}:
+            rows.append([row.heading, *cells])
             if measure in COMPARED and len(columns) > 1:
-                name = f"{row.name}, more than {columns[0].name}"
-                rows.append(row._replace(name=name, cells=differences))
-    return Table(columns, rows, title=scenario, caption=CAPTION)
+                name = f"{row.name}, more than {columns[0]}"
+                rows.append([row._replace(name=name).heading, *differences])
+    return Table(["", *columns], rows, scenario, CAPTION)

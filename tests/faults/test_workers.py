@@ -4,9 +4,7 @@ others go on.
 
 import os
 import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import gymnasium
@@ -83,19 +81,8 @@ def hover(vehicle):
     return lambda observation: np.zeros((len(observation), 4))
 
 
-def crashes(vehicle):
-    if "CRASH" in os.environ:
-        os._exit(3)
-    return hover(vehicle)
-
-
 def exits(vehicle):
     sys.exit(0)
-
-
-def waits(vehicle):
-    Path(f"{os.getpid()}.pid").touch()
-    time.sleep(600)
 
 
 class DropsInfo(gymnasium.Wrapper):
@@ -148,53 +135,3 @@ def test_a_controller_that_exits_is_a_failure_and_the_others_fly(tmp_path, monke
     assert main([*command, "--suite", "suite.yaml", "-o", "out", "--no-report"]) == 1
     assert [entry.controller for entry in load_results("out").entries] == ["hover"]
     assert "failed: bad" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_worker_that_dies_ends_the_evaluation_which_is_repeated(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("suite.yaml").write_text(SUITE)
-    monkeypatch.setenv("CRASH", "1")
-    names = ["hover=test_workers:hover", "bad=test_workers:crashes"]
-    command = ["evaluate", *names, "--suite", "suite.yaml", "-o", "out", "--no-report"]
-    assert main([*command, "--workers", "2"]) == 2
-    assert "--workers" in capsys.readouterr().err.splitlines()[-1]
-    monkeypatch.delenv("CRASH")
-    assert main(command) == 0
-    assert {entry.controller for entry in load_results("out").entries} == {"hover", "bad"}
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(200)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_workers_end_with_the_evaluation_that_started_them(tmp_path, number):
-    (tmp_path / "suite.yaml").write_text(SUITE)
-    command = [
-        sys.executable,
-        "-m",
-        "sb3_quad.cli",
-        "evaluate",
-        "a=test_workers:waits",
-        "b=test_workers:waits",
-    ]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)]),
-    }
-    process = subprocess.Popen(
-        [*command, "--suite", "suite.yaml", "--workers", "2"], cwd=tmp_path, env=environment
-    )
-    try:
-        wait_for(lambda: len(list(tmp_path.glob("*.pid"))) == 2)
-    finally:
-        process.send_signal(number)
-        process.wait(30)
-    workers = [int(path.stem) for path in tmp_path.glob("*.pid")]
-    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
-
-
-def wait_for(condition, seconds=90):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.1)

@@ -56,7 +56,7 @@ def run(options: Namespace) -> int:
     from sb3_quad.cli.output import console
     from sb3_quad.envs.vehicles.vehicle import load_vehicle
     from sb3_quad.evaluation.compare import compare
-    from sb3_quad.evaluation.tables import text_table
+    from sb3_quad.evaluation.tables import Table
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
 
@@ -72,7 +72,7 @@ def run(options: Namespace) -> int:
     except CannotHover as error:
         print("cannot hover:", error, file=sys.stderr)
         return 1
-    console().print(text_table(vehicle.name, ("", ""), _parameters(vehicle), align="left"))
+    console().print(Table(("", ""), _parameters(vehicle), vehicle.name, align="left"))
     for warning in warnings(vehicle):
         print("unusual:", warning)
     if options.flights is not None:
@@ -112,52 +112,48 @@ def warnings(vehicle: "Vehicle") -> list[str]:
     """Return a line for each value that is possible but unlikely, mostly due to a wrong unit."""
     gains = (vehicle.motor_gain_up, vehicle.motor_gain_down)
     arm = vehicle.arm_length
-    # The key, what is measured, its values, the least and the greatest that are likely, and advice.
+    # The key, its values, the least and the greatest that are likely, what it is and advice.
     measured = (
         (
             "inertia",
-            "radii of gyration by the rotors' distance from the centre",
             vehicle.gyration_ratios,
             (0.05, 1.0),
-            "is it in kg m², the mass in kg, and are the rotor positions in m?",
+            "radii of gyration by the rotors' distance from the centre; is it in kg m², the mass "
+            "in kg, and are the rotor positions in m?",
         ),
         (
             "motor_gain",
-            "time constants in s",
             [1.0 / max(gains), 1.0 / min(gains)],
             (0.004, 0.3),
-            "is it in 1/s, one by the time constant?",
+            "time constants in s; is it in 1/s, one by the time constant?",
         ),
         # It is about a tenth of a propeller's diameter.
         (
             "moment_thrust_ratio",
-            "kM / kF by the rotors' distance from the centre",
             [vehicle.moment_thrust_ratio / arm],
             (0.02, 2.0),
-            "is it in m?",
+            "kM / kF by the rotors' distance from the centre; is it in m?",
         ),
         (
             "thrust",
-            "thrust-to-weight ratio",
             [vehicle.thrust_limits[1]],
             (1.2, math.inf),
-            "less leaves little to turn and brake with",
+            "thrust-to-weight ratio; less leaves little to turn and brake with",
         ),
         (
             "collision_radius",
-            "by the rotors' distance from the centre",
             [vehicle.collision_radius / arm],
             (0.0, 2.0),
-            "is it in m?",
+            "by the rotors' distance from the centre; is it in m?",
         ),
     )
     lines = []
-    for key, what, values, (least, greatest), advice in measured:
+    for key, values, (least, greatest), advice in measured:
         low = min(values)
         high = max(values)
         if low < least or high > greatest:
             lines.append(
-                f"{key}: {what}: {low:.3g} to {high:.3g}, where {least:g} to {greatest:g} is "
-                f"likely; {advice}"
+                f"{key}: {low:.3g} to {high:.3g}, where {least:g} to {greatest:g} is likely: "
+                f"{advice}"
             )
     return lines

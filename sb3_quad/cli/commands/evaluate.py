@@ -19,14 +19,8 @@ examples:
     --suite thesis -o evaluations/mine
   # a quick look, in less than a minute
   sb3-quad evaluate pid agent.zip --suite quick
-  # in two processes
-  sb3-quad evaluate agent.zip --suite robustness --workers 2
   # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
-  # the mean of your own reward next to the task's
-  sb3-quad evaluate pid agent.zip --reward my_package.rewards:calm
-  # the same episodes on PyBullet
-  sb3-quad evaluate pid --suite quick --backend pybullet
   # two scenarios with another vehicle
   sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery \
     --vehicle crazyflie -o evaluations/crazyflie
@@ -48,7 +42,6 @@ from sb3_quad.cli.parser import (
     TRUST,
     YES_OR_NO,
     Flags,
-    given,
 )
 
 FLAGS: Flags = {
@@ -64,12 +57,7 @@ FLAGS: Flags = {
     "-n --n-episodes N": (PositiveInt, "episodes of each scenario (the suite's number)"),
     "--seed N": (NonNegativeInt, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
-    "--backend KIND": (str, "batch", "batch (compiled, default) or pybullet"),
-    "--workers N": (PositiveInt, 1, "number of parallel processes (1)"),
     "--overwrite": (SWITCH, "remove the results that the folder holds"),
-    "--reward MODULE:FUNCTION": (
-        "show the mean of a reward of your own, function(state, actions) per control step"
-    ),
     "--report": (YES_OR_NO, True, "write report.md and its plots (yes)"),
     **TRUST,
     **PROGRESS,
@@ -93,14 +81,12 @@ def run(options: Namespace) -> int:
             suite,
             parse_controllers(options.controllers),
             folder,
+            options.overwrite,
             progress=show,
             report=warn,
-            **given(options, "backend", "workers", "overwrite", "reward"),
         )
-    # Each controller once, in the order of the command line.
-    flown = list(dict.fromkeys(entry.controller for entry in results.entries))
-    if flown:
-        console().print(*overview(results, flown))
+    if results.entries:
+        console().print(*overview(results))
         print(f"results in {folder}: results.json, episodes.csv, flights/")
         if options.report:
             # Matplotlib takes a second.
@@ -108,9 +94,5 @@ def run(options: Namespace) -> int:
 
             print("report in", write_report(folder))
     for failure in results.failures:
-        print(
-            f"failed: {failure.controller}, {failure.scenario or 'every scenario'}: "
-            f"{failure.message}",
-            file=sys.stderr,
-        )
+        print("failed:", failure, file=sys.stderr)
     return int(bool(results.failures))

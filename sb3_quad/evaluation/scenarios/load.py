@@ -19,29 +19,6 @@ from sb3_quad.envs.vehicles.vehicle import VEHICLES
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 
 SUITES = YamlFolder("suite", "sb3_quad.evaluation.scenarios.suites")
-# The units of varied keys, by their short names
-UNITS = {
-    "tilt": "deg",
-    "velocity": "m/s",
-    "body_rates": "rad/s",
-    "force": "N",
-    "torque": "N m",
-    "target_distance": "m",
-    "duration": "s",
-    "factor": "× the wrench",
-    "mass": "× the vehicle's own",
-    "inertia": "× the vehicle's own",
-    "motor_gain": "× the vehicle's own",
-    "delay": "control steps",
-    "thrust_to_weight": "greatest thrust by weight",
-    "torque_to_inertia": "rad/s²",
-    "motor_time_constant": "s",
-    "noise": "relative std",
-    "speed": "m/s",
-    "gusts": "std, N",
-    "wind": "m/s",
-    "wind_gusts": "std, m/s",
-}
 # The types that the values of an axis may have.
 NUMBERS = ({int}, {float}, {int, float})
 # Parts of a key that its short name does not need.
@@ -141,10 +118,3 @@ def axis_name(key: str) -> str:
 def axis_values(cell: Mapping[str, float]) -> list[str]:
     """Return the short names of varied keys, each with its value."""
     return [f"{axis_name(key)} {value:g}" for key, value in cell.items()]
-
-
-def axis_label(key: str) -> str:
-    """Return the name of a varied key with its unit, for the axes of plots."""
-    name = axis_name(key)
-    label = name.replace("_", " ")
-    return f"{label} ({UNITS[name]})" if name in UNITS else label

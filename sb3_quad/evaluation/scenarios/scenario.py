@@ -154,7 +154,7 @@ class Scenario(Frozen):
             raise ValueError("waypoints: give them or target, not both")
         tasks, _ = resolve_tasks(self.task, self.task_kwargs)
         points = np.array([tasks[0, T.start_position :][:3], *self.targets])
-        lowest = {"start_position": points[0, 2], "target": points[:, 2].min()}
+        lowest = points[:, 2].min()
         if self.reference is not None:
             if self.waypoints or self.reference.function is not None:
                 raise ValueError(
@@ -162,13 +162,12 @@ class Scenario(Frozen):
                     " the curve polynomial has waypoints of its own"
                 )
             heights = self.reference.tracks(vehicle.control_step).table[:, 2]
-            lowest["reference"] = points[-1, 2] + heights.min()
-        for place, z in lowest.items():
-            if z <= vehicle.collision_radius:
-                raise ValueError(
-                    f"{place}: touches the ground at z = {z:.3g} m; z must exceed"
-                    f" {vehicle.collision_radius:g} m"
-                )
+            lowest = min(lowest, points[-1, 2] + heights.min())
+        if lowest <= vehicle.collision_radius:
+            raise ValueError(
+                f"start_position, target, reference: touch the ground at z = {lowest:.3g} m;"
+                f" z must exceed {vehicle.collision_radius:g} m"
+            )
         farthest = np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)
         most = tasks[:, T.max_distance].min()
         if farthest > most:
@@ -194,12 +193,14 @@ class Scenario(Frozen):
         """
         if own is None or self.vehicle is not None:
             return self
-        vehicle = first_vehicle(own)
-        return validate(
-            Scenario,
-            self.model_dump() | {"vehicle": vehicle},
-            f"scenario {self.name}, flown by {vehicle.name}",
-        )
+        return self.changed({"vehicle": first_vehicle(own)})
+
+    def changed(self, changes: StrDict) -> "Scenario":
+        """Return the scenario with other values of some keys.
+
+        :raises ConfigError: it is impossible with them.
+        """
+        return validate(Scenario, self.model_dump() | changes, f"scenario {self.name}")
 
     def episode_seeds(self) -> list[int]:
         """The seeds of the episodes, for ``reset(seed=…)`` of one environment."""
@@ -292,18 +293,15 @@ class Suite(Frozen):
         """
         chosen: StrDict = {"n_episodes": n_episodes, "seed": seed, "vehicle": vehicle}
         changes = {key: value for key, value in chosen.items() if value is not None}
-        flown_by = ""
         if vehicle is not None:
             changes |= {"vehicles": None, "published": {}}
-            flown_by = f", flown by {vehicle}"
         known = set[str]()
         changed = []
         for scenario in self.scenarios:
             own = {scenario.name, scenario.group or scenario.name}
             known |= own
             if not names or own & {*names}:
-                data = scenario.model_dump() | changes
-                changed.append(validate(Scenario, data, f"scenario {scenario.name}{flown_by}"))
+                changed.append(scenario.changed(changes))
         refuse_unknown("scenario", names, known)
         return self.model_copy(update={"scenarios": changed})
 
