@@ -1,4 +1,4 @@
-"""The results of a sweep: ``results.csv``, and the tables of terminal and ``report.md``."""
+"""The results of a sweep: ``results.csv``, and the tables for the terminal."""
 
 from pathlib import Path
 from typing import TypeAlias
@@ -21,8 +21,6 @@ ROWS = {
     "reward": metric_tables.REWARD,
     "final_error": metric_tables.MEDIAN,
 }
-# All are means, except for the final error, which is a median.
-STATISTICS = {**dict.fromkeys(ROWS, "mean"), "final_error": "median"}
 COMPARED = ("success", "reward")
 CAPTION = (
     "means over n seeds, and differences of the seeds and episodes that both have; in brackets: "
@@ -38,39 +36,31 @@ crashed or left the range.
 
 
 def numbers(flights: Flights) -> StrDict:
-    """Return the measures of all episodes, NaN where there is no number."""
-    final_error = np.where(flights.survival, flights.final_error, np.nan)
-    return {
-        "success": flights.success.tolist(),
-        "survival": flights.survival.tolist(),
-        "reward": flights.reward.tolist(),
-        "final_error": final_error.tolist(),
-    }
+    """Return the measures of all episodes."""
+    measures = {name: getattr(flights, name).astype(np.float64) for name in ROWS}
+    measures["final_error"][~flights.survival] = np.nan
+    return measures
 
 
 def write_results(folder: Path, runs: RunFlights) -> list[Table]:
-    """Write ``results.csv``, a line for each run and scenario, and ``report.md``.
+    """Write ``results.csv``, a line for each run and scenario.
 
     :param runs: the finished runs, at least one.
-    :return: the tables of the report.
+    :return: a table for each scenario.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     parts = {}
     for run in sorted(runs):
         for scenario, measures in runs[run].items():
-            # A row for each episode, NaN where there is no number.
-            part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
-            parts[(*run, scenario)] = part
+            parts[(*run, scenario)] = pd.DataFrame(measures)
     flights = pd.concat(parts, names=LEVELS)
-    means = flights.groupby(level=LEVELS[:3], sort=False).agg(STATISTICS)
+    by_run = flights.groupby(level=LEVELS[:3], sort=False)
+    # All are means, except for the final error, which is a median.
+    means = by_run.mean().assign(final_error=by_run["final_error"].median())
     write_text(folder / "results.csv", means.to_csv(float_format="%.9g"))
     tables = []
-    report = f"# {folder.name}\n"
     for scenario, group in flights.groupby(level="scenario", sort=False):
-        table = compare(str(scenario), group.droplevel("scenario"))
-        report += f"\n## {table.title}\n\n{table.markdown()}\n\n{table.caption}\n"
-        tables.append(table)
-    write_text(folder / "report.md", report)
+        tables.append(compare(str(scenario), group.droplevel("scenario")))
     return tables
 
 
@@ -84,22 +74,19 @@ def compare(scenario: str, flights: pd.DataFrame) -> Table:
         columns.append(Column(f"{name} (n = {runs.index.unique('seed').size})"))
     rows = []
     for measure, row in ROWS.items():
-        statistic = np.nanmedian if STATISTICS[measure] == "median" else np.nanmean
+        statistic = np.nanmedian if measure == "final_error" else np.nanmean
         cells = []
         differences = []
-        first = None
-        for _, runs in flights[measure].groupby(level="configuration", sort=False):
+        for name in flights.index.unique("configuration"):
             # A row for each seed, a column for each episode.
-            values = runs.droplevel("configuration").unstack()
+            values = flights.loc[name, measure].unstack()
             cells.append(estimate_cell(row, over_seeds(values.to_numpy(), statistic)))
-            if first is None:
+            if not differences:
                 first = values
             paired = (values - first).dropna(how="all")
             differences.append(estimate_cell(row, over_seeds(paired.to_numpy())))
-        # No row for what the environment does not report.
-        if any(cell.ends for cell in cells):
-            rows.append(row._replace(cells=cells))
-            if measure in COMPARED and len(columns) > 1:
-                name = f"{row.name}, more than {columns[0].name}"
-                rows.append(row._replace(name=name, cells=differences))
+        rows.append(row._replace(cells=cells))
+        if measure in COMPARED and len(columns) > 1:
+            name = f"{row.name}, more than {columns[0].name}"
+            rows.append(row._replace(name=name, cells=differences))
     return Table(columns, rows, title=scenario, caption=CAPTION)

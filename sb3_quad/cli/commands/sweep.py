@@ -12,8 +12,8 @@ examples:
   # continue after Ctrl-C or a crash
   sb3-quad sweep --resume logs/sweep/my_sweep_1 --trust
 
-The new folder receives the run folders, results.csv and report.md. For the keys
-of the file, see docs/sweeps.md. Needs Ray: pip install '.[ray]' from a clone.
+The new folder receives the run folders and results.csv. For the keys of the
+file, see docs/sweeps.md. Needs Ray: pip install '.[ray]' from a clone.
 """
 
 import shlex
@@ -40,13 +40,12 @@ FLAGS: Flags = {
 
 def run(options: Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
-    import yaml
-
     from sb3_quad.base.errors import ConfigError
-    from sb3_quad.base.files import locked, write_text
+    from sb3_quad.base.files import locked
     from sb3_quad.base.process import trusted
+    from sb3_quad.base.yaml_files import write_yaml
     from sb3_quad.cli.output import console
-    from sb3_quad.training.runs import claim_folder
+    from sb3_quad.training.runs import claim_folder, refuse_links
     from sb3_quad.training.sweep import (
         checked_configurations,
         load_sweep,
@@ -56,18 +55,19 @@ def run(options: Namespace) -> int:
     )
     from sb3_quad.training.sweep_results import write_results
 
+    source = options.sweep
     if options.resume:
-        sweep = load_sweep(Path(options.resume) / "sweep.yaml")
+        source = Path(options.resume) / "sweep.yaml"
         # Ray Tune keeps its state as pickles.
         if not trusted():
             raise ConfigError(
                 f"sweep folder {options.resume}: its files can run code; "
                 "if the sweep is yours, add --trust"
             )
-    elif options.sweep:
-        sweep = load_sweep(options.sweep)
-    else:
+        refuse_links(source.parent)
+    if source is None:
         raise ConfigError("sweep: give its YAML file, or --resume with its folder")
+    sweep = load_sweep(source)
     names = [
         run_name(configuration, seed)
         for configuration in checked_configurations(sweep)
@@ -78,13 +78,13 @@ def run(options: Namespace) -> int:
         return 0
     with ray_cluster(options.address):
         if options.resume:
-            folder = Path(options.resume)
+            folder = source.parent
         else:
             # A new folder only once it is known that Ray starts.
-            parent = Path(options.log_folder) / "sweep"
-            folder = claim_folder(parent, Path(options.sweep).stem)
-            content = sweep.model_dump(mode="json", exclude_defaults=True)
-            write_text(folder / "sweep.yaml", yaml.safe_dump(content, sort_keys=False))
+            folder = claim_folder(Path(options.log_folder) / "sweep", Path(source).stem)
+            write_yaml(
+                folder / "sweep.yaml", sweep.model_dump(mode="json", exclude_defaults=True)
+            )
         with locked(folder, "sweep folder"):
             flights, failed = run_sweep(folder, sweep, options.workers)
             if flights:
