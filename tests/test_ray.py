@@ -35,7 +35,7 @@ SWEEP = {
     },
     "grid": {"env_kwargs.noise": [0.0, 0.05]},
     "seed": [0, 1],
-    "evaluation": {"episodes": 4},
+    "evaluation": {"episodes": 4, "scenario": ["recovery", "tracking"]},
 }
 
 

@@ -16,8 +16,7 @@ import itertools
 import os
 import platform
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -90,8 +89,8 @@ class Configuration(SettingsOptions, RunOptions):
             config = job.config
             if not config.task or config.env_wrapper or config.vec_env_wrapper:
                 raise ConfigError(
-                    f"env {config.env_id}: the agents of a sweep fly a suite, so it must be of this "
-                    "package, without wrappers; train others with train --seed"
+                    f"env {config.env_id}: an agent of a sweep flies a suite, so it must be of "
+                    "this package, without wrappers; train others with train --seed"
                 )
             # This finds an unknown vehicle, too.
             config.make_expert()
@@ -107,12 +106,10 @@ class Evaluation(Frozen):
     """only these of the suite"""
     episodes: PositiveInt | None = None
     """of each scenario"""
-    seed: Seed | None = None
-    """of the episodes"""
 
     def load(self) -> Suite:
         """Return the scenarios."""
-        return load_suite(self.suite).with_changes(self.scenario, self.episodes, self.seed)
+        return load_suite(self.suite).with_changes(self.scenario, self.episodes)
 
 
 class Sweep(Configuration):
@@ -146,88 +143,68 @@ def checked_configurations(sweep: Sweep) -> dict[str, Configuration]:
     """
     sweep.evaluation.load()
     configurations: dict[str, Configuration] = {}
-    for label, data in _cells(sweep):
-        name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,") or "run"
+    # Without configurations there is one, that of the shared keys.
+    own = sweep.configurations or {"": {}}
+    for label, *values in itertools.product(own, *sweep.grid.values()):
+        cell = dict(zip(sweep.grid, values, strict=True))
+        data = sweep.given(Configuration)
+        for key, value in copy.deepcopy(own[label] | cell).items():
+            # The entries of mappings are merged, such as those of env_kwargs.
+            if isinstance(value, dict) and isinstance(data.get(key), dict):
+                value = data[key] | value
+            put_key(data, key, value, f"configuration: {key}")
+        words = [f"{key.rpartition('.')[2]}={value}" for key, value in cell.items()]
         # Some file systems do not tell capital letters from small ones.
-        if name.lower() in map(str.lower, configurations):
-            raise ConfigError(
-                f"two configurations are called {name!r}; give them names, or values that differ"
-            )
-        where = f"configuration {label!r}"
-        configurations[name] = validate(Configuration, data, where)
-        with named(where):
+        name = re.sub(r"[^a-z0-9_.=,+-]+", "-", ",".join([label, *words]).lower())
+        name = name.strip("-.,") or "run"
+        if name in configurations:
+            raise ConfigError(f"configuration {name}: there are two; give them other names")
+        configurations[name] = validate(Configuration, data, f"configuration {name}")
+        with named(f"configuration {name}"):
             configurations[name].plan()
     return configurations
 
 
-def _cells(sweep: Sweep) -> Iterator[tuple[str, StrDict]]:
-    """Yield each configuration: its name with the values of the grid, and all its keys."""
-    # Without configurations there is one, that of the shared keys.
-    for name, own in (sweep.configurations or {"": {}}).items():
-        for values in itertools.product(*sweep.grid.values()):
-            cell = dict(zip(sweep.grid, values, strict=True))
-            data = sweep.given(Configuration)
-            for key, value in copy.deepcopy({**own, **cell}).items():
-                # The entries of mappings are merged, such as those of env_kwargs.
-                if isinstance(value, dict) and isinstance(data.get(key), dict):
-                    value = data[key] | value
-                put_key(data, key, value, f"configuration: {key}")
-            words = [f"{key.rpartition('.')[2]}={value}" for key, value in cell.items()]
-            yield ",".join([name, *words]), data
+def connect_ray(address: str | None) -> Any:
+    """Connect to a Ray cluster.
 
-
-@contextmanager
-def ray_cluster(address: str | None) -> Iterator[None]:
-    """Be connected to a Ray cluster within the block.
-
-    :param address: ``auto``, ``host:port`` or ``ray://host:port``; None: a cluster on this machine,
-        which ends with the block.
+    :param address: ``auto``, ``host:port`` or ``ray://host:port``; None: a cluster on this machine.
+    :return: a context manager that disconnects at its end.
     :raises MissingExtra: Ray Tune is not installed.
     :raises ConfigError: no cluster answers at the address.
     """
     require("ray.tune", "ray", "a sweep")
     import ray
 
-    trust = {TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0")}
     where = (
         f"--address {address}: cannot be used; give auto, host:port or ray://host:port "
         "of a cluster that ray start has started"
     )
     with raised_as(ConfigError, where):
-        ray.init(
+        return ray.init(
             address or "local",
-            runtime_env={"env_vars": trust},
+            runtime_env={"env_vars": {TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0")}},
             log_to_driver=False,
             logging_level="ERROR",
         )
-    try:
-        yield
-    finally:
-        ray.shutdown()
 
 
-def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> tuple[RunFlights, dict[str, str]]:
-    """Train and fly all runs of a sweep, within :func:`ray_cluster`.
+def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> RunFlights:
+    """Train and fly all runs of a sweep on the cluster of :func:`connect_ray`, and print why runs
+    failed.
 
     :param folder: the sweep's, which all machines of the cluster see. What Ray Tune has begun in it
         is continued.
     :param workers: number of concurrent runs; None: as many as fit.
-    :return: the flights of the finished runs, and why others failed, by name. A run that was
-        interrupted is in neither.
-    :raises ConfigError: a configuration that does not fit; files that Ray Tune cannot restore.
+    :return: the flights of the finished runs.
     """
     from ray import tune
 
     folder = folder.absolute()
     configurations = checked_configurations(sweep)
-    work = partial(
-        train_run,
-        folder=folder,
-        configurations=configurations,
-        evaluation=sweep.evaluation,
-        home=os.getcwd(),
-    )
-    trainable = tune.with_resources(work, sweep.resources)
+    suite = sweep.evaluation.load()
+    trainable = partial(train_run, folder, configurations, suite, os.getcwd())
+    trainable = tune.with_resources(trainable, sweep.resources)
     # A sweep that was killed early has no state yet.
     if any(folder.glob("experiment_state-*")):
         tuner = tune.Tuner.restore(str(folder), trainable, resume_errored=True)
@@ -243,18 +220,17 @@ def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> tuple[RunFligh
                 name=folder.name,
                 storage_path=str(folder.parent),
                 failure_config=tune.FailureConfig(max_failures=RETRIES),
-                verbose=1,
             ),
         )
     flights = {}
-    failed = {}
     for result in tuner.fit():
         run = (result.config["configuration"], result.config["seed"])
         if result.error is not None:
-            failed[run_name(*run)] = one_line(result.error)
+            print(f"failed: {run_name(*run)}: {one_line(result.error)}", file=sys.stderr)
+        # A run that was interrupted has none.
         elif "flights" in result.metrics:
             flights[run] = result.metrics["flights"]
-    return flights, failed
+    return flights
 
 
 def run_name(configuration: str, seed: int) -> str:
@@ -263,16 +239,17 @@ def run_name(configuration: str, seed: int) -> str:
 
 
 def train_run(
-    choice: StrMapping,
     folder: Path,
     configurations: dict[str, Configuration],
-    evaluation: Evaluation,
+    suite: Suite,
     home: str,
+    choice: StrMapping,
 ) -> StrDict:
     """Train a run in its folder, or continue it there, and fly its agent.
 
-    :param choice: the ``configuration``, by name, and the ``seed``.
     :param home: the working directory, in which relative paths make sense.
+    :param choice: the ``configuration``, by name, and the ``seed``.
+    :return: ``flights``: the numbers of the agent's flights, by scenario and measure.
     :raises ConfigError: a machine that does not see the folder.
     """
     if not folder.is_dir():
@@ -295,15 +272,10 @@ def train_run(
             options |= {"seed": choice["seed"], "log_folder": str(place)}
             trained = run_pipeline(pipeline, options, "pipeline", report)
     *_, last = trained.stages.values()
-    return {"flights": fly_agent(last.agent, evaluation)}
-
-
-def fly_agent(agent: str, evaluation: Evaluation) -> StrDict:
-    """Return the numbers of the flights of an agent's zip, by scenario and measure."""
-    model = load_model(agent)
-    spec = ControllerSpec("agent", agent)
+    model = load_model(last.agent)
+    spec = ControllerSpec("agent", last.agent)
     flights = {}
-    for scenario in evaluation.load().scenarios:
+    for scenario in suite.scenarios:
         flown = scenario.flown_by(spec.own and spec.own.vehicle)
         flights[scenario.name] = numbers(fly_scenario(model, flown, own=spec.observed))
-    return flights
+    return {"flights": flights}

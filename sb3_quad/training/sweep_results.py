@@ -1,4 +1,4 @@
-"""The results of a sweep: ``results.csv``, and the tables for the terminal."""
+"""The results of a sweep: ``results.csv``, and the table for the terminal."""
 
 from pathlib import Path
 from typing import TypeAlias
@@ -12,20 +12,15 @@ from sb3_quad.evaluation import metric_tables
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.metric_tables import estimate_cell
 from sb3_quad.evaluation.statistics import over_seeds
-from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.evaluation.tables import Column, Row, Table
 
-# The rows of the measures.
 ROWS = {
     "success": metric_tables.SUCCESS,
     "survival": metric_tables.SURVIVAL,
     "reward": metric_tables.REWARD,
-    "final_error": metric_tables.MEDIAN,
+    "final_error": Row("mean final error", "m", decimals=3),
 }
-COMPARED = ("success", "reward")
-CAPTION = (
-    "means over n seeds, and differences of the seeds and episodes that both have; in brackets: "
-    "95 % intervals, by a bootstrap over seeds and episodes"
-)
+CAPTION = "means; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
 # The levels that distinguish the rows of a table of episodes
 LEVELS = ("configuration", "seed", "scenario", "episode")
 RunFlights: TypeAlias = dict[tuple[str, int], StrDict]
@@ -37,56 +32,34 @@ crashed or left the range.
 
 def numbers(flights: Flights) -> StrDict:
     """Return the measures of all episodes."""
-    measures = {name: getattr(flights, name).astype(np.float64) for name in ROWS}
-    measures["final_error"][~flights.survival] = np.nan
+    measures = {name: getattr(flights, name).tolist() for name in ROWS}
+    measures["final_error"] = np.where(flights.survival, flights.final_error, np.nan).tolist()
     return measures
 
 
-def write_results(folder: Path, runs: RunFlights) -> list[Table]:
+def write_results(folder: Path, runs: RunFlights) -> Table:
     """Write ``results.csv``, a line for each run and scenario.
 
     :param runs: the finished runs, at least one.
-    :return: a table for each scenario.
+    :return: a column for each configuration, rows for each scenario.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     parts = {}
     for run in sorted(runs):
         for scenario, measures in runs[run].items():
-            parts[(*run, scenario)] = pd.DataFrame(measures)
+            # Ray stores NaN as null.
+            parts[(*run, scenario)] = pd.DataFrame(measures, dtype=np.float64)
     flights = pd.concat(parts, names=LEVELS)
-    by_run = flights.groupby(level=LEVELS[:3], sort=False)
-    # All are means, except for the final error, which is a median.
-    means = by_run.mean().assign(final_error=by_run["final_error"].median())
+    means = flights.groupby(level=LEVELS[:3], sort=False).mean()
     write_text(folder / "results.csv", means.to_csv(float_format="%.9g"))
-    tables = []
-    for scenario, group in flights.groupby(level="scenario", sort=False):
-        tables.append(compare(str(scenario), group.droplevel("scenario")))
-    return tables
-
-
-def compare(scenario: str, flights: pd.DataFrame) -> Table:
-    """Return a table with a column for each configuration, and with the differences from the first.
-
-    :param flights: the measures of ``ROWS`` by configuration, seed and episode.
-    """
-    columns = []
-    for name, runs in flights.groupby(level="configuration", sort=False):
-        columns.append(Column(f"{name} (n = {runs.index.unique('seed').size})"))
     rows = []
-    for measure, row in ROWS.items():
-        statistic = np.nanmedian if measure == "final_error" else np.nanmean
-        cells = []
-        differences = []
-        for name in flights.index.unique("configuration"):
-            # A row for each seed, a column for each episode.
-            values = flights.loc[name, measure].unstack()
-            cells.append(estimate_cell(row, over_seeds(values.to_numpy(), statistic)))
-            if not differences:
-                first = values
-            paired = (values - first).dropna(how="all")
-            differences.append(estimate_cell(row, over_seeds(paired.to_numpy())))
-        rows.append(row._replace(cells=cells))
-        if measure in COMPARED and len(columns) > 1:
-            name = f"{row.name}, more than {columns[0].name}"
-            rows.append(row._replace(name=name, cells=differences))
-    return Table(columns, rows, title=scenario, caption=CAPTION)
+    for scenario, group in flights.groupby(level="scenario", sort=False):
+        for measure, row in ROWS.items():
+            # A row for each run, a column for each episode.
+            values = group[measure].unstack("episode")
+            cells = []
+            for _, runs_of_one in values.groupby(level="configuration", sort=False):
+                cells.append(estimate_cell(row, over_seeds(runs_of_one.to_numpy())))
+            rows.append(row._replace(name=f"{scenario}: {row.name}", cells=cells))
+    names = flights.index.unique("configuration")
+    return Table([*map(Column, names)], rows, caption=CAPTION)

@@ -8,6 +8,7 @@ true}``. A whole ``low`` makes it ``suggest_int``. Of ``lin_x`` in the settings,
 import copy
 import math
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,18 @@ import optuna
 from optuna.storages import JournalStorage, RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.storages.journal import JournalFileBackend
 
-from sb3_quad.base.errors import ConfigError, raised_as, refuse_unknown
+from sb3_quad.base.errors import ConfigError, named, raised_as
 from sb3_quad.base.files import write_text
-from sb3_quad.base.literals import parse_number, parse_value, put_key
+from sb3_quad.base.literals import parse_value, put_key
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import YamlFolder, write_yaml
-from sb3_quad.training.algorithms import constructor_parameters
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config
 from sb3_quad.training.trainer import train
 
 SPACES = YamlFolder("search space", "sb3_quad.zoo_configs.search_spaces", ".yml")
 LINEAR = "lin_"
-VARIED = ("n_envs", "expert", "policy_kwargs")  # settings that are not the algorithm's arguments
 HEARTBEAT = 60  # s
 SETTINGS = "settings"  # the user attribute of a trial with all its settings
-optuna.logging.set_verbosity(optuna.logging.WARNING)
 # Heartbeats are experimental in Optuna.
 warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
 # SB3 warns of each batch size that does not divide the rollout, which a search often tries.
@@ -39,20 +37,19 @@ warnings.filterwarnings("ignore", message="You have specified a mini-batch size"
 def train_trial(trial: optuna.Trial, job: TrainingJob, space: StrDict, n_evaluations: int) -> float:
     """Train a trial, and return the value of its last evaluation.
 
-    All trials have the same seed, and the same episodes of evaluation. The value is NaN, which
-    fails the trial, if a signal ended the training.
+    All trials have the same seed, and the same episodes of evaluation. The first one has the
+    settings unchanged.
 
     :param job: the job of every trial, except for the varied settings.
     :param n_evaluations: evaluations of each trial, the last one at its end.
     :raises optuna.TrialPruned: the study's pruner ended the training.
+    :raises KeyboardInterrupt: a signal did.
     """
-    base = job.config
-    settings = suggest(trial, space, base)
-    config = build_config(base.algo, base.env_id, settings, f"trial {trial.number}")
+    config = job.config
+    if trial.number > 0:
+        config = suggest(trial, space, config)
     trial.set_user_attr(SETTINGS, config.settings)
-    # A training ends with a whole rollout.
-    total = math.ceil(config.n_timesteps / config.rollout) * config.rollout
-    every = math.ceil(total / n_evaluations)
+    every = math.ceil(config.n_timesteps / n_evaluations)
     values = []
 
     def should_continue(rate: float, reward: float) -> bool:
@@ -63,12 +60,11 @@ def train_trial(trial: optuna.Trial, job: TrainingJob, space: StrDict, n_evaluat
     result = train(
         job.model_copy(update={"config": config, "eval_freq": every, "snapshot_every": 0}),
         report=lambda line: None,
-        on_start=lambda run: trial.set_user_attr("run", str(run.path)),
         should_continue=should_continue,
     )
     if result.exit_code != 0:
-        return math.nan
-    if result.model.num_timesteps < total:
+        raise KeyboardInterrupt
+    if result.model.num_timesteps < config.n_timesteps:
         raise optuna.TrialPruned
     return values[-1]
 
@@ -95,18 +91,19 @@ def load_space(source: StrPath | None, config: TrainingConfig) -> StrDict:
     space, where = SPACES.read(source or config.algo)
     if not space:
         raise ConfigError(f"{where}: must hold settings, such as 'gamma: [0.98, 0.99]'")
-    valid = [*constructor_parameters(config.algorithm), *VARIED]
-    refuse_unknown(f"{where}: setting", [name.partition(".")[0] for name in space], valid)
-    # A trial that is not trained, so that Optuna checks the space.
-    suggest(optuna.create_study().ask(), space, config)
+    # A trial that is not trained, so that Optuna and the settings check the space.
+    with named(where):
+        suggest(optuna.create_study().ask(), space, config)
     return space
 
 
-def suggest(trial: optuna.Trial, space: StrDict, config: TrainingConfig) -> StrDict:
-    """Return all settings of a trial."""
-    settings = _plain(config)
+def suggest(trial: optuna.Trial, space: StrDict, config: TrainingConfig) -> TrainingConfig:
+    """Return the settings of a trial."""
+    settings = copy.deepcopy(config.settings)
+    if isinstance(settings.get("policy_kwargs"), str):
+        settings["policy_kwargs"] = parse_value(settings["policy_kwargs"])
     for name, values in space.items():
-        with raised_as(ConfigError, f"search space: {name}: give a list, or low, high and log"):
+        with raised_as(ConfigError, f"{name}: give a list, or low, high and log"):
             if isinstance(values, list):
                 # Optuna stores plain values alone.
                 text = trial.suggest_categorical(name, [str(value) for value in values])
@@ -115,36 +112,10 @@ def suggest(trial: optuna.Trial, space: StrDict, config: TrainingConfig) -> StrD
                 value = trial.suggest_int(name, **values)
             else:
                 value = trial.suggest_float(name, **values)
-        if str(settings.get(name)).startswith(LINEAR):
+        if str(settings.get(name)).startswith(LINEAR) and isinstance(value, float):
             value = f"{LINEAR}{value:.4g}"
         put_key(settings, name, value, name)
-    return settings
-
-
-def first_parameters(space: StrDict, config: TrainingConfig) -> StrDict:
-    """Return the parameters that stand for the given settings, as far as the space has these."""
-    settings = _plain(config)
-    for key, value in settings.get("policy_kwargs", {}).items():
-        settings[f"policy_kwargs.{key}"] = value
-    first: StrDict = {}
-    for name in space.keys() & settings.keys():
-        value = settings[name]
-        number = parse_number(str(value).removeprefix(LINEAR))
-        if isinstance(space[name], list):
-            # Optuna refuses anything else.
-            if value in space[name]:
-                first[name] = str(value)
-        elif isinstance(number, (int, float)):
-            first[name] = number
-    return first
-
-
-def _plain(config: TrainingConfig) -> StrDict:
-    """Return a copy of the settings in which ``policy_kwargs`` are a mapping."""
-    settings = copy.deepcopy(config.settings)
-    if isinstance(settings.get("policy_kwargs"), str):
-        settings["policy_kwargs"] = parse_value(settings["policy_kwargs"])
-    return settings
+    return build_config(config.algo, config.env_id, settings)
 
 
 def open_study(name: str, storage: str, **keywords: Any) -> optuna.Study:
@@ -179,5 +150,6 @@ def write_results(study: optuna.Study, env_id: str, folder: Path) -> None:
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     write_text(folder / "trials.csv", study.trials_dataframe().to_csv(index=False))
-    if study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.COMPLETE]):
+    # Optuna raises one if no trial is complete.
+    with suppress(ValueError):
         write_yaml(folder / "best.yml", {env_id: study.best_trial.user_attrs[SETTINGS]})

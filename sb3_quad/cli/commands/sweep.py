@@ -17,7 +17,6 @@ file, see docs/sweeps.md. Needs Ray: pip install '.[ray]' from a clone.
 """
 
 import shlex
-import sys
 from argparse import Namespace
 from pathlib import Path
 
@@ -41,15 +40,15 @@ FLAGS: Flags = {
 def run(options: Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
     from sb3_quad.base.errors import ConfigError
-    from sb3_quad.base.files import locked
+    from sb3_quad.base.files import locked, write_text
     from sb3_quad.base.process import trusted
-    from sb3_quad.base.yaml_files import write_yaml
     from sb3_quad.cli.output import console
     from sb3_quad.training.runs import claim_folder, refuse_links
     from sb3_quad.training.sweep import (
+        SWEEPS,
         checked_configurations,
+        connect_ray,
         load_sweep,
-        ray_cluster,
         run_name,
         run_sweep,
     )
@@ -76,25 +75,18 @@ def run(options: Namespace) -> int:
     if options.dry_run:
         print(*names, sep="\n")
         return 0
-    with ray_cluster(options.address):
+    with connect_ray(options.address):
         if options.resume:
             folder = source.parent
         else:
             # A new folder only once it is known that Ray starts.
             folder = claim_folder(Path(options.log_folder) / "sweep", Path(source).stem)
-            write_yaml(
-                folder / "sweep.yaml", sweep.model_dump(mode="json", exclude_defaults=True)
-            )
+            write_text(folder / "sweep.yaml", SWEEPS.text(source)[0])
         with locked(folder, "sweep folder"):
-            flights, failed = run_sweep(folder, sweep, options.workers)
+            flights = run_sweep(folder, sweep, options.workers)
             if flights:
-                console().print(*write_results(folder, flights))
+                console().print(write_results(folder, flights))
     print(f"{len(flights)} of {len(names)} runs finished, saved in {folder}")
-    for name, message in failed.items():
-        print(f"failed: {name}: {message}", file=sys.stderr)
     if len(flights) < len(names):
         print(f"to continue: sb3-quad sweep --resume {shlex.quote(str(folder))} --trust")
-    # Ray Tune ends without an error after Ctrl-C.
-    if len(flights) + len(failed) < len(names):
-        return 130
-    return int(bool(failed))
+    return int(len(flights) < len(names))

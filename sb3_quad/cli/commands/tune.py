@@ -29,11 +29,9 @@ import shlex
 from argparse import Namespace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
-from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import CONF_FILE, SETTINGS_FLAGS, plan, prepare
 from sb3_quad.cli.parser import Flags, given, natural, positive, seed
 from sb3_quad.training.options import DEFAULT_ALGO
@@ -63,7 +61,6 @@ def run(options: Namespace) -> int:
     optuna = require("optuna", "tune", "a search")
     from sb3_quad.training.runs import claim_folder, file_name
     from sb3_quad.training.tune import (
-        first_parameters,
         load_space,
         open_study,
         train_trial,
@@ -81,35 +78,25 @@ def run(options: Namespace) -> int:
     # A search is for the settings of a single run.
     options.algo = options.algo or DEFAULT_ALGO
     stage = plan(options)
-    known = given(options, "device", "initial_policy", "n_eval_envs", "seed", "eval_episodes")
-    job = stage.job(known)
+    job = stage.job(
+        given(options, "device", "initial_policy", "n_eval_envs", "seed", "eval_episodes")
+    )
     config = job.config
     space = load_space(options.search_space, config)
     name = options.study_name or f"{config.algo}_{config.env_id}"
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     storage = options.storage or f"sqlite:///{folder}/study.db"
     study = open_study(name, storage, sampler=sampler, pruner=pruner)
-    if not study.trials:
-        study.enqueue_trial(first_parameters(space, config))
-    print("results go to", folder)
+    print(f"results go to {folder}; to continue:", end=" ")
+    print(f"--storage {shlex.quote(storage)} --study-name {shlex.quote(name)}")
     objective = partial(
         train_trial,
         job=job.model_copy(update={"log_folder": str(folder)}),
         space=space,
         n_evaluations=options.n_evaluations,
     )
-    with StopSignals() as signals:
-
-        def after_trial(study: Any, trial: Any) -> None:
-            write_results(study, config.env_id, folder)
-            end = f"{trial.state.name.lower()}, value {trial.value}, {trial.params}"
-            print(f"trial {trial.number}: {end}")
-            if signals.received:
-                study.stop()
-
-        study.optimize(objective, options.n_trials, catch=(Exception,), callbacks=[after_trial])
+    try:
+        study.optimize(objective, options.n_trials, catch=(Exception,))
+    finally:
         write_results(study, config.env_id, folder)
-    best = shlex.quote(f"{folder}/best.yml")
-    print(f"to train: sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {best}")
-    print(f"to continue: --storage {shlex.quote(storage)} --study-name {shlex.quote(name)}")
-    return signals.exit_code
+    return 0
