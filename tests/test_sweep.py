@@ -83,7 +83,10 @@ def test_the_configurations_are_the_product_of_list_and_grid():
         ("no-such", {"grid": {"env_kwargs.vehicle": ["no-such"]}}),
         ("seed", {"seed": -1}),
         ("configuration a", {"configurations": {"a": {}, "A": {}}}),
-        ("Pendulum-v1", {"env": "Pendulum-v1", "algo": "ppo", "conf_file": "pendulum.yml"}),
+        (
+            "Pendulum-v1",
+            {"env": "Pendulum-v1", "algo": "ppo", "conf_file": "pendulum.yml", "hyperparams": {}},
+        ),
         ("suite", {"evaluation": {"suite": "no-such"}}),
         ("nobody", {"expert": "nobody"}),
         ("none.zip", {"initial_policy": "none.zip"}),
@@ -131,10 +134,10 @@ def test_a_run_is_what_train_gives_and_is_not_trained_twice(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(process, "_most_cpus", process._most_cpus)
     planned = sweep()
-    work = partial(train_run, tmp_path, checked_configurations(planned))
-    work = partial(
-        work, planned.evaluation.load(), str(tmp_path), {"configuration": "run", "seed": 1}
-    )
+    suite = planned.evaluation.load()
+    choice = {"configuration": "run", "seed": 1}
+    configurations = checked_configurations(planned)
+    work = partial(train_run, tmp_path, configurations, suite, str(tmp_path), choice)
     first = work()
     (agent,) = Path("runs/run/seed_1/dagger").glob("*_1/Quad*.zip")
     before = agent.stat().st_mtime_ns

@@ -150,8 +150,8 @@ def test_the_spaces_of_the_package_fit_its_settings(algo):
     space = load_space(None, config)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(10):
-        suggested = suggest(study.ask(), space, config)
-        assert yaml.safe_load(yaml.safe_dump(suggested.settings)) == suggested.settings
+        settings = suggest(study.ask(), space, config).settings
+        assert yaml.safe_load(yaml.safe_dump(settings)) == settings
 
 
 rewards = st.floats(-1e4, 1e4).map(lambda value: round(value, 3))
