@@ -128,10 +128,8 @@ class CoefficientSchedule(BaseCallback):
             value = FloatSchedule(value)(self.model._current_progress_remaining)
         if isinstance(value, float):
             return value
-        valid = [key for key, other in vars(self.model).items() if isinstance(other, float)]
-        raise ConfigError(
-            f"{unknown(f'float of {type(self.model).__name__}', name, valid)}; it is {value!r}"
-        )
+        kind = type(self.model).__name__
+        raise ConfigError(f"coefficient {name}: is {value!r} in {kind}, must be a float")
 
     def _set(self, value: float) -> None:
         """Set it with the algorithm's ``set_<name>``, or else as its constructor would."""
@@ -139,13 +137,12 @@ class CoefficientSchedule(BaseCallback):
         setter = getattr(self.model, f"set_{name}", None)
         if setter is not None:
             setter(value)
-        elif name == "learning_rate":
-            self.model.learning_rate = value
-            self.model.lr_schedule = FloatSchedule(value)
-        elif callable(getattr(self.model, name)):
+        elif name != "learning_rate" and callable(getattr(self.model, name)):
             setattr(self.model, name, FloatSchedule(value))
         else:
             setattr(self.model, name, value)
+            # This has an effect if it is the learning rate.
+            self.model._setup_lr_schedule()
 
 
 class _LastLogged(KVWriter):

@@ -159,8 +159,8 @@ def checked_configurations(sweep: Sweep) -> dict[str, Configuration]:
         name = name.strip("-.,") or "run"
         if name in configurations:
             raise ConfigError(f"configuration {name}: there are two; give them other names")
-        configurations[name] = validate(Configuration, data, f"configuration {name}")
         with named(f"configuration {name}"):
+            configurations[name] = validate(Configuration, data, "sweep")
             configurations[name].plan()
     return configurations
 
