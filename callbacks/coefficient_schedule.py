@@ -101,7 +101,7 @@ class CoefficientSchedule(BaseCallback):
             measured = self.num_timesteps / self.model._total_timesteps
         if math.isfinite(measured):
             value = self.value_at(measured)
-            # One way: a share of the way back is not taken.
+            # One way: what the quantity takes back is not followed.
             back = (value - self._value) * (self._final - self._start) < 0.0
             if not (self._one_way and back):
                 self._value = value
