@@ -3,9 +3,9 @@
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.utils import FloatSchedule
@@ -58,23 +58,18 @@ class CoefficientSchedule(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        numbers = (start, final, *between)
-        if len(numbers) != 4 or not all(
-            isinstance(value, (int, float)) and math.isfinite(value) for value in numbers
-        ):
+        first, last = between
+        # A sum of finite numbers is finite.
+        if not math.isfinite(start + final + first + last) or first == last:
             raise ConfigError(
-                f"CoefficientSchedule: start {start}, final {final}, between {between}: "
-                "must be finite numbers"
-            )
-        if between[0] == between[1]:
-            raise ConfigError(
-                f"CoefficientSchedule: between {tuple(between)}: its ends must differ"
+                f"CoefficientSchedule: start {start}, final {final}, between {first} and {last}: "
+                "must be finite, and the ends must differ"
             )
         self.coefficient = coefficient
         self.follow = follow
         self._start = float(start)
         self._final = float(final)
-        self._between = tuple(between)
+        self._between = (first, last)
         self._one_way = one_way
 
     def value_at(self, measured: float) -> float:
@@ -84,15 +79,15 @@ class CoefficientSchedule(BaseCallback):
         return self._start + share * (self._final - self._start)
 
     def _on_training_start(self) -> None:
-        _check(self.model, self.coefficient)
         self._logged = _LastLogged()
         self.logger.output_formats.append(self._logged)
+        current = self._current()
         self._value = self._start
         if self.num_timesteps > 0:
-            self._value = _read(self.model, self.coefficient)
+            self._value = current
         # Set each value once, so that one that is out of range is refused now and not at the end.
         for value in (self._final, self._start, self._value):
-            _set(self.model, self.coefficient, value)
+            self._set(value)
         if self.follow == PROGRESS:
             self._on_rollout_end()
 
@@ -101,73 +96,53 @@ class CoefficientSchedule(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         self._logged.write(self.logger.name_to_value)
+        measured = self._logged.values.get(self.follow, math.nan)
         if self.follow == PROGRESS:
             measured = self.num_timesteps / self.model._total_timesteps
-        else:
-            measured = self._logged.values.get(self.follow, math.nan)
         if math.isfinite(measured):
             value = self.value_at(measured)
-            if self._one_way and self._final < self._start:
-                value = min(value, self._value)
-            elif self._one_way:
-                value = max(value, self._value)
-            self._value = value
-        _set(self.model, self.coefficient, self._value)
+            # One way: what the quantity takes back is not followed.
+            back = (value - self._value) * (self._final - self._start) < 0.0
+            if not (self._one_way and back):
+                self._value = value
+        self._set(self._value)
         self.logger.record(f"schedule/{self.coefficient}", self._value)
 
     def _on_training_end(self) -> None:
         self.logger.output_formats.remove(self._logged)
         if self.follow != PROGRESS and self.follow not in self._logged.values:
-            reason = "nothing was logged"
-            if self._logged.values:
-                reason = unknown("metric", self.follow, self._logged.values)
             warnings.warn(
-                f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: {reason}",
+                f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: "
+                + unknown("metric", self.follow, self._logged.values),
                 stacklevel=2,
             )
 
+    def _current(self) -> float:
+        """The coefficient as the algorithm has it.
 
-def _set(model: BaseAlgorithm, name: str, value: float) -> None:
-    """Set a coefficient with the algorithm's ``set_<name>``, or else as its constructor would."""
-    setter = getattr(model, f"set_{name}", None)
-    if setter is not None:
-        setter(value)
-    elif name == "learning_rate":
-        model.learning_rate = value
-        model.lr_schedule = FloatSchedule(value)
-    elif callable(getattr(model, name)):
-        setattr(model, name, FloatSchedule(value))
-    else:
-        setattr(model, name, value)
+        :raises ConfigError: it has no such coefficient, or it is neither a float nor a schedule.
+        """
+        name = self.coefficient
+        value: Any = getattr(self.model, f"current_{name}", vars(self.model).get(name))
+        if isinstance(value, FloatSchedule) or name == "learning_rate":
+            value = FloatSchedule(value)(self.model._current_progress_remaining)
+        if isinstance(value, float):
+            return value
+        kind = type(self.model).__name__
+        raise ConfigError(f"coefficient {name}: is {value!r} in {kind}, must be a float")
 
-
-def _read(model: BaseAlgorithm, name: str) -> float:
-    value: Any = getattr(model, f"current_{name}", getattr(model, name))
-    if callable(value):
-        value = value(model._current_progress_remaining)
-    return float(value)
-
-
-def _check(model: BaseAlgorithm, name: str) -> None:
-    """Check a coefficient's name.
-
-    :raises ConfigError: if the algorithm has no such coefficient, or if it is not a float there.
-    """
-    public = {}
-    valid = []
-    for key, value in vars(model).items():
-        if key.startswith("_") or key == "lr_schedule":
-            continue
-        public[key] = value
-        if isinstance(value, (float, FloatSchedule)) or key == "learning_rate":
-            valid.append(key)
-    if name not in valid and not isinstance(public.get(name), int):
-        raise ConfigError(unknown(f"coefficient of {type(model).__name__}", name, valid))
-    if name not in valid and not hasattr(model, f"set_{name}"):
-        raise ConfigError(
-            f"{name} of {type(model).__name__} is {public[name]!r}, which is not a float; "
-            "give it as one, as 0.0"
-        )
+    def _set(self, value: float) -> None:
+        """Set it with the algorithm's ``set_<name>``, or else as its constructor would."""
+        name = self.coefficient
+        setter = getattr(self.model, f"set_{name}", None)
+        if setter is not None:
+            setter(value)
+        elif name != "learning_rate" and callable(getattr(self.model, name)):
+            setattr(self.model, name, FloatSchedule(value))
+        else:
+            setattr(self.model, name, value)
+            # This has an effect if it is the learning rate.
+            self.model._setup_lr_schedule()
 
 
 class _LastLogged(KVWriter):
@@ -180,7 +155,7 @@ class _LastLogged(KVWriter):
         self, key_values: Mapping[str, Any], key_excluded: object = None, step: int = 0
     ) -> None:
         for name, value in key_values.items():
-            if isinstance(value, (int, float)) or getattr(value, "shape", None) == ():
+            with suppress(TypeError, ValueError):
                 self.values[name] = float(value)
 
     def close(self) -> None:

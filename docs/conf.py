@@ -41,9 +41,6 @@ linkcheck_anchors = False
 # Other packages document their names themselves.
 IGNORED = "Bounded|a_number|StopSignals|Perceptrons"
 nitpick_ignore_regex = [("py:.*", r"(?!sb3_quad).*"), ("py:class", rf".*\.({IGNORED})")]
-    ("py:.*", r"(?!sb3_quad).*"),
-    ("py:class", r".*\.(Bounded|a_number|StopSignals|Perceptrons)"),
-]
 
 # The reference must have every name in the __all__ of these.
 PACKAGES = ("sb3_quad", "sb3_quad.envs", "sb3_quad.callbacks", "sb3_quad.envs.vehicles")

@@ -12,30 +12,20 @@ from pathlib import Path
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_quad.cli import main
-
 pytest.importorskip("ray.tune")
 
 import ray
 from ray.cluster_utils import Cluster
+from test_sweep import NET, TINY
 
 ROOT = Path(__file__).resolve().parent.parent
 SWEEP = {
-    "algo": "dagger",
-    "env": "QuadStateRecovery-v0",
+    **TINY,
     "n_timesteps": 400,
-    "n_envs": 4,
-    "eval_episodes": 0,
-    "hyperparams": {
-        "n_steps": 20,
-        "batch_size": 80,
-        "gradient_steps": 2,
-        "policy_kwargs": {"net_arch": [4]},
-        "callback": "test_ray.NotesNode",
-    },
+    "hyperparams": {**NET, "callback": "test_ray.NotesNode"},
     "grid": {"env_kwargs.noise": [0.0, 0.05]},
     "seed": [0, 1],
-    "evaluation": {"episodes": 4},
+    "evaluation": {"episodes": 4, "scenario": ["recovery", "tracking"]},
 }
 
 
@@ -62,14 +52,6 @@ def cluster(monkeypatch):
     yield made
     ray.shutdown()
     made.shutdown()
-
-
-def test_an_address_that_nobody_answers_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "s.yaml").write_text(json.dumps(SWEEP))
-    assert main(["sweep", "s.yaml", "--address", "ray://host:port"]) == 2
-    assert "--address" in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "logs").exists()
 
 
 @pytest.mark.slow

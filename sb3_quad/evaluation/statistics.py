@@ -73,9 +73,9 @@ def bootstrap(values: FloatArray, statistic: Statistic = np.mean) -> Estimate:
     return Estimate(value=value, low=min(value, low), high=max(value, high), n=n)
 
 
-def over_seeds(values: FloatArray, statistic: Statistic = np.nanmean) -> Estimate | None:
-    """Estimate the mean over seeds of a statistic of a run's episodes, with a bootstrap over seeds
-    and episodes; for the difference of two configurations, this is a paired bootstrap.
+def over_seeds(values: FloatArray) -> Estimate | None:
+    """Estimate the mean over seeds and episodes, with a bootstrap over both; for the difference of
+    two configurations, this is a paired bootstrap.
 
     A resample draws as many seeds as there are, with replacement, and as many episodes; the
     episodes are the same in every run, so seeds and episodes are crossed (Owen, The pigeonhole
@@ -96,9 +96,9 @@ def over_seeds(values: FloatArray, statistic: Statistic = np.nanmean) -> Estimat
         # A resample may miss the few episodes that have a number.
         warnings.simplefilter("ignore", RuntimeWarning)
         # (resamples, seeds)
-        runs = np.stack([statistic(row[episodes], axis=1) for row in values], axis=1)
+        runs = np.stack([np.nanmean(row[episodes], axis=1) for row in values], axis=1)
         means = np.nanmean(np.take_along_axis(runs, seeds, axis=1), axis=1)
     # The interval includes the value, even if every resample misses it.
-    value = float(statistic(values, axis=1).mean())
+    value = float(np.nanmean(values, axis=1).mean())
     low, high = np.nanpercentile(means, [2.5, 97.5])
     return Estimate(value=value, low=min(value, low), high=max(value, high), n=values.size)

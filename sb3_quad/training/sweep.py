@@ -7,7 +7,7 @@ holds
 
 - ``sweep.yaml``, the sweep as given;
 - ``runs/<configuration>/seed_<k>/``, a pipeline's folder, as ``train`` leaves it;
-- ``results.csv`` and ``report.md``, see :mod:`sb3_quad.training.sweep_results`;
+- ``results.csv``, see :mod:`sb3_quad.training.sweep_results`;
 - Ray Tune's own files, among them ``tuner.pkl``.
 """
 
@@ -16,38 +16,29 @@ import itertools
 import os
 import platform
 import re
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from pydantic import BeforeValidator, Field, PositiveInt
-from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_quad.agents.agent_settings import env_kwargs
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import load_model
-from sb3_quad.algorithms.statistics import STATISTICS, share_statistics
-from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.errors import ConfigError, named, raised_as
 from sb3_quad.base.files import one_line
-from sb3_quad.base.imports import import_packages, require
+from sb3_quad.base.imports import require
 from sb3_quad.base.literals import put_key
 from sb3_quad.base.process import TRUST_VARIABLE, use_cpus
-from sb3_quad.base.seeds import Seed, seed_for
+from sb3_quad.base.seeds import Seed
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.envs.simulation.settings import KEY
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import fly_scenario
-from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.training.algorithms import as_list
-from sb3_quad.training.config import TrainingJob
-from sb3_quad.training.environments import make_environments
 from sb3_quad.training.options import RunOptions, SettingsOptions, all_changes
 from sb3_quad.training.pipeline import (
     STATUS_FILE,
@@ -63,7 +54,6 @@ from sb3_quad.training.sweep_results import RunFlights, numbers
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 # How often Ray repeats a run that fails, or whose node is lost. It continues from its snapshot.
 RETRIES = 2
-TASKS = ("state_recovery", "target_tracking")
 
 
 class Configuration(SettingsOptions, RunOptions):
@@ -87,49 +77,39 @@ class Configuration(SettingsOptions, RunOptions):
     def plan(self) -> tuple[Pipeline, StrDict]:
         """Return the pipeline that this trains, a single run as one of one stage, and the options
         of its jobs.
+
+        :raises ConfigError: what cannot be trained, or an agent that could not fly a suite.
         """
         changes = all_changes(self.hyperparams, self.given(SettingsOptions))
         planned = plan_training(self.given(Configuration), changes)
         if isinstance(planned, Stage):
             planned = Pipeline(stages=[planned])
         options = self.given(RunOptions)
-        if self.initial_policy is not None:
-            options["initial_policy"] = agent_path(self.initial_policy)
-        return planned, options
-
-    def check(self) -> None:
-        """Check everything that can be checked before a training.
-
-        :raises ConfigError: a setting that does not fit; an unknown vehicle or expert; no agent.
-        """
-        pipeline, options = self.plan()
-        agent = options.get("initial_policy")
-        if agent is not None and not Path(agent).is_file():
-            raise ConfigError(f"initial_policy {agent}: no such file")
-        for job in stage_jobs(pipeline, options):
+        for job in stage_jobs(planned, options):
+            config = job.config
+            if not config.task or config.env_wrapper or config.vec_env_wrapper:
+                raise ConfigError(
+                    f"env {config.env_id}: an agent of a sweep flies a suite, so it must be of "
+                    "this package, without wrappers; train others with train --seed"
+                )
             # This finds an unknown vehicle, too.
-            job.config.make_expert()
+            config.make_expert()
+        return planned, options
 
 
 class Evaluation(Frozen):
     """The fresh episodes on which all agents are compared."""
 
-    suite: str | None = None
-    """name or YAML file; without it, fresh episodes of both tasks"""
+    suite: str = "quick"
+    """name or YAML file"""
     scenario: Annotated[list[str], BeforeValidator(as_list)] = []
     """only these of the suite"""
     episodes: PositiveInt | None = None
-    """of each scenario; without a suite 240"""
-    seed: Seed | None = None
-    """of the episodes"""
+    """of each scenario"""
 
-    def load(self) -> Suite | None:
-        """Return the scenarios; None without a suite."""
-        if self.suite is not None:
-            return load_suite(self.suite).with_changes(self.scenario, self.episodes, self.seed)
-        if self.scenario:
-            raise ConfigError("evaluation: scenario goes with a suite")
-        return None
+    def load(self) -> Suite:
+        """Return the scenarios."""
+        return load_suite(self.suite).with_changes(self.scenario, self.episodes)
 
 
 class Sweep(Configuration):
@@ -145,8 +125,6 @@ class Sweep(Configuration):
     """the episodes that the agents fly in the end"""
     resources: dict[str, float] = {"cpu": 1}
     """what Ray reserves for a run, such as gpu: 1"""
-    gym_packages: list[str] = []
-    """modules that register further environments"""
 
 
 def load_sweep(source: StrPath) -> Sweep:
@@ -163,94 +141,70 @@ def checked_configurations(sweep: Sweep) -> dict[str, Configuration]:
     :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
         two configurations with the same name.
     """
-    import_packages(sweep.gym_packages, "gym_packages:")
     sweep.evaluation.load()
     configurations: dict[str, Configuration] = {}
-    for label, data in _cells(sweep):
-        where = f"configuration {label!r}"
-        configuration = validate(Configuration, data, where)
-        name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", label).strip("-.,")
+    # Without configurations there is one, that of the shared keys.
+    own = sweep.configurations or {"": {}}
+    for label, *values in itertools.product(own, *sweep.grid.values()):
+        cell = dict(zip(sweep.grid, values, strict=True))
+        data = sweep.given(Configuration)
+        for key, value in copy.deepcopy(own[label] | cell).items():
+            # The entries of mappings are merged, such as those of env_kwargs.
+            if isinstance(value, dict) and isinstance(data.get(key), dict):
+                value = data[key] | value
+            put_key(data, key, value, f"configuration: {key}")
+        words = [f"{key.rpartition('.')[2]}={value}" for key, value in cell.items()]
         # Some file systems do not tell capital letters from small ones.
-        if name.lower() in map(str.lower, configurations):
-            raise ConfigError(
-                f"two configurations are called {name!r}; give them names, or values that differ"
-            )
-        try:
-            configuration.check()
-        except ConfigError as error:
-            raise ConfigError(f"{where}: {error}") from None
-        configurations[name] = configuration
+        name = re.sub(r"[^a-z0-9_.=,+-]+", "-", ",".join([label, *words]).lower())
+        name = name.strip("-.,") or "run"
+        if name in configurations:
+            raise ConfigError(f"configuration {name}: there are two; give them other names")
+        with named(f"configuration {name}"):
+            configurations[name] = validate(Configuration, data, "sweep")
+            configurations[name].plan()
     return configurations
 
 
-def _cells(sweep: Sweep) -> Iterator[tuple[str, StrDict]]:
-    """Yield each configuration: its name with the values of the grid, and all its keys."""
-    # Without configurations there is one, that of the shared keys.
-    for name, own in (sweep.configurations or {"": {}}).items():
-        for values in itertools.product(*sweep.grid.values()):
-            cell = dict(zip(sweep.grid, values, strict=True))
-            data = sweep.given(Configuration)
-            # The entries of mappings are merged, such as those of env_kwargs.
-            for key, value in [*own.items(), *cell.items()]:
-                if isinstance(value, dict) and isinstance(data.get(key), dict):
-                    value = data[key] | value
-                put_key(data, key, copy.deepcopy(value), f"configuration: {key}")
-            words = [name] if name else []
-            words += [f"{key.rpartition('.')[2]}={value}" for key, value in cell.items()]
-            yield ",".join(words) or "run", data
+def connect_ray(address: str | None) -> Any:
+    """Connect to a Ray cluster.
 
-
-@contextmanager
-def ray_cluster(address: str | None) -> Iterator[None]:
-    """Be connected to a Ray cluster within the block.
-
-    :param address: ``auto``, ``host:port`` or ``ray://host:port``; None: a cluster on this machine,
-        which ends with the block.
+    :param address: ``auto``, ``host:port`` or ``ray://host:port``; None: a cluster on this machine.
+    :return: a context manager that disconnects at its end.
     :raises MissingExtra: Ray Tune is not installed.
     :raises ConfigError: no cluster answers at the address.
     """
     require("ray.tune", "ray", "a sweep")
-    ray = require("ray", "ray", "a sweep")
-    trust = {TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0")}
+    import ray
+
     where = (
         f"--address {address}: cannot be used; give auto, host:port or ray://host:port "
         "of a cluster that ray start has started"
     )
     with raised_as(ConfigError, where):
-        ray.init(
+        return ray.init(
             address or "local",
-            runtime_env={"env_vars": trust},
+            runtime_env={"env_vars": {TRUST_VARIABLE: os.environ.get(TRUST_VARIABLE, "0")}},
             log_to_driver=False,
             logging_level="ERROR",
         )
-    try:
-        yield
-    finally:
-        ray.shutdown()
 
 
-def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> tuple[RunFlights, dict[str, str]]:
-    """Train and fly all runs of a sweep, within :func:`ray_cluster`.
+def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> RunFlights:
+    """Train and fly all runs of a sweep on the cluster of :func:`connect_ray`, and print why runs
+    failed.
 
     :param folder: the sweep's, which all machines of the cluster see. What Ray Tune has begun in it
         is continued.
     :param workers: number of concurrent runs; None: as many as fit.
-    :return: the flights of the finished runs, and why others failed, by name. A run that was
-        interrupted is in neither.
-    :raises ConfigError: a configuration that does not fit; files that Ray Tune cannot restore.
+    :return: the flights of the finished runs.
     """
     from ray import tune
 
     folder = folder.absolute()
     configurations = checked_configurations(sweep)
-    work = partial(
-        train_run,
-        folder=folder,
-        sweep=sweep,
-        configurations=configurations,
-        home=os.getcwd(),
-    )
-    trainable = tune.with_resources(work, sweep.resources)
+    suite = sweep.evaluation.load()
+    trainable = partial(train_run, folder, configurations, suite, os.getcwd())
+    trainable = tune.with_resources(trainable, sweep.resources)
     # A sweep that was killed early has no state yet.
     if any(folder.glob("experiment_state-*")):
         tuner = tune.Tuner.restore(str(folder), trainable, resume_errored=True)
@@ -266,18 +220,17 @@ def run_sweep(folder: Path, sweep: Sweep, workers: int | None) -> tuple[RunFligh
                 name=folder.name,
                 storage_path=str(folder.parent),
                 failure_config=tune.FailureConfig(max_failures=RETRIES),
-                verbose=1,
             ),
         )
     flights = {}
-    failed = {}
     for result in tuner.fit():
         run = (result.config["configuration"], result.config["seed"])
         if result.error is not None:
-            failed[run_name(*run)] = one_line(result.error)
+            print(f"failed: {run_name(*run)}: {one_line(result.error)}", file=sys.stderr)
+        # A run that was interrupted has none.
         elif "flights" in result.metrics:
             flights[run] = result.metrics["flights"]
-    return flights, failed
+    return flights
 
 
 def run_name(configuration: str, seed: int) -> str:
@@ -286,17 +239,18 @@ def run_name(configuration: str, seed: int) -> str:
 
 
 def train_run(
-    choice: StrMapping,
     folder: Path,
-    sweep: Sweep,
     configurations: dict[str, Configuration],
+    suite: Suite,
     home: str,
+    choice: StrMapping,
 ) -> StrDict:
     """Train a run in its folder, or continue it there, and fly its agent.
 
-    :param choice: the ``configuration``, by name, and the ``seed``.
     :param home: the working directory, in which relative paths make sense.
-    :raises ConfigError: a machine that does not see the folder; files that lead out of it.
+    :param choice: the ``configuration``, by name, and the ``seed``.
+    :return: ``flights``: the numbers of the agent's flights, by scenario and measure.
+    :raises ConfigError: a machine that does not see the folder.
     """
     if not folder.is_dir():
         raise ConfigError(
@@ -306,12 +260,7 @@ def train_run(
     # One core for each run, so that the weights are the same on any machine.
     torch.set_num_threads(1)
     use_cpus(1)
-    import_packages(sweep.gym_packages, "gym_packages:")
     place = folder / "runs" / run_name(**choice)
-    # A link in a folder from someone else must not make this write elsewhere.
-    for path in (place, *place.rglob("*")):
-        if not path.resolve().is_relative_to(folder.resolve()):
-            raise ConfigError(f"{path}: leads out of the sweep's folder; remove it")
     place.mkdir(parents=True, exist_ok=True)
     with (place / "log.txt").open("a", buffering=1, encoding="utf-8") as log:
         report = partial(print, file=log)
@@ -323,29 +272,10 @@ def train_run(
             options |= {"seed": choice["seed"], "log_folder": str(place)}
             trained = run_pipeline(pipeline, options, "pipeline", report)
     *_, last = trained.stages.values()
-    return {"flights": fly_agent(Path(last.agent), trained.job, sweep.evaluation)}
-
-
-def fly_agent(agent: Path, job: TrainingJob, evaluation: Evaluation) -> StrDict:
-    """Return the numbers of an agent's flights, by scenario and measure."""
-    model = load_model(agent)
-    suite = evaluation.load()
-    if suite is not None:
-        spec = ControllerSpec("agent", str(agent))
-        flights = {}
-        for scenario in suite.scenarios:
-            flown = scenario.flown_by(spec.own and spec.own.vehicle)
-            flights[scenario.name] = numbers(fly_scenario(model, flown, own=spec.observed))
-        return flights
-    episodes = evaluation.episodes or 240
-    # Without a suite, the episodes are those of the closing table of train.
-    seed = seed_for("table", evaluation.seed or 0)
-    if hasattr(model, KEY):
-        how = env_kwargs(model)
-        return {task: numbers(fly(model, task, episodes, seed, **how)) for task in TASKS}
-    # A third-party environment has rewards alone, and so has a wrapped one.
-    config = job.for_evaluation()
-    with closing(make_environments(config, 1, seed)) as env:
-        share_statistics(getattr(model, STATISTICS, None), env)
-        rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
-    return {config.env_id: {"reward": rewards}}
+    model = load_model(last.agent)
+    spec = ControllerSpec("agent", last.agent)
+    flights = {}
+    for scenario in suite.scenarios:
+        flown = scenario.flown_by(spec.own and spec.own.vehicle)
+        flights[scenario.name] = numbers(fly_scenario(model, flown, own=spec.observed))
+    return {"flights": flights}

@@ -1,4 +1,4 @@
-"""The results of a sweep: ``results.csv``, and the tables of terminal and ``report.md``."""
+"""The results of a sweep: ``results.csv``, and the table for the terminal."""
 
 from pathlib import Path
 from typing import TypeAlias
@@ -10,24 +10,17 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation import metric_tables
 from sb3_quad.evaluation.flights import Flights
-from sb3_quad.evaluation.metric_tables import estimate_text
+from sb3_quad.evaluation.metric_tables import Row, estimate_text
 from sb3_quad.evaluation.statistics import over_seeds
 from sb3_quad.evaluation.tables import Table
 
-# The rows of the measures.
 ROWS = {
     "success": metric_tables.SUCCESS,
     "survival": metric_tables.SURVIVAL,
     "reward": metric_tables.REWARD,
-    "final_error": metric_tables.MEDIAN,
+    "final_error": Row("mean final error", "m", decimals=3),
 }
-# All are means, except for the final error, which is a median.
-STATISTICS = {**dict.fromkeys(ROWS, "mean"), "final_error": "median"}
-COMPARED = ("success", "reward")
-CAPTION = (
-    "means over n seeds, and differences of the seeds and episodes that both have; in brackets: "
-    "95 % intervals, by a bootstrap over seeds and episodes"
-)
+CAPTION = "means; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
 # The levels that distinguish the rows of a table of episodes
 LEVELS = ("configuration", "seed", "scenario", "episode")
 RunFlights: TypeAlias = dict[tuple[str, int], StrDict]
@@ -38,68 +31,35 @@ crashed or left the range.
 
 
 def numbers(flights: Flights) -> StrDict:
-    """Return the measures of all episodes, NaN where there is no number."""
-    final_error = np.where(flights.survival, flights.final_error, np.nan)
-    return {
-        "success": flights.success.tolist(),
-        "survival": flights.survival.tolist(),
-        "reward": flights.reward.tolist(),
-        "final_error": final_error.tolist(),
-    }
+    """Return the measures of all episodes."""
+    measures = {name: getattr(flights, name).tolist() for name in ROWS}
+    measures["final_error"] = np.where(flights.survival, flights.final_error, np.nan).tolist()
+    return measures
 
 
-def write_results(folder: Path, runs: RunFlights) -> list[Table]:
-    """Write ``results.csv``, a line for each run and scenario, and ``report.md``.
+def write_results(folder: Path, runs: RunFlights) -> Table:
+    """Write ``results.csv``, a line for each run and scenario.
 
     :param runs: the finished runs, at least one.
-    :return: the tables of the report.
+    :return: a column for each configuration, rows for each scenario.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     parts = {}
     for run in sorted(runs):
         for scenario, measures in runs[run].items():
-            # A row for each episode, NaN where there is no number.
-            part = pd.DataFrame(measures, columns=[*ROWS], dtype=np.float64)
-            parts[(*run, scenario)] = part
+            # Ray stores NaN as null.
+            parts[(*run, scenario)] = pd.DataFrame(measures, dtype=np.float64)
     flights = pd.concat(parts, names=LEVELS)
-    means = flights.groupby(level=LEVELS[:3], sort=False).agg(STATISTICS)
+    means = flights.groupby(level=LEVELS[:3], sort=False).mean()
     write_text(folder / "results.csv", means.to_csv(float_format="%.9g"))
-    tables = []
-    report = f"# {folder.name}\n"
-    for scenario, group in flights.groupby(level="scenario", sort=False):
-        table = compare(str(scenario), group.droplevel("scenario"))
-        report += f"\n## {table.title}\n\n{table.markdown()}\n\n{table.caption}\n"
-        tables.append(table)
-    write_text(folder / "report.md", report)
-    return tables
-
-
-def compare(scenario: str, flights: pd.DataFrame) -> Table:
-    """Return a table with a column for each configuration, and with the differences from the first.
-
-    :param flights: the measures of ``ROWS`` by configuration, seed and episode.
-    """
-    columns = []
-    for name, runs in flights.groupby(level="configuration", sort=False):
-        columns.append(f"{name} (n = {runs.index.unique('seed').size})")
     rows = []
-    for measure, row in ROWS.items():
-        statistic = np.nanmedian if STATISTICS[measure] == "median" else np.nanmean
-        cells = []
-        differences = []
-        first = None
-        for _, runs in flights[measure].groupby(level="configuration", sort=False):
-            # A row for each seed, a column for each episode.
-            values = runs.droplevel("configuration").unstack()
-            cells.append(estimate_text(row, over_seeds(values.to_numpy(), statistic)))
-            if first is None:
-                first = values
-            paired = (values - first).dropna(how="all")
-            differences.append(estimate_text(row, over_seeds(paired.to_numpy())))
-        # No row for what the environment does not report.
-        if {*cells} != {"–"}:
-            rows.append([row.heading, *cells])
-            if measure in COMPARED and len(columns) > 1:
-                name = f"{row.name}, more than {columns[0]}"
-                rows.append([row._replace(name=name).heading, *differences])
-    return Table(["", *columns], rows, scenario, CAPTION)
+    for scenario, group in flights.groupby(level="scenario", sort=False):
+        for measure, row in ROWS.items():
+            # A row for each run, a column for each episode.
+            values = group[measure].unstack("episode")
+            cells = []
+            for _, runs_of_one in values.groupby(level="configuration", sort=False):
+                cells.append(estimate_text(row, over_seeds(runs_of_one.to_numpy())))
+            rows.append([f"{scenario}: {row.heading}", *cells])
+    names = flights.index.unique("configuration")
+    return Table(["", *map(str, names)], rows, caption=CAPTION)

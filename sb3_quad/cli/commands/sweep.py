@@ -12,12 +12,11 @@ examples:
   # continue after Ctrl-C or a crash
   sb3-quad sweep --resume logs/sweep/my_sweep_1 --trust
 
-The new folder receives the run folders, results.csv and report.md. For the keys
-of the file, see docs/sweeps.md. Needs Ray: pip install '.[ray]' from a clone.
+The new folder receives the run folders and results.csv. For the keys of the
+file, see docs/sweeps.md. Needs Ray: pip install '.[ray]' from a clone.
 """
 
 import shlex
-import sys
 from argparse import Namespace
 from pathlib import Path
 
@@ -42,34 +41,34 @@ FLAGS: Flags = {
 
 def run(options: Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
-    import yaml
-
     from sb3_quad.base.errors import ConfigError
     from sb3_quad.base.files import locked, write_text
     from sb3_quad.base.process import trusted
     from sb3_quad.cli.output import console
-    from sb3_quad.training.runs import claim_folder
+    from sb3_quad.training.runs import claim_folder, refuse_links
     from sb3_quad.training.sweep import (
+        SWEEPS,
         checked_configurations,
+        connect_ray,
         load_sweep,
-        ray_cluster,
         run_name,
         run_sweep,
     )
     from sb3_quad.training.sweep_results import write_results
 
+    source = options.sweep
     if options.resume:
-        sweep = load_sweep(Path(options.resume) / "sweep.yaml")
+        source = Path(options.resume) / "sweep.yaml"
         # Ray Tune keeps its state as pickles.
         if not trusted():
             raise ConfigError(
                 f"sweep folder {options.resume}: its files can run code; "
                 "if the sweep is yours, add --trust"
             )
-    elif options.sweep:
-        sweep = load_sweep(options.sweep)
-    else:
+        refuse_links(source.parent)
+    if source is None:
         raise ConfigError("sweep: give its YAML file, or --resume with its folder")
+    sweep = load_sweep(source)
     names = [
         run_name(configuration, seed)
         for configuration in checked_configurations(sweep)
@@ -78,25 +77,18 @@ def run(options: Namespace) -> int:
     if options.dry_run:
         print(*names, sep="\n")
         return 0
-    with ray_cluster(options.address):
+    with connect_ray(options.address):
         if options.resume:
-            folder = Path(options.resume)
+            folder = source.parent
         else:
             # A new folder only once it is known that Ray starts.
-            parent = Path(options.log_folder) / "sweep"
-            folder = claim_folder(parent, Path(options.sweep).stem)
-            content = sweep.model_dump(mode="json", exclude_defaults=True)
-            write_text(folder / "sweep.yaml", yaml.safe_dump(content, sort_keys=False))
+            folder = claim_folder(Path(options.log_folder) / "sweep", Path(source).stem)
+            write_text(folder / "sweep.yaml", SWEEPS.text(source)[0])
         with locked(folder, "sweep folder"):
-            flights, failed = run_sweep(folder, sweep, options.workers)
+            flights = run_sweep(folder, sweep, options.workers)
             if flights:
-                console().print(*write_results(folder, flights))
+                console().print(write_results(folder, flights))
     print(f"{len(flights)} of {len(names)} runs finished, saved in {folder}")
-    for name, message in failed.items():
-        print(f"failed: {name}: {message}", file=sys.stderr)
     if len(flights) < len(names):
         print(f"to continue: sb3-quad sweep --resume {shlex.quote(str(folder))} --trust")
-    # Ray Tune ends without an error after Ctrl-C.
-    if len(flights) + len(failed) < len(names):
-        return 130
-    return int(bool(failed))
+    return int(len(flights) < len(names))

@@ -27,20 +27,17 @@ clone.
 
 import shlex
 from argparse import Namespace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pydantic import NonNegativeInt, PositiveInt
 
-from sb3_quad.base.errors import refuse_unknown
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.imports import require
-from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import CONF_FILE, SETTINGS_FLAGS, plan, prepare
 from sb3_quad.cli.parser import Flags, given, seed
 from sb3_quad.training.options import DEFAULT_ALGO
 
-# Episodes per evaluation by --vec-env.
-EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 FLAGS: Flags = {
     **CONF_FILE,
     **SETTINGS_FLAGS,
@@ -61,57 +58,51 @@ FLAGS: Flags = {
     "--search-space FILE": "YAML file of settings to vary (the package's file for the algorithm)",
     "-f --log-folder DIR": (str, "logs", "results go to DIR/tune/ALGO/ENV_N (logs)"),
     "--seed N": (seed, 0, "seed of trainings and sampler, negative for a random one (0)"),
-    "--eval-episodes N": (PositiveInt, "episodes per evaluation (batch: 240, else 48)"),
+    "--eval-episodes N": (PositiveInt, 240, "episodes per evaluation (240)"),
 }
 
 
 def run(options: Namespace) -> int:
     """Search, report, write. Returns the exit code."""
     optuna = require("optuna", "tune", "a search")
-    require("cmaes", "tune", "a search")
-    from sb3_quad.base.validate import validate
-    from sb3_quad.training.config import TrainingJob
     from sb3_quad.training.runs import claim_folder, file_name
-    from sb3_quad.training.tune import make_objective, open_study, write_results
+    from sb3_quad.training.tune import (
+        load_space,
+        open_study,
+        train_trial,
+        write_results,
+    )
 
-    # Processes that share a storage must not propose the same trials.
-    sampler_seed = None if options.storage else options.seed
-    refuse_unknown("sampler", [options.sampler], optuna.samplers.__all__)
-    refuse_unknown("pruner", [options.pruner], optuna.pruners.__all__)
-    sampler = getattr(optuna.samplers, options.sampler)(seed=sampler_seed)
-    pruner = getattr(optuna.pruners, options.pruner)()
+    with raised_as(
+        ConfigError, f"--sampler {options.sampler} --pruner {options.pruner}: cannot be used"
+    ):
+        # Processes that share a storage must not propose the same trials.
+        sampler_seed = None if options.storage else options.seed
+        sampler = getattr(optuna.samplers, options.sampler)(seed=sampler_seed)
+        pruner = getattr(optuna.pruners, options.pruner)()
     prepare(options)
     # A search is for the settings of a single run.
     options.algo = options.algo or DEFAULT_ALGO
     stage = plan(options)
-    config = stage.load()
-    known = given(options, "device", "initial_policy", "n_eval_envs", "seed", "eval_episodes")
-    data = {
-        "config": config,
-        "agent": stage.agent,
-        "eval_episodes": EPISODES[config.vec_env],
-        **known,
-    }
-    job = validate(TrainingJob, data, "command line")
-    objective = make_objective(job, options.search_space, options.n_evaluations)
+    job = stage.job(
+        given(options, "device", "initial_policy", "n_eval_envs", "seed", "eval_episodes")
+    )
+    config = job.config
+    space = load_space(options.search_space, config)
     name = options.study_name or f"{config.algo}_{config.env_id}"
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     storage = options.storage or f"sqlite:///{folder}/study.db"
-    study = open_study(name, storage, objective, sampler, pruner)
-    objective.job = job.model_copy(update={"log_folder": str(folder)})
-    print("results go to", folder)
-    with StopSignals() as signals:
-
-        def after_trial(study: Any, trial: Any) -> None:
-            write_results(study, objective, folder)
-            end = f"{trial.state.name.lower()}, value {trial.value}, {trial.params}"
-            print(f"trial {trial.number}: {end}")
-            if signals.received:
-                study.stop()
-
-        study.optimize(objective, options.n_trials, catch=(Exception,), callbacks=[after_trial])
-        write_results(study, objective, folder)
-    best = shlex.quote(f"{folder}/best.yml")
-    print(f"to train: sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {best}")
-    print(f"to continue: --storage {shlex.quote(storage)} --study-name {shlex.quote(name)}")
-    return signals.exit_code
+    study = open_study(name, storage, sampler=sampler, pruner=pruner)
+    print(f"results go to {folder}; to continue:", end=" ")
+    print(f"--storage {shlex.quote(storage)} --study-name {shlex.quote(name)}")
+    objective = partial(
+        train_trial,
+        job=job.model_copy(update={"log_folder": str(folder)}),
+        space=space,
+        n_evaluations=options.n_evaluations,
+    )
+    try:
+        study.optimize(objective, options.n_trials, catch=(Exception,))
+    finally:
+        write_results(study, config.env_id, folder)
+    return 0
