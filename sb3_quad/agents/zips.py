@@ -6,7 +6,6 @@ file.
 """
 
 import base64
-import functools
 import io
 import json
 import warnings
@@ -22,9 +21,8 @@ from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.agents.pickles import read_pickle
-from sb3_quad.agents.pretrained import pretrained_names
 from sb3_quad.algorithms.statistics import STATISTICS
-from sb3_quad.base.errors import ConfigError, did_you_mean, raised_as
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.process import trusted
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
@@ -63,7 +61,7 @@ def saved_data(path: StrPath) -> StrDict:
     """
     # A damaged archive may raise anything.
     with raised_as(ConfigError, f"model {path}: not a complete SB3 zip"):
-        return _data(_open(_read_file(Path(path))))
+        return _data(_open(path))
 
 
 def saved_algorithm(path: StrPath) -> str:
@@ -121,20 +119,16 @@ def load_zip(algorithm: Any, source: StrPath | io.BytesIO, where: str = "", **kw
     """
     where = where or f"model {source}"
     with raised_as(ConfigError, f"{where}: not a complete SB3 zip"), warnings.catch_warnings():
-        # SB3 mistakes the buffer of n-step returns, its own choice, for the user's.
-        warnings.filterwarnings("ignore", "`n_steps=")
-        # SB3 reads the layers of older zips, too.
-        warnings.filterwarnings("ignore", "As shared layers")
-        content = source
-        if not isinstance(content, io.BytesIO):
-            content = _read_file(Path(content))
-        archive = _open(content)
+        # SB3 mistakes the buffer of n-step returns, its own choice, for the user's; and it reads
+        # the layers of older zips, too.
+        warnings.filterwarnings("ignore", "`n_steps=|As shared layers")
+        archive = _open(source)
         data = _data(archive)
         to_fly = algorithm is None
         if to_fly:
             # ``predict`` of this package's algorithms is that of PPO.
-            name = _algorithm(data)
-            algorithm = getattr(stable_baselines3, name, stable_baselines3.PPO)
+            algorithm = getattr(stable_baselines3, _algorithm(data), stable_baselines3.PPO)
+        content: Any = archive.fp
         if not trusted():
             content, kwargs["custom_objects"] = _copy(archive, data, to_fly, where)
         content.seek(0)
@@ -147,26 +141,26 @@ def _read_file(path: Path) -> io.BytesIO:
     :raises ConfigError: it is missing, or too large.
     """
     if not path.is_file():
-        guess = did_you_mean(path, pretrained_names())
-        problem = f"model {path}: no such file, or no run with an agent in this folder; {guess}"
-        raise ConfigError(problem.rstrip("; "))
+        raise ConfigError(f"model {path}: no such file, or no run with an agent in this folder")
     if path.stat().st_size > _LARGEST:
         raise ConfigError(f"{path}: is larger than {_LARGEST:,} bytes")
     return io.BytesIO(path.read_bytes())
 
 
-def _open(content: io.BytesIO) -> zipfile.ZipFile:
+def _open(source: StrPath | io.BytesIO) -> zipfile.ZipFile:
     """Open a zip whose parts need no more memory than its size, as SB3 and PyTorch write it.
 
+    :raises ConfigError: see :func:`_read_file`.
     :raises ValueError: it begins with something else, or parts are compressed, or overlap.
     """
+    content = source
+    if not isinstance(content, io.BytesIO):
+        content = _read_file(Path(content))
     # Before version 1.6, PyTorch wrote files of another kind.
     if not content.getvalue().startswith(b"PK\x03\x04"):
         raise ValueError("it does not begin as a zip")
     archive = zipfile.ZipFile(content)
-    parts = archive.infolist()
-    size = sum(part.file_size for part in parts)
-    if size > archive.start_dir or any(part.compress_type for part in parts):
+    if sum(part.file_size for part in archive.infolist()) > archive.start_dir:
         raise ValueError("is compressed, as no zip of SB3 is; pack it with zip -0")
     return archive
 
@@ -187,18 +181,18 @@ def _copy(
     """
     kept = {}
     for key, entry in data.items():
+        if key in _NEVER_READ:
+            continue
         if isinstance(entry, dict) and ":serialized:" in entry:
             if to_fly and key not in _TO_FLY:
                 continue
-            with _safely(f"{where}: its {key}"):
-                kept[key] = read_pickle(base64.b64decode(entry[":serialized:"]))
-        elif key not in _NEVER_READ:
-            kept[key] = entry
+            entry = _read(f"{where}: its {key}", base64.b64decode(entry[":serialized:"]))
+        kept[key] = entry
     tensors = {}
     for part in archive.namelist():
-        if part.endswith(".pth"):
-            with _safely(f"{where}: its {part}"):
-                tensors[part.removesuffix(".pth")] = _tensors(archive.read(part))
+        name, _, ending = part.rpartition(".")
+        if ending == "pth":
+            tensors[name] = _tensors(f"{where}: its {part}", archive.read(part))
     # The second name is that of SB3 before 0.9.
     variables = tensors.pop("pytorch_variables", None) or tensors.pop("tensors", {})
     # SB3 would set variables of other names on any object.
@@ -211,20 +205,19 @@ def _copy(
     return copy, kept
 
 
-def _safely(its: str) -> Any:
+def _read(its: str, content: bytes, *numbers: Any) -> Any:
     way_out = "if you trust its maker, add --trust, or set SB3_QUAD_TRUST=1"
-    return raised_as(ConfigError, f"{its} cannot be read; {way_out}")
+    with raised_as(ConfigError, f"{its} cannot be read; {way_out}"):
+        return read_pickle(content, *numbers)
 
 
-def _tensors(content: bytes) -> Any:
+def _tensors(its: str, content: bytes) -> Any:
     """Return what PyTorch has saved."""
     weights = _open(io.BytesIO(content))
-    (name,) = [name for name in weights.namelist() if name.endswith("/data.pkl")]
-    folder = name.removesuffix(".pkl") + "/"
-    # Several tensors may share their numbers.
-    return read_pickle(
-        weights.read(name), functools.cache(lambda key: bytearray(weights.read(folder + key)))
-    )
+    # PyTorch writes the pickle first, then the folder with the tensors.
+    name = weights.namelist()[0]
+    folder = name.removesuffix(".pkl")
+    return _read(its, weights.read(name), lambda part: weights.read(f"{folder}/{part}"))
 
 
 def _check_size(data: StrDict, most: int) -> None:
@@ -256,8 +249,7 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
     :raises ConfigError: a file that cannot be read, or no file although the run had statistics.
     """
     for file in Path(path).parent.glob("*/vecnormalize.pkl"):
-        with _safely(str(file)):
-            statistics = read_pickle(_read_file(file).getvalue())
+        statistics = _read(str(file), _read_file(file).getvalue())
         if not isinstance(statistics, VecNormalize):
             raise ConfigError(f"{file}: holds no VecNormalize")
         return statistics
