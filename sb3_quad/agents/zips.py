@@ -21,8 +21,9 @@ from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.agents.pickles import read_pickle
+from sb3_quad.agents.pretrained import pretrained_names
 from sb3_quad.algorithms.statistics import STATISTICS
-from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.errors import ConfigError, did_you_mean, raised_as
 from sb3_quad.base.process import trusted
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
@@ -141,7 +142,9 @@ def _read_file(path: Path) -> io.BytesIO:
     :raises ConfigError: it is missing, or too large.
     """
     if not path.is_file():
-        raise ConfigError(f"model {path}: no such file, or no run with an agent in this folder")
+        guess = did_you_mean(path, pretrained_names())
+        problem = f"model {path}: no such file, or no agent in this folder; {guess}"
+        raise ConfigError(problem.rstrip("; "))
     if path.stat().st_size > _LARGEST:
         raise ConfigError(f"{path}: is larger than {_LARGEST:,} bytes")
     return io.BytesIO(path.read_bytes())
