@@ -189,13 +189,15 @@ def _copy(
         if isinstance(entry, dict) and ":serialized:" in entry:
             if to_fly and key not in _TO_FLY:
                 continue
-            entry = _read(f"{where}: its {key}", base64.b64decode(entry[":serialized:"]))
+            with _safely(f"{where}: its {key}"):
+                entry = read_pickle(base64.b64decode(entry[":serialized:"]))
         kept[key] = entry
     tensors = {}
     for part in archive.namelist():
         name, _, ending = part.rpartition(".")
         if ending == "pth":
-            tensors[name] = _tensors(f"{where}: its {part}", archive.read(part))
+            with _safely(f"{where}: its {part}"):
+                tensors[name] = _tensors(archive.read(part))
     # The second name is that of SB3 before 0.9.
     variables = tensors.pop("pytorch_variables", None) or tensors.pop("tensors", {})
     # SB3 would set variables of other names on any object.
@@ -208,19 +210,18 @@ def _copy(
     return copy, kept
 
 
-def _read(its: str, content: bytes, *numbers: Any) -> Any:
+def _safely(its: str) -> Any:
     way_out = "if you trust its maker, add --trust, or set SB3_QUAD_TRUST=1"
-    with raised_as(ConfigError, f"{its} cannot be read; {way_out}"):
-        return read_pickle(content, *numbers)
+    return raised_as(ConfigError, f"{its} cannot be read; {way_out}")
 
 
-def _tensors(its: str, content: bytes) -> Any:
+def _tensors(content: bytes) -> Any:
     """Return what PyTorch has saved."""
     weights = _open(io.BytesIO(content))
     # PyTorch writes the pickle first, then the folder with the tensors.
     name = weights.namelist()[0]
     folder = name.removesuffix(".pkl")
-    return _read(its, weights.read(name), lambda part: weights.read(f"{folder}/{part}"))
+    return read_pickle(weights.read(name), lambda part: weights.read(f"{folder}/{part}"))
 
 
 def _check_size(data: StrDict, most: int) -> None:
@@ -252,7 +253,8 @@ def _statistics_beside(path: StrPath) -> VecNormalize | None:
     :raises ConfigError: a file that cannot be read, or no file although the run had statistics.
     """
     for file in Path(path).parent.glob("*/vecnormalize.pkl"):
-        statistics = _read(str(file), _read_file(file).getvalue())
+        with _safely(str(file)):
+            statistics = read_pickle(_read_file(file).getvalue())
         if not isinstance(statistics, VecNormalize):
             raise ConfigError(f"{file}: holds no VecNormalize")
         return statistics
