@@ -139,24 +139,18 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     :raises ConfigError: it does not fit.
     """
     if not isinstance(record, dict):
-        raise ConfigError(
-            f"{where}: must be a mapping of names to values, as"
-            " FlightSettings(...).write_into(model) writes it"
-        )
+        raise ConfigError(f"{where}: must be what FlightSettings(...).write_into(model) writes")
     # A path in a stranger's zip could name a device file, which would be read forever. Both a
     # vehicle and a distribution may be given by a name, which could be a path.
     distribution = record.get("vehicles")
     if isinstance(distribution, dict):
         distribution = distribution.get("distribution")
-    for key, folder, source in (
-        ("rotor_layout", VEHICLES, record.get("rotor_layout")),
-        ("vehicles", DISTRIBUTIONS, distribution),
+    for folder, source in (
+        (VEHICLES, record.get("rotor_layout")),
+        (DISTRIBUTIONS, distribution),
     ):
         if isinstance(source, str) and folder.is_path(source):
-            raise ConfigError(
-                f"{where}: {key}: {source!r} is a path; "
-                "a zip holds such files or names those of the package"
-            )
+            raise ConfigError(f"{where}: {source!r} is a path; a zip holds what it needs")
     # A task is saved by its fields; a mixture has weights by name instead.
     task = record.get("task")
     changes: StrDict = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}

@@ -8,6 +8,7 @@ A few bytes can describe an object whose hash or copy takes forever. Therefore k
 an object counts each time that it occurs.
 """
 
+import functools
 import io
 import pickle
 import pickletools
@@ -117,11 +118,11 @@ class Name(str):
 class Made(list[Any]):
     """An object that a pickle makes: from what, with which arguments, state, fields and items."""
 
+    state: Any = None
+
     def __init__(self, maker: Any, arguments: Any) -> None:
-        super().__init__()
         self.maker = maker
         self.arguments = arguments
-        self.state: Any = None
         self.fields: StrDict = {}
 
     def __setstate__(self, state: Any) -> None:
@@ -159,7 +160,7 @@ class _Reader(pickle._Unpickler):
     }
 
 
-def read_pickle(content: bytes, numbers: Callable[[str], bytearray] | None = None) -> Any:
+def read_pickle(content: bytes, numbers: Callable[[str], bytes] = str.encode) -> Any:
     """Return the object in a pickle. :func:`.trusted` files may hold any.
 
     :param numbers: returns what a tensor's part of a file holds.
@@ -178,8 +179,9 @@ def read_pickle(content: bytes, numbers: Callable[[str], bytearray] | None = Non
 class _Builder:
     """Makes objects from their descriptions."""
 
-    def __init__(self, numbers: Callable[[str], bytearray] | None) -> None:
-        self._numbers: Any = numbers
+    def __init__(self, numbers: Callable[[str], bytes]) -> None:
+        # Several tensors may share their numbers.
+        self._numbers = functools.cache(lambda part: bytearray(numbers(part)))
         self._left = _MOST
 
     def build(self, value: Any) -> Any:

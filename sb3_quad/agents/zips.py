@@ -6,7 +6,6 @@ file.
 """
 
 import base64
-import functools
 import io
 import json
 import warnings
@@ -63,7 +62,7 @@ def saved_data(path: StrPath) -> StrDict:
     """
     # A damaged archive may raise anything.
     with raised_as(ConfigError, f"model {path}: not a complete SB3 zip"):
-        return _data(_open(_read_file(Path(path))))
+        return _data(_open(path))
 
 
 def saved_algorithm(path: StrPath) -> str:
@@ -121,20 +120,16 @@ def load_zip(algorithm: Any, source: StrPath | io.BytesIO, where: str = "", **kw
     """
     where = where or f"model {source}"
     with raised_as(ConfigError, f"{where}: not a complete SB3 zip"), warnings.catch_warnings():
-        # SB3 mistakes the buffer of n-step returns, its own choice, for the user's.
-        warnings.filterwarnings("ignore", "`n_steps=")
-        # SB3 reads the layers of older zips, too.
-        warnings.filterwarnings("ignore", "As shared layers")
-        content = source
-        if not isinstance(content, io.BytesIO):
-            content = _read_file(Path(content))
-        archive = _open(content)
+        # SB3 mistakes the buffer of n-step returns, its own choice, for the user's; and it reads
+        # the layers of older zips, too.
+        warnings.filterwarnings("ignore", "`n_steps=|As shared layers")
+        archive = _open(source)
         data = _data(archive)
         to_fly = algorithm is None
         if to_fly:
             # ``predict`` of this package's algorithms is that of PPO.
-            name = _algorithm(data)
-            algorithm = getattr(stable_baselines3, name, stable_baselines3.PPO)
+            algorithm = getattr(stable_baselines3, _algorithm(data), stable_baselines3.PPO)
+        content: Any = archive.fp
         if not trusted():
             content, kwargs["custom_objects"] = _copy(archive, data, to_fly, where)
         content.seek(0)
@@ -148,25 +143,27 @@ def _read_file(path: Path) -> io.BytesIO:
     """
     if not path.is_file():
         guess = did_you_mean(path, pretrained_names())
-        problem = f"model {path}: no such file, or no run with an agent in this folder; {guess}"
+        problem = f"model {path}: no such file, or no agent in this folder; {guess}"
         raise ConfigError(problem.rstrip("; "))
     if path.stat().st_size > _LARGEST:
         raise ConfigError(f"{path}: is larger than {_LARGEST:,} bytes")
     return io.BytesIO(path.read_bytes())
 
 
-def _open(content: io.BytesIO) -> zipfile.ZipFile:
+def _open(source: StrPath | io.BytesIO) -> zipfile.ZipFile:
     """Open a zip whose parts need no more memory than its size, as SB3 and PyTorch write it.
 
+    :raises ConfigError: see :func:`_read_file`.
     :raises ValueError: it begins with something else, or parts are compressed, or overlap.
     """
+    content = source
+    if not isinstance(content, io.BytesIO):
+        content = _read_file(Path(content))
     # Before version 1.6, PyTorch wrote files of another kind.
     if not content.getvalue().startswith(b"PK\x03\x04"):
         raise ValueError("it does not begin as a zip")
     archive = zipfile.ZipFile(content)
-    parts = archive.infolist()
-    size = sum(part.file_size for part in parts)
-    if size > archive.start_dir or any(part.compress_type for part in parts):
+    if sum(part.file_size for part in archive.infolist()) > archive.start_dir:
         raise ValueError("is compressed, as no zip of SB3 is; pack it with zip -0")
     return archive
 
@@ -187,18 +184,20 @@ def _copy(
     """
     kept = {}
     for key, entry in data.items():
+        if key in _NEVER_READ:
+            continue
         if isinstance(entry, dict) and ":serialized:" in entry:
             if to_fly and key not in _TO_FLY:
                 continue
             with _safely(f"{where}: its {key}"):
-                kept[key] = read_pickle(base64.b64decode(entry[":serialized:"]))
-        elif key not in _NEVER_READ:
-            kept[key] = entry
+                entry = read_pickle(base64.b64decode(entry[":serialized:"]))
+        kept[key] = entry
     tensors = {}
     for part in archive.namelist():
-        if part.endswith(".pth"):
+        name, _, ending = part.rpartition(".")
+        if ending == "pth":
             with _safely(f"{where}: its {part}"):
-                tensors[part.removesuffix(".pth")] = _tensors(archive.read(part))
+                tensors[name] = _tensors(archive.read(part))
     # The second name is that of SB3 before 0.9.
     variables = tensors.pop("pytorch_variables", None) or tensors.pop("tensors", {})
     # SB3 would set variables of other names on any object.
@@ -219,12 +218,10 @@ def _safely(its: str) -> Any:
 def _tensors(content: bytes) -> Any:
     """Return what PyTorch has saved."""
     weights = _open(io.BytesIO(content))
-    (name,) = [name for name in weights.namelist() if name.endswith("/data.pkl")]
-    folder = name.removesuffix(".pkl") + "/"
-    # Several tensors may share their numbers.
-    return read_pickle(
-        weights.read(name), functools.cache(lambda key: bytearray(weights.read(folder + key)))
-    )
+    # PyTorch writes the pickle first, then the folder with the tensors.
+    name = weights.namelist()[0]
+    folder = name.removesuffix(".pkl")
+    return read_pickle(weights.read(name), lambda part: weights.read(f"{folder}/{part}"))
 
 
 def _check_size(data: StrDict, most: int) -> None:

@@ -68,10 +68,8 @@ PAIRS = b")" + b"".join(b"\x94h" + bytes([k]) + b"\x86" for k in range(60))
 # They would crash Python, never end, or take much memory.
 MONSTERS = {
     "a deep key": b"}" + DEEP + b"Ns.",
-    "a deep name": DEEP + b")R.",
     "pairs": PAIRS + b".",
     "a key of pairs": b"}" + PAIRS + b"Ns.",
-    "a call of pairs": PAIRS + b")R.",
     "itself": b"]\x94h\0a.",
     "many": b"}\x94" * 10**6 + b".",
     "a long array": b"\x96" + (1 << 40).to_bytes(8, "little") + b".",
@@ -106,23 +104,16 @@ def zip_with(changes, source=AGENT, path="foreign.zip"):
     return path
 
 
-def weights(content=b"", compression=0, tensor=None):
+def weights(content=b"", compression=0, **tensors):
     """A file of torch.save, whose pickle may be another."""
     plain = io.BytesIO()
-    torch.save({"a": tensor}, plain)
+    torch.save(tensors, plain)
     changed = io.BytesIO()
     with zipfile.ZipFile(plain) as archive, zipfile.ZipFile(changed, "w", compression) as copied:
         for name in archive.namelist():
             is_pickle = content and name.endswith("/data.pkl")
             copied.writestr(name, content if is_pickle else archive.read(name))
     return changed.getvalue()
-
-
-def legacy(content):
-    """A file of PyTorch before 1.6."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer, _use_new_zipfile_serialization=False)
-    return buffer.getvalue()
 
 
 def the_line(capsys):
@@ -149,7 +140,6 @@ def test_a_pickle_that_calls_a_function_is_refused(content):
 @pytest.mark.parametrize(
     ("command", "key"),
     [
-        ("evaluate foreign.zip --suite quick -n 1 --no-report", "policy_class"),
         ("enjoy foreign.zip --no-render -n 1", "action_space"),
         ("export foreign.zip --format c", "observation_space"),
         ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "vec_normalize"),
@@ -164,13 +154,11 @@ def test_no_command_runs_what_a_zip_holds(command, key, capsys):
     assert not MARK.exists()
 
 
-@pytest.mark.parametrize("key", ["learning_rate", "anything"])
-def test_a_run_folder_that_is_resumed_runs_nothing(key, capsys, dagger_run):
-    content = Path(zip_with({key: CALLS}, dagger_run / "QuadStateRecovery-v0.zip")).read_bytes()
-    model = np.frombuffer(content, np.uint8)
-    np.savez(dagger_run / "resume.npz", timesteps=np.array(5), model=model)
+def test_a_run_folder_that_is_resumed_runs_nothing(capsys, dagger_run):
+    model = np.fromfile(zip_with({"anything": CALLS}), np.uint8)
+    np.savez(dagger_run / "resume.npz", model=model)
     assert main(["train", "--resume", str(dagger_run)]) == 2
-    assert f"its {key}" in the_line(capsys)
+    assert "its anything" in the_line(capsys)
     assert not MARK.exists()
 
 
@@ -190,18 +178,14 @@ def test_trust_ends_with_the_command_and_has_to_be_meant(monkeypatch):
 def test_no_class_is_changed():
     """SB3 would set variables wherever their names lead, and Python attributes of a class."""
     before = {kind: dict(vars(kind)) for kind in (RolloutBuffer, ActorCriticPolicy, PPO)}
-    name = "policy.action_net.weight.__class__"
-    variables = io.BytesIO()
-    torch.save({name: torch.zeros(1)}, variables)
-    with zipfile.ZipFile(AGENT) as archive:
-        plain = archive.read("pytorch_variables.pth")
-    late = legacy({name: torch.zeros(1)})
+    variables = weights(**{"policy.action_net.weight.__class__": torch.zeros(1)})
+    # PyTorch would read the first of two files in one, zipfile the second.
+    two_files = io.BytesIO()
+    torch.save({}, two_files, _use_new_zipfile_serialization=False)
     for changes in (
         {"policy_kwargs": b"\x80\x04" + CHANGES + b"."},
-        {"pytorch_variables.pth": variables.getvalue()},
-        # Two files in one: PyTorch reads the first, zipfile the second.
-        {"pytorch_variables.pth": late + plain},
-        {"pytorch_variables.pth": late[:100] + plain},
+        {"pytorch_variables.pth": variables},
+        {"pytorch_variables.pth": two_files.getvalue() + weights()},
     ):
         with pytest.raises(ConfigError):
             load_model(zip_with(changes))
@@ -248,8 +232,8 @@ def test_a_small_zip_that_would_take_long_or_much_is_refused(name):
         ("policy_kwargs", {"n_critics": 10**9}),
         ("anything", [[]] * 10**6),
         ("policy.pth", weights(compression=8)),
-        ("policy.optimizer.pth", weights(tensor=torch.zeros(1).expand(9_999, 9_999))),
-        ("policy.pth", legacy({})),
+        ("policy.optimizer.pth", weights(a=torch.zeros(1).expand(9_999, 9_999))),
+        ("policy.pth", pickle.dumps({})),
     ],
 )
 def test_a_zip_that_asks_for_more_than_it_holds_is_refused(key, value):
@@ -335,18 +319,28 @@ def test_a_zip_imports_nothing(monkeypatch):
     assert not MARK.exists()
 
 
-@pytest.mark.parametrize("source", ["/dev/zero", "fifo.yaml"])
-@pytest.mark.parametrize("key", ["rotor_layout", "vehicles", "vehicles.distribution", "vehicle"])
-def test_a_zip_opens_no_file_of_this_machine(key, source, capsys):
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rotor_layout": "fifo.yaml"},
+        {"vehicles": "fifo.yaml"},
+        {"vehicles": {"distribution": "/dev/zero"}},
+        {"vehicle": "fifo.yaml"},
+        {"vehicle": {"name": "../outside"}},
+        {"vehicle": {"name": "*/ int x; /*"}},
+        {"vehicle": {"name": "two\nlines"}},
+    ],
+)
+def test_a_zip_names_no_file_of_this_machine(change):
     # Who opens it waits for ever.
     os.mkfifo("fifo.yaml")
-    settings = agent_settings(AGENT)[0].model_dump(mode="json")
-    name, _, inner = key.partition(".")
-    settings[name] = {inner: source} if inner else source
-    assert main(["enjoy", zip_with({"flight_settings": settings}), "--no-render", "-n", "1"]) == 2
-    assert "foreign.zip: flight_settings: " in the_line(capsys)
-    settings = agent_settings(AGENT)[0].model_dump(mode="json")
-    settings["reference"] = {"curve": "file", "file": source}
+    settings = saved_data(AGENT)["flight_settings"]
+    if "name" in change.get("vehicle", ()):
+        change = {"vehicle": settings["vehicle"] | change["vehicle"]}
+    with pytest.raises(ConfigError, match=r"foreign\.zip: flight_settings: "):
+        agent_settings(zip_with({"flight_settings": settings | change}))
+    # Such a reference is left out.
+    settings["reference"] = {"curve": "file", "file": "fifo.yaml"}
     assert agent_settings(zip_with({"flight_settings": settings}))[0] == agent_settings(AGENT)[0]
 
 
@@ -354,7 +348,6 @@ def test_a_zip_opens_no_file_of_this_machine(key, source, capsys):
     ("key", "entry"),
     [
         ("callback", {"os.makedirs": {"name": str(MARK)}}),
-        ("vec_env_wrapper", "builtins.print"),
         ("env_wrapper", "os.mkdir"),
     ],
 )
@@ -368,11 +361,3 @@ def test_settings_call_only_classes_of_the_right_kind(key, entry, capsys):
     assert main(["train", "--resume", "run"]) == 2
     assert f"config.yml: {key}: " in the_line(capsys)
     assert not MARK.exists()
-
-
-@pytest.mark.parametrize("name", ["../outside", "*/ int x; /*", "two\nlines", "\x1b[2J", "a" * 101])
-def test_a_vehicle_s_name_is_a_name(name):
-    settings = saved_data(AGENT)["flight_settings"]
-    settings["vehicle"]["name"] = name
-    with pytest.raises(ConfigError, match="flight_settings: name: "):
-        agent_settings(zip_with({"flight_settings": settings}))
