@@ -10,6 +10,7 @@ import argparse
 
 from sb3_quad import PPOBC, DAgger, QuadcopterVecEnv, fly
 from sb3_quad.callbacks import BestModel
+from sb3_quad.evaluation.offset_correction import correct_offset
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -42,7 +43,7 @@ best = BestModel(
 agent.learn(second, callback=best)
 # An agent that still crashes has no offset.
 if second > every:
-    agent.correct_offset()
+    correct_offset(agent)
 agent.save(arguments.output)
 
 for name, controller in (("PID", "pid"), ("imitation", imitation), ("agent", agent)):
