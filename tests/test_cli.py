@@ -367,7 +367,7 @@ def test_any_task_has_a_closing_table(task):
     )
 
 
-@pytest.mark.parametrize("ignored", [False, True])
+@pytest.mark.parametrize("ignored", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_neither_an_import_nor_a_command_changes_what_ctrl_c_does(ignored):
     """Also if it is ignored, as by a shell for what it starts in the background."""
     code = (

@@ -25,6 +25,7 @@ ELSEWHERE = {
 
 # Pages that fly or train for several seconds even so.
 LONG = (
+    "docs/agents",
     "docs/any_quadcopter",
     "docs/apg",
     "docs/domain_randomization",

@@ -134,13 +134,13 @@ def test_any_quadcopter_flies_vehicles_with_another_order_of_rotors(vehicle):
     flights = fly(
         sb3_quad.load_pretrained("any-quadcopter"),
         "state_recovery",
-        480,
+        96,
         33_000_000,
-        max_episode_steps=600,
+        max_episode_steps=400,
         **own,
     )
     assert (
-        flights.survival.mean() > 0.96
+        flights.survival.mean() > 0.9
     )  # of ITM, whose rotors do the least; without the layout it would be nearly none
 
 

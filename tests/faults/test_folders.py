@@ -74,6 +74,7 @@ def disk_full(*arguments, **settings):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "code"), [(interrupted, 130), (disk_full, 2)])
 def test_publish_replaces_both_the_zip_and_its_card_or_neither(tmp_path, monkeypatch, fault, code):
     command = ["--name", "mine", "-o", str(tmp_path), "--episodes", "1"]
