@@ -1,4 +1,4 @@
-r"""Make pictures of the pages anew, each by the commands that stand beside its name.
+r"""Make pictures of the pages again, each by the commands that stand beside its name.
 
 Scripts drew adaptive_times.png, cloning.png, learning_speed.png and robustness.png; commit 5e3ee3c0
 is the last that has them, in its folder of examples.
@@ -8,7 +8,7 @@ is the last that has them, in its folder of examples.
 
 Learning curves are not among them: they need trainings of hours, and the pages say which. The
 commands run in ``build/pictures/``. What is flown there is kept for later calls;
-``build/pictures/finished.txt`` lists these commands. Empty the folder to begin anew.
+``build/pictures/finished.txt`` lists these commands. Empty the folder to begin again.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Reading the model in an SB3 zip whose algorithm is not known beforehand.
 
 The zip is read once, as data: JSON, the pickles in it (:mod:`.pickles`) and the weights. Then it is
-written anew from what was read, and SB3 loads that copy. So SB3 and PyTorch never open a stranger's
+written again from what was read, and SB3 loads that copy. So SB3 and PyTorch never open a stranger's
 file.
 """
 
@@ -179,7 +179,7 @@ def _data(archive: zipfile.ZipFile) -> StrDict:
 def _copy(
     archive: zipfile.ZipFile, data: StrDict, to_fly: bool, where: str
 ) -> tuple[io.BytesIO, StrDict]:
-    """Return a zip that has been written anew with the weights in another one, and the model's
+    """Return a zip that has been written again with the weights in another one, and the model's
     attributes for SB3's ``custom_objects``.
     """
     kept = {}

@@ -1,4 +1,4 @@
-"""What an algorithm asks of a policy: mean actions, values and gradients.
+"""A policy as an algorithm asks it: mean actions, values and gradients.
 
 PyTorch is the definition. An accelerator may compute the same faster: see
 :mod:`sb3_quad.base.plugins`. In shapes, ``b`` is the mini-batch and ``a`` the action dimension.

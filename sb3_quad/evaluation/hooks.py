@@ -1,4 +1,6 @@
-"""What is called during flights: the hooks that measure every flight, and the base of your own."""
+"""Hooks, which are called during flights: those that measure every flight, and the base of your
+own.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

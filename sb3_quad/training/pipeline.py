@@ -337,7 +337,7 @@ def state_of(runs: Sequence[RunFolder], number: int, n_timesteps: int) -> State:
     # A callback may end a stage early. If the next stage has a run, this one had ended.
     if number + 1 < len(runs) or run.timesteps >= n_timesteps:
         return "done"
-    # A run that has a model and no snapshot cannot be resumed, so it begins anew.
+    # A run that has a model and no snapshot cannot be resumed, so it begins again.
     return "begun" if run.not_begun or run.resume_state.is_file() else "new"
 
 
