@@ -306,7 +306,7 @@ def test_a_pipeline_whose_stages_do_not_fit_is_refused_before_the_first(tmp_path
     with pytest.raises(ConfigError, match="stage 'two': normalize: must be as in"):
         stage_jobs(Pipeline(stages=[one, two]), {})
     settings = {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan"}
-    with pytest.raises(ConfigError, match="stage 'one': correct_offset: .*wrappers"):
+    with pytest.raises(ConfigError, match=r"stage 'one': correct_offset: .*wrappers"):
         stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0, "settings": settings}]), {})
     (job,) = stage_jobs(Pipeline(stages=[{**one, "correct_offset": 1.0}]), {})
     assert job.config.normalize

@@ -1,8 +1,8 @@
 """Reading the model in an SB3 zip whose algorithm is not known beforehand.
 
 The zip is read once, as data: JSON, the pickles in it (:mod:`.pickles`) and the weights. Then it is
-written again from what was read, and SB3 loads that copy. So SB3 and PyTorch never open a stranger's
-file.
+written again from what was read, and SB3 loads that copy. So SB3 and PyTorch never open the file
+of a stranger.
 """
 
 import base64
