@@ -249,10 +249,10 @@ def test_it_recovers_as_its_zip(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", ["crazyflie-robust", "any-quadcopter"])
-def test_960_recoveries_of_the_app_and_of_its_zip(tmp_path, name):
-    zipped, flown = success(name, tmp_path, 960)
+def test_recoveries_of_the_app_and_of_its_zip(tmp_path, name):
+    zipped, flown = success(name, tmp_path, 240)
     print(f"{name}: zip {zipped:.2f} %, app {flown:.2f} %")
-    assert zipped > 98.0 and abs(zipped - flown) <= 0.3
+    assert zipped > 97.0 and abs(zipped - flown) <= 1.0
 
 
 @on_arm

@@ -432,6 +432,9 @@ def test_a_policy_that_sees_a_further_feature_exports(tmp_path):
     for name in ("sb3_quad", "envs", "callbacks", "zoo_configs"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     apply(FEATURE, tmp_path)
+    # As installed: the checkout's finder would give its own otherwise.
+    for name in ("envs", "callbacks", "zoo_configs"):
+        (tmp_path / "sb3_quad" / name).symlink_to(tmp_path / name)
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", EXPORT],
         cwd=tmp_path,

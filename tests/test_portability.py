@@ -33,7 +33,7 @@ Path("tiny.yml").write_text("QuadTargetTracking-v0: {{{SETTINGS}}}")
 command = ["train", "--algo", "dagger", "--conf-file", "tiny.yml", "--eval-episodes", "0"]
 assert main([*command, "--no-progress"]) == 0
 run = Path("logs/dagger/QuadTargetTracking-v0_1")
-assert main(["train", "--resume", str(run)]) == 0
+assert main(["train", "--resume", str(run)]) == 2  # it is complete
 with locked(run, "run folder"):
     assert main(["train", "--resume", str(run)]) == 2
 evaluate = "evaluate pid geometric --suite quick -n 2 --scenario recovery --no-report"
