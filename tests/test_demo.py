@@ -108,13 +108,17 @@ node = pytest.mark.skipif(NODE is None, reason="there is no node on this machine
 chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
 
-def in_node(tmp_path, harness=HARNESS, **job):
+def in_node(tmp_path, harness=HARNESS, seconds=60, **job):
     """What the page's model answers, without a browser."""
     file = tmp_path / "model.mjs"
     file.write_text(script(MODEL) + harness)
-    done = subprocess.run(
-        [NODE, str(file)], input=json.dumps(job), capture_output=True, text=True, check=False
-    )
+    command = [NODE, str(file)]
+    how = {"input": json.dumps(job), "capture_output": True, "text": True}
+    # Node 20 hangs once in some thousand starts, whatever it runs: then it is started again.
+    try:
+        done = subprocess.run(command, timeout=seconds, check=False, **how)
+    except subprocess.TimeoutExpired:
+        done = subprocess.run(command, check=False, **how)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -385,9 +389,10 @@ def test_the_page_differentiates_its_physics(changes, tmp_path):
 
 @node
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_network_trained_by_the_page_recovers(tmp_path):
     vehicle = load_vehicle("itm").model_dump(mode="json")
-    numbers = in_node(tmp_path, LEARNING, what="learn", vehicle=vehicle, seed=0)
+    numbers = in_node(tmp_path, LEARNING, 600, what="learn", vehicle=vehicle, seed=0)
     env = QuadcopterVecEnv(1, task="state_recovery", n_threads=1)
     model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [64, 64]}, device="cpu")
     policy = model.policy
