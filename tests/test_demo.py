@@ -114,7 +114,7 @@ def in_node(tmp_path, harness=HARNESS, seconds=60, **job):
     file.write_text(script(MODEL) + harness)
     command = [NODE, str(file)]
     how = {"input": json.dumps(job), "capture_output": True, "text": True}
-    # Node 20 hangs once in some thousand starts, whatever it runs: then it is started again.
+    # Node 20 was once seen to hang before it answered: then it is started again.
     try:
         done = subprocess.run(command, timeout=seconds, check=False, **how)
     except subprocess.TimeoutExpired:
