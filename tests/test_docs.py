@@ -25,10 +25,12 @@ ELSEWHERE = {
 
 # Pages that fly or train for several seconds even so.
 LONG = (
+    "README",
     "docs/agents",
     "docs/any_quadcopter",
     "docs/apg",
     "docs/domain_randomization",
+    "docs/environments",
     "docs/evaluate",
     "docs/ppo_bc",
     "docs/research/",
