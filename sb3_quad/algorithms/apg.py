@@ -89,9 +89,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     :param n_steps: Control steps of each flight in an update. A whole flight takes about 300.
     :param max_grad_norm: The gradient is scaled down to this norm if it is larger.
     :param max_row_ratio: At each step, the gradient with respect to the actions of each environment
-        is limited to this many times the median norm over all environments. Where each episode has
-        another vehicle, a few flights on the verge of chaos would otherwise outweigh all others; 3
-        is a good value. None: no limit.
+        is limited to this many times the median norm over all environments, since a few flights on
+        the verge of chaos would otherwise outweigh all others. Where each episode has another
+        vehicle, 3 is a good value. None: no limit.
     :param stats_window_size: Number of flights that the values of ``rollout/`` average over; at
         least all flights of an update.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
@@ -131,7 +131,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         device: th.device | str = "auto",
         *,
         initial_policy: BaseAlgorithm | StrPath | None = None,
-        max_row_ratio: Annotated[float, Field(ge=1.0)] | None = None,
+        max_row_ratio: Annotated[float, Field(ge=1.0)] | None = 10.0,
         continue_flights: bool = False,
         cost: Callable[[Any], th.Tensor] | None = None,
         body_rates_coef: Weight = 0.0,
