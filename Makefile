@@ -8,6 +8,9 @@ DOCS_VENV ?= .venv-docs
 ARGS ?=
 MINUTES ?= 10
 
+# Where this is set, every process would compile the sources of PyTorch and its like anew: six seconds each.
+unexport PYTHONDONTWRITEBYTECODE
+
 PY := $(VENV)/bin/python
 INSTALL := $(PY) -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 INSTALLED := $(VENV)/.installed
