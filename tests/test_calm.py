@@ -19,8 +19,10 @@ STEP = load_vehicle("itm").control_step
 
 def hovered(distances, flying=True):
     """The metrics of one flight: calm of the constants above while it is near, wild elsewhere."""
-    hook = Hover(Course(np.zeros((0, 3)), 0.5))
+    course = Course(np.zeros((0, 3)), 0.5)
+    hook = Hover(course)
     array = np.zeros((STATE_SIZE, 1))
+    course.on_start(State(array), load_vehicle("itm"))
     hook.on_start(State(array), load_vehicle("itm"))
     for step, distance in enumerate(distances, 1):
         half = np.radians(TILT if distance <= 0.1 else 80.0) / 2

@@ -124,9 +124,9 @@ def _draw_ball(
 ) -> None:
     """Draw a ball of a radius in m around ``middle``, (3,)."""
     column, row, depth = camera.project(middle[None])[0]
-    pixels = radius * camera.lens.height / (2.0 * camera.lens.slope * depth)
     if depth > NEAR:
-        pen.circle((column, row), max(1.0, pixels), colour)
+        pixels = max(1.0, radius * camera.lens.height / (2.0 * camera.lens.slope * depth))
+        pen.ellipse([column - pixels, row - pixels, column + pixels, row + pixels], colour)
 
 
 def _draw_trail(pen: ImageDraw.ImageDraw, trail: Trail, camera: Camera) -> None:
