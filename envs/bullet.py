@@ -8,6 +8,7 @@ import numpy as np
 from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Lens, chasing, framing_camera
+from sb3_quad.envs.rendering.picture import draw, relative_size
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import (
     Client,
@@ -146,13 +147,12 @@ class Renderer:
         self, vehicle: Vehicle, width: int, height: int, body: BulletBody, human: bool
     ) -> None:
         self.vehicle = vehicle
-        self.scene = Scene(vehicle, body.client)
+        self.scene = Scene(vehicle, body.client) if human else None
         self.lens = Lens(width, height, WIDE)
-        self.human = human
         self.shown_at = time.perf_counter()
         self.frames_due = 1.0
         self.reset(np.zeros(TARGET.stop))
-        if self.human:
+        if self.scene is not None:
             start_drawing(self.scene.client)
 
     def reset(self, state: FloatArray) -> None:
@@ -167,7 +167,7 @@ class Renderer:
         :return: uint8 (height, width, 3). If there is a window, None: it shows WINDOW_FPS frames a
             second, and this call waits until real time has caught up.
         """
-        if self.human:
+        if self.scene is not None:
             control_step = self.vehicle.control_step
             # Wait for real time, but do not hurry after a step that took longer.
             now = time.perf_counter()
@@ -177,11 +177,12 @@ class Renderer:
             if self.frames_due < 1.0:
                 return None
             self.frames_due %= 1.0
-        self.scene.place(state[:, None])
         # Vehicle and target must both be in the picture.
         both = np.stack([state[POSITION], state[TARGET]])
-        camera = framing_camera(both, MARGIN * self.scene.scale, self.forward, self.lens)
-        if not self.human:
-            return np.array(self.scene.picture(camera))
+        margin = MARGIN * relative_size(self.vehicle)
+        camera = framing_camera(both, margin, self.forward, self.lens)
+        if self.scene is None:
+            return np.array(draw(self.vehicle, state, camera))
+        self.scene.place(state[:, None])
         point_window(self.scene.client, camera, state[POSITION])
         return None

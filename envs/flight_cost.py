@@ -8,6 +8,7 @@ from torch.nn.functional import avg_pool1d, pad
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.envs.simulation.reward import CALM_CHANGE, CALM_DISTANCE
 from sb3_quad.envs.simulation.state import STATE
 from sb3_quad.envs.vehicles.vehicle import GRAVITY
 
@@ -96,12 +97,12 @@ def cost_and_gradients(
 
 
 def whole_cost(
-    cost: Callable[[FlownStates], th.Tensor], body_rates_coef: float
+    cost: Callable[[FlownStates], th.Tensor], calm_coef: float, control_step: float
 ) -> Callable[[FlownStates], th.Tensor]:
-    """Return a cost with ``body_rates_coef`` times :func:`body_rates_cost` added."""
-    if not body_rates_coef:
+    """Return a cost with ``calm_coef`` times :func:`calm_cost` added."""
+    if not calm_coef:
         return cost
-    return lambda flown: cost(flown) + body_rates_coef * body_rates_cost(flown)
+    return lambda flown: cost(flown) + calm_coef * calm_cost(flown, control_step)
 
 
 def length(vectors: th.Tensor) -> th.Tensor:
@@ -129,17 +130,23 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     return cost + 0.5 * (SAFE_HEIGHT - flown.position[..., 2]).clamp(min=0.0)
 
 
-def body_rates_cost(flown: FlownStates) -> th.Tensor:
-    """Return an additional cost of body rates at the target, (steps, n).
+def calm_cost(flown: FlownStates, control_step: float) -> th.Tensor:
+    """Return an additional cost of body rates and changing commands at the target, (steps, n).
 
-    It is ``|ω| / (1 + (d / 0.5)²)`` at the distance d, m.
+    It is ``(|ω| + 0.1 c) / (1 + (d / 0.5)²)`` at the distance d, m, with the body rates ω, rad/s.
+    The change c of the commands is the root mean square over the rotors, 1/s; that of the first
+    control step counts as zero. The reward of a task with a ``calm_cost`` has the same term.
+
+    :param control_step: s.
     """
-    return length(flown.body_rates) / _farness(flown.distance)
+    commands = flown.actions.clamp(-1.0, 1.0)
+    change = length(commands.diff(dim=0, prepend=commands[:1])) / (2.0 * control_step)
+    return (length(flown.body_rates) + CALM_CHANGE * change) / _farness(flown.distance)
 
 
 def _farness(d: th.Tensor) -> th.Tensor:
     """Return the divisor of terms that matter near the target, at distances d, m; 1 at d = 0."""
-    return 1.0 + (d / COARSE) ** 2
+    return 1.0 + (d / CALM_DISTANCE) ** 2
 
 
 def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:

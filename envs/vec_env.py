@@ -158,17 +158,17 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         n_steps: int,
         substeps: int | None = None,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
-        body_rates_coef: float = 0.0,
+        calm_coef: float = 0.0,
     ) -> FlightTape:
         """Return a tape that records flights of this environment and differentiates them.
 
         :param n_steps: control steps of a recording.
         :param substeps: physics steps in a control step of a recording; None: as in :meth:`step`.
         :param cost: the cost of each control step, in PyTorch.
-        :param body_rates_coef: weight of :func:`~sb3_quad.envs.flight_cost.body_rates_cost`, which
-            is added.
+        :param calm_coef: weight of :func:`~sb3_quad.envs.flight_cost.calm_cost`, which is added.
         """
-        differentiated = partial(cost_and_gradients, whole_cost(cost, body_rates_coef))
+        whole = whole_cost(cost, calm_coef, self.vehicle.control_step)
+        differentiated = partial(cost_and_gradients, whole)
         return FlightTape(self.batch, n_steps, substeps, differentiated)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:

@@ -174,5 +174,5 @@ def test_the_gradient_of_the_cost_of_low_forces_is_that_of_differences():
 
 
 def test_apg_refuses_the_costs_of_quadcopters_for_other_environments():
-    with pytest.raises(ConfigError, match="body_rates_coef"):
-        APG("MlpPolicy", Carts(2, 0), n_steps=5, body_rates_coef=1.0).learn(10)
+    with pytest.raises(ConfigError, match="calm_coef"):
+        APG("MlpPolicy", Carts(2, 0), n_steps=5, calm_coef=1.0).learn(10)

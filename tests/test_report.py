@@ -58,6 +58,7 @@ def test_the_report_holds_the_results_and_no_html(folder):
     metrics = results.entry("pid", "tracking").metrics
     assert f"{metrics.reward.value:.2f}".replace("-", "−") in text
     assert f"{metrics.arrivals[0].time.value:.2f}" in text
+    assert "Vehicles: itm." in text
     # The published ones, and the cells that vary makes
     for words in ("paper: expert", "never", "A &lt;small&gt; suite &amp; its tags", "90, success"):
         assert words in text

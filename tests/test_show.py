@@ -19,7 +19,7 @@ from sb3_quad.base.errors import ControllerError
 from sb3_quad.cli import main
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
-from sb3_quad.envs.rendering.scene import Scene, Trail
+from sb3_quad.envs.rendering.picture import Trail, draw
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
@@ -93,12 +93,9 @@ def test_points_are_seen_where_they_are():
 @pytest.mark.parametrize(("distance", "seen"), [(3.0, True), (-3.0, False)])
 def test_trails_are_drawn_unless_they_are_behind_the_camera(fall, distance, seen):
     points = np.array([[distance, y, 20.0] for y in (-0.5, 0.5)])
-    scene = Scene(fall.vehicle)
-    scene.place(fall.state.array[:, [0]])
     camera = looking_along_x((0.0, 0.0, 20.0))
-    drawn = np.array(scene.picture(camera, [Trail(points, "red")]))
+    drawn = np.array(draw(fall.vehicle, fall.state.array[:, 0], camera, [Trail(points, "red")]))
     assert (drawn == (255, 0, 0)).all(axis=2).any() == seen
-    scene.close()
 
 
 coordinates = st.floats(-20, 20, allow_nan=False)
@@ -121,7 +118,7 @@ def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(
 def test_a_following_camera_never_loses_the_vehicle(fall):
     for step in range(fall.state.n):
         state = fall.state.array[:, [step]]
-        camera = following_camera(state, 1.0, np.array([0.0, 1.0, 0.0]), Lens(100, 100))
+        camera = following_camera(state, fall.vehicle, np.array([0.0, 1.0, 0.0]), Lens(100, 100))
         column, row, _ = camera.project(fall.state.position[[step]])[0]
         assert 0 < column < 100 and 0 < row < 100
 

@@ -258,3 +258,37 @@ def test_the_least_time_is_of_this_vehicle_alone() -> None:
     other = ITM.model_copy(update={"name": "mine", "geometric_gains": None})
     assert ITM.time_optimal and other.time_optimal == ITM.time_optimal
     assert ITM.model_copy(update={"mass": 2.0}).time_optimal is None
+
+
+@pytest.mark.parametrize(("latency", "step"), [(0.0, 0.01), (0.03, 0.01), (0.012, 0.012)])
+def test_a_latency_is_a_delay_in_seconds(latency, step):
+    changes = {"latency": latency, "control_step": step, "physics_step": step / 5}
+    assert ITM.model_copy(update=changes).delay * step == pytest.approx(latency)
+
+
+@given(latency=st.floats(0.001, 0.1))
+def test_the_way_out_of_a_latency_that_does_not_fit_is_valid(latency):
+    try:
+        ITM.model_copy(update={"latency": latency})
+    except ValidationError as error:
+        message = str(error)
+    else:
+        return
+    control = float(message.split("control_step: ")[1].split()[0])
+    physics = float(message.split("physics_step: ")[1].split(",")[0])
+    changes = {"latency": control, "control_step": control, "physics_step": physics}
+    assert ITM.model_copy(update=changes).delay == 1
+
+
+def test_a_key_that_is_unknown_brings_all_that_the_docs_teach(tmp_path):
+    with pytest.raises(ConfigError) as refused:
+        load_vehicle(write(tmp_path / "mine.yaml", lag=0.01))
+    for key in ("rotor_order", "arm_length", "motor_gain", "latency", "props", "delay"):
+        assert key in str(refused.value)
+
+
+def test_what_is_printed_leaves_out_types_and_defaults():
+    settings = FlightSettings(vehicles={"distribution": "raptor"}, randomize={"mass": 1.3})
+    text = repr(settings)
+    assert "Annotated" not in text and "drag" not in text
+    assert "Factor(low=1.3, high=1.3)" in text

@@ -65,6 +65,7 @@ _KEPT = (
     "streams",
     "task_index",
     "returns",
+    "last_actions",
     "limits",
     "vehicles",
     "gust",
@@ -163,6 +164,8 @@ class QuadcopterBatch:
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         self.returns = np.zeros(n)
+        is_calm = self.task_parameters[:, T.calm_cost].any()
+        self.last_actions = np.zeros((n * is_calm, 4), np.float32)
         self.outcome = np.zeros(n, dtype=OUTCOME)
         self._set_scaling(settings)
         self.set_noise(settings.noise)

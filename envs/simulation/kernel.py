@@ -39,7 +39,7 @@ from sb3_quad.envs.simulation.physics import (
     turn_rotors,
 )
 from sb3_quad.envs.simulation.random import STEP, gust_words
-from sb3_quad.envs.simulation.reward import score, succeeds
+from sb3_quad.envs.simulation.reward import score, score_calm, succeeds
 from sb3_quad.envs.simulation.sampling import (
     add_gusts,
     advance_gusts,
@@ -164,7 +164,7 @@ def step(
     state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers,
     gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps,
-    outcome, last_observations,
+    outcome, last_observations, last_actions,
     moves, for_px4, course, tracks, track_numbers, previews,
     physics_step, substeps, autoreset,
 ):  # fmt: skip
@@ -203,6 +203,7 @@ def step(
     :param limits: int64 (n,), control steps of the current episodes; ``max_steps`` (n,), of later
         ones.
     :param outcome: OUTCOME (n,); ``last_observations`` float32 (n, size), of the same episodes.
+    :param last_actions: float32 (0 or n, 4), of the control step before, if change has a cost.
     :param moves: whether references move or have a heading; otherwise the rows of the state after
         the target's position are not read.
     :param for_px4: whether observations are those of ``features: px4``.
@@ -270,6 +271,8 @@ def step(
             for lane in range(count):
                 streams[STEP, first + lane] += 1
             load_rows(streams, first, b.stream)
+            if last_actions.shape[0] > 0:
+                score_calm(b, first, count, actions, last_actions, physics_step * substeps)
             observe(b, moves, for_px4)
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)

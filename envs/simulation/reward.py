@@ -5,6 +5,7 @@
 import math
 
 from sb3_quad.base.compiled import LANES, compiled, fast, inlined
+from sb3_quad.envs.simulation.random import STEP
 from sb3_quad.envs.simulation.vectors import dot, four, polynomial, subtract, vector
 
 # Coefficients of Cephes' arctangent, the highest power first
@@ -16,6 +17,9 @@ _DENOMINATOR = (
     *(1.0, 2.485846490142306297962e1, 1.650270098316988542046e2),
     *(4.328810604912902668951e2, 4.853903996359136964868e2, 1.945506571482613964425e2),
 )
+
+CALM_DISTANCE = 0.5  # from the target, m, at which half of calm_cost is due
+CALM_CHANGE = 0.1  # rad; what a change of commands by 1/s costs, relative to body rates
 
 
 @inlined
@@ -67,3 +71,27 @@ def score(b):
         reward -= b.out_of_range_cost[lane] * (distance > b.max_distance[lane])
         b.reward[lane] = reward
         b.distance[lane] = distance
+
+
+@fast
+def score_calm(b, first, count, actions, last_actions, control_step):
+    """Subtract the ``calm_cost`` of a control step from ``b.reward``, which is scored otherwise.
+
+    It is due for |ω|, and for the root mean square, over the rotors, of the change of the commands
+    per second. The thesis does not have it.
+
+    :param last_actions: float32 (n, 4), those of the step before; becomes ``actions``.
+    """
+    for lane in range(count):
+        i = first + lane
+        squares = 0.0
+        for k in range(4):
+            action = min(max(actions[i, k], -1.0), 1.0)
+            squares += (action - last_actions[i, k]) ** 2
+            last_actions[i, k] = action
+        # The first action of an episode changes nothing.
+        squares *= b.stream[STEP, lane] > 1
+        change = math.sqrt(squares) / (2.0 * control_step)
+        farness = 1.0 + (b.distance[lane] / CALM_DISTANCE) ** 2
+        agitation = _length(vector(b.body_rates, lane)) + CALM_CHANGE * change
+        b.reward[lane] -= b.calm_cost[lane] * agitation / farness

@@ -69,6 +69,10 @@ class Task(Frozen):
     """for touching the ground (Eq. 4.8)"""
     out_of_range_cost: Cost = 15.0
     """for leaving max_distance (Eq. 4.9)"""
+    calm_cost: Cost = 0.0
+    """per rad/s of body rates, and per 10/s by which commands change, at the target and control
+    step; half of it at a distance of 0.5 m
+    """
 
     @model_validator(mode="after")
     def _nearest_first(self) -> "Task":

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.base.process import print_once
 from sb3_quad.base.types import FloatArray, StrDict, StrMapping, StrPath
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen, check, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.vehicles.gains import GeometricGains
 from sb3_quad.envs.vehicles.layout import NamedLayout, Turn, find_turn
@@ -86,6 +86,7 @@ NonNegativeFloat = Annotated[Number, Field(ge=0.0)]
 Limits = tuple[NonNegativeFloat, PositiveFloat]
 Place = tuple[Number, Number]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
+CONTROL_STEP = 0.01  # s
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 _NO_LIMITS = (0.0, 0.0)
 # Results of a search, which are valid for one vehicle only
@@ -99,12 +100,15 @@ class Vehicle(Frozen):
     instead of ``thrust_limits``, in hover thrusts, ``rotor_thrust_limits`` in N or
     ``rotor_speed_limits`` in rad/s. These become ``thrust_limits``, which a copy with another mass
     keeps, and are None. ``motor_gain`` stands for ``motor_gain_up`` and ``motor_gain_down`` if both
-    are the same.
+    are the same, ``latency``, in seconds, for ``delay``, and ``rotor_order`` with ``arm_length``
+    for the rotors' positions and directions.
 
     It is frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well.
     :func:`load_vehicle` raises :class:`ConfigError`; the class itself raises pydantic's
     ``ValidationError``.
     """
+
+    short_keys: ClassVar = ("motor_gain", "latency", *NamedLayout.model_fields)
 
     name: str = Field(pattern=NAME)
     """what the vehicle is called; up to 100 characters, none of / \\ < > or control"""
@@ -144,34 +148,40 @@ class Vehicle(Frozen):
     """
     physics_step: PositiveFloat = Field(default=MAX_PHYSICS_STEP, le=MAX_PHYSICS_STEP)
     """s; at most 0.0025"""
-    control_step: PositiveFloat = 0.01
+    control_step: PositiveFloat = CONTROL_STEP
     """s; a whole number of physics steps"""
     delay: int = Field(default=1, ge=0, le=100)
-    """control steps from a command to its effect"""
+    """control steps from a command to its effect; or give latency, s, a multiple of control_step"""
     collision_radius: PositiveFloat
     """radius of the collision sphere at the centre of mass, m"""
-    geometric_gains: GeometricGains | None = None
+    geometric_gains: GeometricGains | None = Field(default=None, repr=False)
     """gains of the geometric expert, found for this vehicle; without them it derives gains"""
-    time_optimal: dict[PositiveFloat, PositiveFloat] | None = None
+    time_optimal: dict[PositiveFloat, PositiveFloat] | None = Field(default=None, repr=False)
     """from distances, m, to least times to rest there, s, as an optimal control finds them"""
 
     @model_validator(mode="before")
     @classmethod
     def _in_short(cls, data: Any) -> Any:
-        """Replace ``motor_gain`` by the gains up and down, and ``rotor_order`` with its keys by
-        positions and directions.
+        """Replace ``motor_gain`` by the gains up and down, ``latency`` by the delay, and
+        ``rotor_order`` with its keys by positions and directions.
         """
         if not isinstance(data, Mapping):
             return data
         data = dict(data)
-        meant = {}
+        meant: StrDict = {}
         if "motor_gain" in data:
             meant = dict.fromkeys(MOTOR_GAINS, data.pop("motor_gain"))
-        if "rotor_order" in data:
-            given = {key: data.pop(key) for key in NamedLayout.model_fields if key in data}
+        if "latency" in data:
+            step = check(PositiveFloat, data.get("control_step", CONTROL_STEP), "control_step")
+            latency = check(NonNegativeFloat, data.pop("latency"), "latency")
+            meant["delay"] = _delay(latency, step)
+        given = {key: data.pop(key) for key in NamedLayout.model_fields if key in data}
+        if given:
             meant |= validate(NamedLayout, given, "rotor_order").rotors()
         for key in sorted(data.keys() & meant):
-            raise ValueError(f"{key}: give it, or motor_gain or rotor_order, which stands for it")
+            raise ValueError(
+                f"{key}: give it, or motor_gain, latency or rotor_order, which stands for it"
+            )
         return data | meant
 
     @model_validator(mode="after")
@@ -261,6 +271,8 @@ class Vehicle(Frozen):
         replaced: set[str] = set()
         if "motor_gain" in changes:
             replaced.update(MOTOR_GAINS)
+        if "latency" in changes:
+            replaced.add("delay")
         if not changes.keys().isdisjoint(LIMITS):
             replaced.add("thrust_limits")
         return Vehicle.model_validate({**self.model_dump(exclude=replaced), **changes})
@@ -447,6 +459,23 @@ class Vehicle(Frozen):
                 *self.hover_shares,
             ]
         )
+
+
+def _delay(latency: float, control_step: float) -> int:
+    """Return a latency, s, in control steps.
+
+    :raises ValueError: it is no multiple of the control step.
+    """
+    steps = round(latency / control_step)
+    if abs(latency - steps * control_step) > 1e-6 * control_step:
+        fitting = latency / max(steps, 1)
+        substeps = math.ceil(fitting / MAX_PHYSICS_STEP - 1e-9)
+        raise ValueError(
+            f"latency {latency:g}: must be a multiple of control_step {control_step:g}, since "
+            f"commands act from one control step to the next; give control_step: {fitting:.12g} "
+            f"with physics_step: {fitting / substeps:.12g}, or latency: {steps * control_step:g}"
+        )
+    return steps
 
 
 VehicleSource = StrPath | Vehicle

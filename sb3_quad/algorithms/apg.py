@@ -31,7 +31,7 @@ class Tape(Protocol):
     """Records flights of n environments, and carries gradients back through their steps.
 
     An environment that ``APG`` can train on has ``record(n_steps, substeps)``, which returns one.
-    Where ``APG`` is given a ``cost`` or a ``body_rates_coef``, ``record`` gets it by that keyword.
+    Where ``APG`` is given a ``cost`` or a ``calm_coef``, ``record`` gets it by that keyword.
     To record, call :meth:`reset`, then :meth:`step` once for each step. For the backward pass, call
     :meth:`begin`, then :meth:`backward` once for each step, the last one first.
     """
@@ -103,9 +103,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         records, in PyTorch; in ours, of :class:`~sb3_quad.envs.flight_cost.FlownStates`. It is not
         saved: give it to ``load`` as well. None: the environment's own, which is
         :func:`~sb3_quad.envs.flight_cost.flight_cost` in ours.
-    :param body_rates_coef: Weight of :func:`~sb3_quad.envs.flight_cost.body_rates_cost`, which is
-        added to the cost: for agents that swing around the target because motors are slow or delays
-        are long.
+    :param calm_coef: Weight of :func:`~sb3_quad.envs.flight_cost.calm_cost`, which is added to the
+        cost: for agents that swing or buzz at the target, such as with slow motors or long delays.
     :param substeps: Physics steps per control step during training; None: the vehicle's.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a non-finite gradient, even in a single environment.
@@ -134,7 +133,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         max_row_ratio: Annotated[float, Field(ge=1.0)] | None = 10.0,
         continue_flights: bool = False,
         cost: Callable[[Any], th.Tensor] | None = None,
-        body_rates_coef: Weight = 0.0,
+        calm_coef: Weight = 0.0,
         substeps: Count | None = 2,
         _init_setup_model: bool = True,
     ):
@@ -164,7 +163,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.continue_flights = continue_flights
         self.cost = cost
         self.own_cost = False
-        self.body_rates_coef = body_rates_coef
+        self.calm_coef = calm_coef
         self.substeps = substeps
 
         if _init_setup_model:
@@ -232,8 +231,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         options: StrDict = {}
         if self.cost is not None:
             options["cost"] = self.cost
-        if self.body_rates_coef:
-            options["body_rates_coef"] = self.body_rates_coef
+        if self.calm_coef:
+            options["calm_coef"] = self.calm_coef
         # The user's own environment may know neither.
         unfit = f"{type(env).__name__}: does not record with {[*options]}"
         with raised_as(ConfigError, unfit):

@@ -4,9 +4,9 @@ import json
 import math
 import re
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -45,14 +45,26 @@ class Frozen(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
     )
+    short_keys: ClassVar[tuple[str, ...]] = ()
+    """keys that a subclass replaces by fields before this class sees them"""
 
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, given: Any) -> Any:
         """Name the nearest key, which pydantic would not."""
         if isinstance(given, dict):
-            refuse_unknown("key", given, cls.model_fields)
+            refuse_unknown("key", given, {*cls.model_fields, *cls.short_keys})
         return given
+
+    def __repr_name__(self) -> str:
+        """Leave out the types of a generic class."""
+        return type(self).__name__.partition("[")[0]
+
+    def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
+        """Leave out what has its default."""
+        for name, value in super().__repr_args__():
+            if name is None or value != type(self).model_fields[name].default:
+                yield name, value
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:

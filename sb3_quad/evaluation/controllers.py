@@ -14,7 +14,7 @@ from sb3_quad.agents.zips import saved_algorithm
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.vehicles.vehicle import VehicleSource, load_vehicle
+from sb3_quad.envs.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
 from sb3_quad.evaluation.results import ControllerRecord, file_name
 
 
@@ -130,10 +130,12 @@ def controller_record(spec: ControllerSpec) -> ControllerRecord:
         import_factory(spec.spec, "controller")
         return ControllerRecord(label=spec.label, spec=spec.spec, kind=spec.kind)
     path = Path(spec.spec)
+    flown = spec.own or FlightSettings()
     return ControllerRecord(
         label=spec.label,
         spec=path.name,
         kind=spec.kind,
         algorithm=saved_algorithm(path),
         content=hashlib.sha256(path.read_bytes()).hexdigest(),
+        vehicle=first_vehicle(flown.vehicle).name,
     )

@@ -57,6 +57,7 @@ def evaluate(
     """
     results = Results(
         suite=suite.name,
+        title=suite.title,
         description=suite.description,
         source=suite.source,
         package_version=__version__,

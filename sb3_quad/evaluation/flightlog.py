@@ -16,6 +16,7 @@ from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.hooks import Hook
+from sb3_quad.evaluation.hover import HOVERED
 
 SAMPLE_RATE = 50.0  # Hz
 OUTCOMES = ("success", "missed", "collision", "out_of_range")
@@ -32,6 +33,7 @@ EPISODES = (
     "final_offset",
     "recovery_time",
     "cross_track_error",
+    *HOVERED,
     *FOLLOWED,
 )
 

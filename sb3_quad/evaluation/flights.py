@@ -43,6 +43,7 @@ from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.hooks import Arrivals, Course, Hook, Motion
+from sb3_quad.evaluation.hover import HOVERED, Hover
 from sb3_quad.evaluation.reward import OwnRewards, Reward
 from sb3_quad.evaluation.scenarios.sample import Plan
 
@@ -77,6 +78,11 @@ class Flights:
     recovery_time: FloatArray
     #: (n,), largest distance from the straight line to the target, m; NaN if there is no line
     cross_track_error: FloatArray
+    #: (n,), root mean square of the body rates in hover at the target, rad/s; NaN if it did not
+    #: hover there, see Hover
+    hover_body_rates: FloatArray
+    hover_tilt: FloatArray  #: (n,), likewise, of the tilt, degrees
+    hover_command_change: FloatArray  #: (n,), likewise, of the change of commands, 1/s
     #: (n,), root mean square of |r - r_T|, m. This and the next four are for targets that move or
     #: turn, after the first 2 s; NaN if the flight was lost or its target rests.
     rms_error: FloatArray
@@ -237,7 +243,14 @@ def fly_settings(
             controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic
         )
         following = Following(fleet.moves)
-        measuring = [course, Arrivals(tolerances, course), Motion(), following, OwnRewards(reward)]
+        measuring = [
+            course,
+            Arrivals(tolerances, course),
+            Motion(),
+            Hover(course),
+            following,
+            OwnRewards(reward),
+        ]
         watching = [*measuring, *hooks]
         control_step = fleet.vehicle_list[0].control_step
         observation = fleet.begin(plan.start)
@@ -284,6 +297,8 @@ def fly_settings(
             measured |= hook.results()
         # Neither a course nor a moving target has a straight line to deviate from.
         measured["cross_track_error"][following.moves | (plan.waypoints.size > 0)] = np.nan
+        for name in HOVERED:
+            measured[name][following.moves] = np.nan
         offset = state.position - state.target
         return Flights(
             success=outcome["success"] & course.on_last,

@@ -8,6 +8,7 @@ import numpy as np
 
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.hooks import arrival_tolerance
+from sb3_quad.evaluation.hover import HOVERED
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_values
@@ -57,6 +58,12 @@ MEDIAN = Row("final error, median", "m", decimals=3)
 QUANTILE = Row("final error, 95 %", "m", decimals=3)
 RECOVERY_TIME = Row("recovery time", "s", verb="recover")
 CROSS_TRACK_ERROR = Row("cross-track error", "m")
+# Of calm, in the order of HOVERED
+HOVER = (
+    Row("body rates in hover, rms", "rad/s"),
+    Row("tilt in hover, rms", "°"),
+    Row("change of commands in hover, rms", "1/s"),
+)
 # For moving targets, in the order of FOLLOWED
 FOLLOWING = (
     Row("position error, rms", "m", decimals=3),
@@ -80,6 +87,7 @@ ROWS = {
     "final_error_median": MEDIAN,
     "final_error_95": QUANTILE,
     "recovery_time": RECOVERY_TIME,
+    **dict(zip(HOVERED, HOVER, strict=True)),
     **dict(zip(FOLLOWED, FOLLOWING, strict=True)),
 }
 CAPTION = "in brackets: 95 % intervals"
@@ -227,17 +235,18 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     """The rows that have a meaning in a scenario."""
     shares = [SUCCESS, SURVIVAL]
     rewards = [REWARD, OWN_REWARD]
+    errors = [MEDIAN, QUANTILE, *HOVER]
     if scenario.waypoints:
-        return [*shares, REACHED, COMPLETED, COURSE_TIME]
+        return [*shares, REACHED, COMPLETED, COURSE_TIME, *HOVER]
     if len(scenario.cell) > 1:
         return [SUCCESS]
     if scenario.reference is not None:
         return [*shares, *rewards, *FOLLOWING]
     if scenario.group is not None:
-        return [*shares, MEDIAN]
+        return [*shares, MEDIAN, *HOVER]
     # An episode that starts at its target does not fly to it.
     if not scenario.has_way:
-        return [*shares, FLOWN, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
+        return [*shares, FLOWN, *rewards, RECOVERY_TIME, *errors]
     settling = [settling_row(arrival_tolerance(scenario.tolerances)), LIMIT, OVERSHOOT_RATE]
     times = map(time_row, scenario.tolerances)
-    return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
+    return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, *errors]

@@ -8,6 +8,7 @@ from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.following import FOLLOWED
+from sb3_quad.evaluation.hover import HOVERED
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
 
 
@@ -76,6 +77,14 @@ class Metrics(Frozen):
     """flights that became stable again, and when"""
     cross_track_error: Estimate | None
     """mean largest distance from the straight line to the target, m; None: there is no line"""
+    hover_body_rates: Estimate | None
+    """mean root mean square of the body rates in hover, rad/s; this and the next two are over the
+    flights that hover at their targets, from 2 s after they came within 0.1 m; None: none does
+    """
+    hover_tilt: Estimate | None
+    """mean root mean square of the tilt in hover, degrees"""
+    hover_command_change: Estimate | None
+    """mean root mean square of the change of commands, which reach from -1 to 1, in hover, 1/s"""
     rms_error: Estimate | None
     """mean root mean square of |r - r_T| after the first 2 s, m; like the next four, only for
     targets that move or turn
@@ -120,7 +129,7 @@ def summarise(flights: Flights) -> Metrics:
         final_error_95=mean(error, partial(np.quantile, q=0.95)),
         recovery_time=_moment(flights.recovery_time),
         cross_track_error=mean(flights.cross_track_error[survived]),
-        **{name: mean(getattr(flights, name)) for name in FOLLOWED},
+        **{name: mean(getattr(flights, name)) for name in (*HOVERED, *FOLLOWED)},
         course=course,
     )
 

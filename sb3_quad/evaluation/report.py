@@ -30,9 +30,10 @@ def write_report(folder: StrPath) -> Path:
     place = Path(folder)
     results = load_results(folder)
     parts = [
-        f"# Suite {escape(results.suite)}",
+        f"# {escape(results.title or results.suite)}",
         escape(results.description),
-        f"Flown by sb3_quad {results.package_version}; {CAPTION}.",
+        f"Vehicles: {escape(_vehicles(results))}.",
+        f"Suite {escape(results.suite)}, sb3_quad {results.package_version}; {CAPTION}.",
     ]
     for heading, scenarios in scenario_groups(results):
         parts += [f"## {escape(heading)}", escape(scenarios[0].description)]
@@ -43,6 +44,18 @@ def write_report(folder: StrPath) -> Path:
             parts.append(f"![{name}]({picture})")
     write_text(place / REPORT, "\n\n".join(filter(None, parts)) + "\n")
     return place / REPORT
+
+
+def _vehicles(results: Results) -> str:
+    """Return the names of the vehicles that were flown."""
+    own = {record.vehicle for record in results.controllers}
+    names = set[str]()
+    for scenario in results.scenarios:
+        if scenario.vehicles is not None:
+            names.add("sampled quadcopters")
+        else:
+            names |= {scenario.nominal_vehicle().name} if scenario.vehicle else own
+    return ", ".join(sorted(names))
 
 
 def _figures(

@@ -49,6 +49,8 @@ class ControllerRecord(Frozen):
     """SB3 class that loaded a zip"""
     content: str | None = None
     """SHA-256 of the zip"""
+    vehicle: str = "itm"
+    """name of the vehicle that it flies where a scenario names none"""
 
 
 class Entry(Frozen):
@@ -68,8 +70,10 @@ class Entry(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[9] = 9
+    schema_version: Literal[10] = 10
     suite: str
+    title: str = ""
+    """of the suite"""
     description: str
     source: str = "published"
     """where the scenarios' published metrics come from"""

@@ -9,7 +9,7 @@ import numpy as np
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrMapping
 from sb3_quad.envs.rendering.camera import DOWN, ON_PATH, broadside
-from sb3_quad.envs.rendering.scene import MARKER, Trail
+from sb3_quad.envs.rendering.picture import MARKER, Trail
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.vehicles.vehicle import Vehicle
@@ -20,7 +20,7 @@ from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
 from sb3_quad.evaluation.tables import colours_of
 
 # The path of a target has the colour of its ball.
-TARGET = "#" + bytes(round(255 * part) for part in MARKER[:3]).hex()
+TARGET = "#" + bytes(MARKER).hex()
 
 
 class Recording(Hook):

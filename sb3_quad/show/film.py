@@ -5,7 +5,6 @@ together, in real time.
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,11 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
 from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Camera, Lens, framing_camera
+from sb3_quad.envs.rendering.picture import draw, relative_size
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import open_window, point_window, start_drawing
 from sb3_quad.envs.simulation.state import POSITION, TARGET
+from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.show.episodes import Episode, Recording, outlook
 
 FPS = 25
@@ -101,13 +102,16 @@ def film_frames(
         yield np.concatenate(pictures, axis=1)
 
 
-def following_camera(states: FloatArray, scale: float, forward: FloatArray, lens: Lens) -> Camera:
+def following_camera(
+    states: FloatArray, vehicle: Vehicle, forward: FloatArray, lens: Lens
+) -> Camera:
     """Return a camera that has all vehicles in its picture, and their targets when these are near.
 
     :param states: the vehicles' states, (STATE_SIZE, n).
-    :param scale: the vehicles' size, relative to the default one.
+    :param vehicle: the kind of all of them.
     :param forward: the direction in which it looks, a unit vector, (3,), not vertical.
     """
+    scale = relative_size(vehicle)
     vehicles = states[POSITION].T
     # The targets, or at most AHEAD of the way there along each axis.
     way = states[TARGET].T - vehicles
@@ -120,18 +124,16 @@ def _panel(
 ) -> Iterator[Image]:
     """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
     font = ImageFont.load_default(max(10.0, TEXT_SHARE * lens.height))
-    with closing(Scene(recording.vehicle)) as scene:
-        for step in recording.at(times):
-            state = recording.state.array[:, [step]]
-            scene.place(state)
-            camera = following_camera(state, scene.scale, forward, lens)
-            picture = scene.picture(camera, recording.trails(step))
-            text = f"{recording.name}  {recording.times[step]:.2f} s"
-            # A lost vehicle stands still from then on.
-            if step == recording.state.n - 1:
-                text += f"  {recording.lost}"
-            ImageDraw.Draw(picture).text((8, 6), text, recording.colour, font)
-            yield np.asarray(picture)
+    for step in recording.at(times):
+        state = recording.state.array[:, step]
+        camera = following_camera(state[:, None], recording.vehicle, forward, lens)
+        picture = draw(recording.vehicle, state, camera, recording.trails(step))
+        text = f"{recording.name}  {recording.times[step]:.2f} s"
+        # A lost vehicle stands still from then on.
+        if step == recording.state.n - 1:
+            text += f"  {recording.lost}"
+        ImageDraw.Draw(picture).text((8, 6), text, recording.colour, font)
+        yield np.asarray(picture)
 
 
 def show_in_window(episodes: Sequence[Episode], width: int, height: int, speed: float) -> None:
@@ -144,10 +146,11 @@ def show_in_window(episodes: Sequence[Episode], width: int, height: int, speed: 
     try:
         # Add all bodies before the window draws, since it would show each one as it is added.
         n = len(episodes[0])
-        scene = Scene(episodes[0][0].vehicle, client, n)
+        vehicle = episodes[0][0].vehicle
+        scene = Scene(vehicle, client, n)
         start_drawing(client)
         for recordings in episodes:
-            _play(scene, recordings, Lens(width, height, WIDE), speed)
+            _play(scene, vehicle, recordings, Lens(width, height, WIDE), speed)
     except p.error:
         # PyBullet also raises when somebody shuts the window; that is how this ends.
         if client.isConnected():
@@ -156,7 +159,7 @@ def show_in_window(episodes: Sequence[Episode], width: int, height: int, speed: 
         client.close()
 
 
-def _play(scene: Scene, recordings: Episode, lens: Lens, speed: float) -> None:
+def _play(scene: Scene, vehicle: Vehicle, recordings: Episode, lens: Lens, speed: float) -> None:
     forward = outlook(recordings)
     begun = time.perf_counter()
     for number, seconds in enumerate(frame_times(recordings, speed)):
@@ -169,5 +172,5 @@ def _play(scene: Scene, recordings: Episode, lens: Lens, speed: float) -> None:
         states = [recording.state.array[:, recording.at(seconds)] for recording in recordings]
         together = np.stack(states, axis=1)
         scene.place(together)
-        camera = following_camera(together, scene.scale, forward, lens)
+        camera = following_camera(together, vehicle, forward, lens)
         point_window(scene.client, camera, together[POSITION].mean(axis=1))

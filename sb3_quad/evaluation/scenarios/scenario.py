@@ -260,6 +260,8 @@ class Suite(Frozen):
 
     name: str = Field(pattern=NAME)
     """letters, digits, _ . -"""
+    title: str = ""
+    """heading of its report; default: its name"""
     description: str = ""
     """its purpose"""
     source: str = "published"
