@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numba import float32
 
-from sb3_quad.base.compiled import LANES, atomic_add, compiled, inlined, inner
+from sb3_quad.base.compiled import LANES, atomic_add, called, compiled, inlined, inner
 from sb3_quad.envs.simulation.frames import (
     clear_frames,
     integrate_position,
@@ -433,7 +433,7 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
                 b.scored[k, lane] = tasks[task, T.max_distance + k]
 
 
-@inlined
+@called
 def load_vehicles(b, vehicles, first, dt):
     """Load the vehicles of a block, with the divisions of a control step precomputed."""
     load_rows(vehicles, first, b.vehicle)
@@ -453,7 +453,7 @@ def load_vehicles(b, vehicles, first, dt):
         store(b.rates_gain, lane, (dt / ixx, dt / iyy, dt / izz))
 
 
-@inner
+@called
 def load_scaling(b, scaling):
     """Load μ, 1/σ and the noise levels of a block, in float32."""
     for lane in range(LANES):
@@ -502,7 +502,7 @@ def _load_commands(b, first, count, actions, queue):
     save_rows(command, first, count, queue[delay - 1])
 
 
-@inner
+@called
 def _write_observations(
     b, count, integral, ages, frames, previews, course, tracks, track_numbers, out
 ):

@@ -16,7 +16,7 @@ Functions with a ``lane`` compute one vehicle of a block, the others a whole blo
 
 import math
 
-from sb3_quad.base.compiled import LANES, fast, inlined, inner
+from sb3_quad.base.compiled import LANES, called, fast, inlined, inner
 from sb3_quad.envs.simulation.vectors import (
     add,
     dot,
@@ -186,7 +186,7 @@ def _limited(a):
     return min(max(x, low), high), min(max(y, low), high), min(max(z, low), high)
 
 
-@inner
+@called
 def limit_velocities(b):
     """Limit each world component of v and ω as PyBullet does, in the rare lanes that exceed it."""
     for lane in range(LANES):

@@ -117,7 +117,7 @@ def _to_uniform(high, low):
     return (((uint64(high) << _SHIFT | uint64(low)) >> uint64(11)) + 0.5) * 2.0**-53
 
 
-@inner
+@called
 def random_words(b):
     """Write ``b.word``: random words of every lane, a multiple of 4, from its key and counter."""
     word = b.word

@@ -65,7 +65,7 @@ def deepest(i, streams, table, numbers):
     return -lowest
 
 
-@inner
+@called
 def follow(b, ahead, state, streams, course, table, numbers):
     """Load the targets of a block's rows as they are ``ahead`` control steps from now."""
     for lane in range(LANES):

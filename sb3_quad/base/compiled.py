@@ -119,7 +119,9 @@ class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
         if self._depth == 0:
             self._start = time.perf_counter()
-            print_once("compiling the simulation once, for a minute or so; it is kept")
+            print_once(
+                "compiling once, a minute or so if a core is idle; it is kept for later runs"
+            )
         self._depth += 1
 
     def on_end(self, event: event.Event) -> None:

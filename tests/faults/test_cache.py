@@ -1,5 +1,6 @@
 """Compiled code: kept where it can be, and nothing fails where it cannot."""
 
+import importlib
 import os
 import shutil
 import subprocess
@@ -7,6 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from sb3_quad.base import compiled
+from sb3_quad.envs.simulation import kernel
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -58,3 +62,36 @@ def test_a_read_only_installation_without_a_home_says_that_it_compiles_at_every_
             f"(1.0, 0.0, 0.0) {hits}\n",
             [],
         )
+
+
+@pytest.mark.parametrize(
+    ("changed", "recompiled", "kept"),
+    [
+        ("envs.simulation.reward", ["envs.simulation.kernel"], ["envs.simulation.sampling"]),
+        ("envs.vehicles.vehicle", ["envs.simulation.kernel", "envs.simulation.sampling"], []),
+        ("fast.losses", ["fast.kernel"], ["envs.simulation.kernel", "experts.geometric_law"]),
+        ("envs.simulation.physics", ["envs.simulation.kernel", "experts.pid"], ["fast.kernel"]),
+    ],
+)
+def test_a_change_recompiles_what_imports_it_and_nothing_else(
+    changed, recompiled, kept, monkeypatch
+):
+    modules = [f"sb3_quad.{name}" for name in (*recompiled, *kept)]
+    for module in modules:
+        importlib.import_module(module)
+    stamp = compiled._source_stamp.__wrapped__
+    read = compiled._read
+    before = {module: stamp(module) for module in modules}
+
+    def read_changed(module):
+        source, imports = read(module)
+        return source + b"#" * (module == f"sb3_quad.{changed}"), imports
+
+    monkeypatch.setattr(compiled, "_read", read_changed)
+    differ = [module for module in modules if stamp(module) != before[module]]
+    assert differ == modules[: len(recompiled)]
+
+
+def test_python_cannot_call_what_has_no_entry_for_it():
+    with pytest.raises(TypeError, match="load_rows: only compiled functions"):
+        kernel.load_rows(None, 0, None)
