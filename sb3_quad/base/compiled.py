@@ -57,7 +57,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     return dispatcher
 
 
-class _Inner(CPUDispatcher):  # type: ignore[misc]
+class _Inner(CPUDispatcher):
     """A function that Python cannot call: without what that needs, it compiles in half the time."""
 
     def __call__(self, *arguments: Any) -> Any:
