@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -305,3 +306,19 @@ def test_a_recorded_flight_holds_what_was_seen_and_done(tmp_path):
     assert len(observations) == len(actions) == flights.length.sum() < 3 * 400
     np.testing.assert_array_equal(observations[:6], np.concatenate(seen[:2]))
     assert (actions == -1.0).all()
+
+
+@pytest.mark.parametrize(("threads", "in_flight"), [(8, 1), (4, 1), (3, 3)])
+def test_torch_flies_with_one_thread_unless_it_was_given_another_number(
+    threads, in_flight, monkeypatch
+):
+    monkeypatch.setattr("sb3_quad.algorithms.threads.available_cpus", lambda: 8)
+    torch.set_num_threads(threads)
+    seen = []
+
+    def controller(observations):
+        seen.append(torch.get_num_threads())
+        return np.zeros((len(observations), 4))
+
+    fly(controller, n_episodes=1, max_episode_steps=1)
+    assert (seen, torch.get_num_threads()) == ([in_flight], threads)

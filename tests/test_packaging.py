@@ -141,3 +141,7 @@ def test_importing_waits_for_nothing_heavy():
     imports = "import sys, sb3_quad, sb3_quad.envs, sb3_quad.cli, sb3_quad.zoo_configs"
     code = f"{imports}; print(*({heavy!r} & set(sys.modules)))"
     assert run(sys.executable, "-c", code, cwd=ROOT).split() == []
+    code = (
+        "import sys, sb3_quad.envs.simulation.batch; print(*({'torch', 'pandas'} & {*sys.modules}))"
+    )
+    assert run(sys.executable, "-c", code, cwd=ROOT).split() == []

@@ -12,7 +12,7 @@ keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as
 
 import math
 
-from sb3_quad.base.compiled import LANES, compiled, fast, inlined
+from sb3_quad.base.compiled import LANES, fast, inlined, inner
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE, F, heading_of
 from sb3_quad.envs.simulation.physics import (
     fly,
@@ -170,7 +170,7 @@ def accelerate_vjp(b, before, after, gradient, grad_wanted):
         _add_rotation(before[X.quaternion :], gradient, lane, matrix)
 
 
-@compiled
+@inner
 def flight_vjp(b, states, gradient, grad_wanted, dt, substeps):
     """Vector-Jacobian product of :func:`.physics.fly`.
 
@@ -191,7 +191,7 @@ def flight_vjp(b, states, gradient, grad_wanted, dt, substeps):
         accelerate_vjp(b, before, after, gradient, grad_wanted)
 
 
-@compiled
+@inner
 def limits_vjp(b, grad_speed):
     """Vector-Jacobian product of :func:`.physics.limit_speeds`, in place.
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from numba import float32
 from pydantic import Field, PositiveFloat, field_validator
 
-from sb3_quad.base.compiled import compiled, inlined
+from sb3_quad.base.compiled import inlined, inner
 from sb3_quad.base.validate import Frozen
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE, F
 
@@ -91,7 +91,7 @@ class ObservationSettings(Frozen):
         return self.last_action or self.ages != (0,) or self.position_integral is not None
 
 
-@compiled
+@inner
 def store_action(i, step, action, frames):
     """Keep the action (4,) that led row i to control step ``step``, in place.
 
@@ -102,14 +102,16 @@ def store_action(i, step, action, frames):
         frames[i, slot, OBSERVATION_SIZE + k] = min(max(action[k], float32(-1.0)), float32(1.0))
 
 
-@compiled
+@inner
 def clear_frames(i, frames, integral):
     """Clear the last action and the integral as row i begins an episode, in place."""
-    frames[i, 0, OBSERVATION_SIZE:] = 0.0
-    integral[:, i] = 0.0
+    for k in range(OBSERVATION_SIZE, frames.shape[2]):
+        frames[i, 0, k] = 0.0
+    for axis in range(integral.shape[0]):
+        integral[axis, i] = 0.0
 
 
-@compiled
+@inner
 def integrate_position(b, i, lane, numbers, integral):
     """Advance the position integral of row i by a control step, in place.
 
@@ -135,7 +137,7 @@ def _unscaled(b, k, lane):
     return b.feature[k, lane] / b.inverse_std[k, lane] + b.mean[k, lane]
 
 
-@compiled
+@inner
 def observe_frames(b, i, step, lane, integral, ages, frames, out):
     """Keep row i's present frame and write its observation, in place.
 
@@ -157,8 +159,6 @@ def observe_frames(b, i, step, lane, integral, ages, frames, out):
     at = 0
     for age in ages:
         # Frames from before the episode are zeros.
-        if age <= step:
-            out[i, at : at + size] = frames[i, (step - age) % depth]
-        else:
-            out[i, at : at + size] = 0.0
+        for k in range(size):
+            out[i, at + k] = frames[i, (step - age) % depth, k] if age <= step else 0.0
         at += size

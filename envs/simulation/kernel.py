@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numba import float32
 
-from sb3_quad.base.compiled import LANES, atomic_add, compiled, inlined
+from sb3_quad.base.compiled import LANES, atomic_add, called, compiled, inlined, inner
 from sb3_quad.envs.simulation.frames import (
     clear_frames,
     integrate_position,
@@ -264,7 +264,7 @@ def step(
                 fly(b, physics_step, substeps)
                 save_rows(b.state[: X.target], first, count, state)
             if tracks.shape[0] > 0:
-                follow(b, 1, state, streams, course, tracks, track_numbers)
+                follow(b, np.int64(1), state, streams, course, tracks, track_numbers)
                 save_rows(b.target, first, count, state[X.target :])
             score(b)
             # The noise of the observation is that of the next step.
@@ -329,7 +329,7 @@ def step(
             for k in range(4):
                 b.stream[k, lane] = streams[k, b.row[lane]]
         if tracks.shape[0] > 0:
-            follow(b, 0, state, streams, course, tracks, track_numbers)
+            follow(b, np.int64(0), state, streams, course, tracks, track_numbers)
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
         observe(b, moves, for_px4)
@@ -377,7 +377,7 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step):
     state[X.rotor_speeds : X.target, 0] = blocks[0].rotor_speeds[:, 0]
 
 
-@compiled
+@inner
 def new_block():
     """Return memory for a block, (1,), that begins at a cache line: vectors that straddle two lines
     take a third longer.
@@ -387,7 +387,7 @@ def new_block():
     return room[start : start + _SIZE].view(BLOCK)
 
 
-@compiled
+@inner
 def _is_finite(actions):
     # Look at the bits: code compiled with fastmath may assume that no NaN exists.
     wrong = 0
@@ -396,7 +396,7 @@ def _is_finite(actions):
     return wrong == 0
 
 
-@compiled
+@inner
 def load_rows(source, first, target):
     """Copy the columns of a block from a (rows, n) array, or its only column to all lanes."""
     last = min(first + LANES, source.shape[1]) - 1
@@ -409,7 +409,7 @@ def load_rows(source, first, target):
                 target[k, lane] = source[k, min(first + lane, last)]
 
 
-@compiled
+@inner
 def save_rows(source, first, count, target):
     """Copy the first lanes of a block to columns of a (rows, n) array."""
     for k in range(source.shape[0]):
@@ -436,7 +436,7 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
                 b.scored[k, lane] = tasks[task, T.max_distance + k]
 
 
-@inlined
+@called
 def load_vehicles(b, vehicles, first, dt):
     """Load the vehicles of a block, with the divisions of a control step precomputed."""
     load_rows(vehicles, first, b.vehicle)
@@ -456,7 +456,7 @@ def load_vehicles(b, vehicles, first, dt):
         store(b.rates_gain, lane, (dt / ixx, dt / iyy, dt / izz))
 
 
-@compiled
+@called
 def load_scaling(b, scaling):
     """Load μ, 1/σ and the noise levels of a block, in float32."""
     for lane in range(LANES):
@@ -483,7 +483,9 @@ def _load_commands(b, first, count, actions, queue):
             command[k, lane] = actions[b.row[lane], k]
     command_rotors(b)
     if delay == 0:
-        wanted[:] = command
+        for k in range(4):
+            for lane in range(LANES):
+                wanted[k, lane] = command[k, lane]
         return
     load_rows(queue[0], first, wanted)
     for k in range(4):
@@ -503,7 +505,7 @@ def _load_commands(b, first, count, actions, queue):
     save_rows(command, first, count, queue[delay - 1])
 
 
-@compiled
+@called
 def _write_observations(
     b, count, integral, ages, frames, previews, course, tracks, track_numbers, out
 ):
@@ -555,5 +557,6 @@ def _end_episodes(
         end.total = returns[i]
         end.reward = b.reward[lane]
         end.length = b.stream[STEP, lane]
-        last_observations[i] = observations[i]
+        for k in range(observations.shape[1]):
+            last_observations[i, k] = observations[i, k]
     return ended

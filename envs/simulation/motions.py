@@ -3,13 +3,15 @@
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Motion = Callable[[FloatArray], FloatArray]
 """The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
@@ -44,6 +46,9 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     :raises ConfigError: a file that cannot be read, or whose times do not rise; the message names
         the row, counted from 1 after the header.
     """
+    # Other references do not wait for it.
+    import pandas as pd
+
     with raised_as(ConfigError, str(path)):
         frame = pd.read_csv(path, dtype=np.float64, skipinitialspace=True)
     # Pandas would take surplus numbers in the rows for an index, and shift all columns.
@@ -66,7 +71,7 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     return times, numbers[:, 1:]
 
 
-def refuse_gaps(path: Path, frame: pd.DataFrame) -> None:
+def refuse_gaps(path: Path, frame: "pd.DataFrame") -> None:
     """Refuse a table in which a number is missing or not finite.
 
     :raises ConfigError: the message names the row, counted from 1 after the header, and the column.

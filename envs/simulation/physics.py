@@ -16,7 +16,7 @@ Functions with a ``lane`` compute one vehicle of a block, the others a whole blo
 
 import math
 
-from sb3_quad.base.compiled import LANES, compiled, fast, inlined
+from sb3_quad.base.compiled import LANES, called, fast, inlined, inner
 from sb3_quad.envs.simulation.vectors import (
     add,
     dot,
@@ -179,14 +179,14 @@ def accelerate(b):
     return over > 0
 
 
-@compiled
+@inner
 def _limited(a):
     low, high = -MAX_COORDINATE_VELOCITY, MAX_COORDINATE_VELOCITY
     x, y, z = a
     return min(max(x, low), high), min(max(y, low), high), min(max(z, low), high)
 
 
-@compiled
+@called
 def limit_velocities(b):
     """Limit each world component of v and ω as PyBullet does, in the rare lanes that exceed it."""
     for lane in range(LANES):

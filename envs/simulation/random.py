@@ -20,16 +20,17 @@ import numpy as np
 import numpy.typing as npt
 from numba import float32, int32, uint32, uint64
 
-from sb3_quad.base.compiled import LANES, compiled, fast, inlined
+from sb3_quad.base.compiled import LANES, called, fast, inlined, inner
 from sb3_quad.base.seeds import seed_errors
 from sb3_quad.envs.simulation.vectors import polynomial
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
-# Purposes: the last word of the counter
-OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND, REFERENCE = range(
-    8
+# Purposes: the last word of the counter. numba would compile a function for each int.
+OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND, REFERENCE = (
+    np.arange(8, dtype=np.uint32)
 )
 ROUNDS = 10
+BLOCKS = 8  # as many as any purpose takes
 _MASK = uint64(0xFFFFFFFF)
 _SHIFT = uint64(32)
 # The bits of sqrt(1/2) in float32
@@ -74,7 +75,7 @@ def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     return streams
 
 
-@compiled
+@inner
 def _round(c0, c1, c2, c3, k0, k1):
     # In uint64 whose upper half may hold anything: AVX2 multiplies the lower halves of 64-bit
     # lanes.
@@ -83,7 +84,7 @@ def _round(c0, c1, c2, c3, k0, k1):
     return (p1 >> _SHIFT) ^ c1 ^ k0, p1, (p0 >> _SHIFT) ^ c3 ^ k1, p0
 
 
-@compiled
+@inner
 def philox(c0, c1, c2, c3, k0, k1):
     """Return four uint32 of Philox4x32-10 from a counter of four and a key of two."""
     c0, c1, c2, c3, k0, k1 = uint64(c0), uint64(c1), uint64(c2), uint64(c3), uint64(k0), uint64(k1)
@@ -94,29 +95,29 @@ def philox(c0, c1, c2, c3, k0, k1):
     return uint32(c0), uint32(c1), uint32(c2), uint32(c3)
 
 
-@compiled
+@inner
 def _words(streams, row, block, purpose):
     counter = uint32(block), streams[STEP, row], streams[EPISODE, row], uint32(purpose)
     return philox(*counter, streams[KEY_LO, row], streams[KEY_HI, row])
 
 
-@compiled
-def uniforms(streams, row, blocks, purpose):
-    """Return doubles uniform on (0, 1), of 53 bits each, two per block: shape (2 blocks,)."""
-    numbers = np.empty(2 * blocks)
-    for block in range(blocks):
+@called
+def uniforms(streams, row, purpose):
+    """Return doubles uniform on (0, 1), of 53 bits each, two per block: shape (2 BLOCKS,)."""
+    numbers = np.empty(2 * BLOCKS)
+    for block in range(BLOCKS):
         w0, w1, w2, w3 = _words(streams, row, block, purpose)
         numbers[2 * block] = _to_uniform(w0, w1)
         numbers[2 * block + 1] = _to_uniform(w2, w3)
     return numbers
 
 
-@compiled
+@inner
 def _to_uniform(high, low):
     return (((uint64(high) << _SHIFT | uint64(low)) >> uint64(11)) + 0.5) * 2.0**-53
 
 
-@compiled
+@called
 def random_words(b):
     """Write ``b.word``: random words of every lane, a multiple of 4, from its key and counter."""
     word = b.word
@@ -131,14 +132,14 @@ def random_words(b):
             ) = _words(b.stream, lane, block, OBSERVATION_NOISE)
 
 
-@compiled
+@inner
 def gust_words(word, stream):
     """Write two random words of every lane to ``word``, (2, LANES), for the gusts of the wind."""
     for lane in range(LANES):
         word[0, lane], word[1, lane], _, _ = _words(stream, lane, 0, WIND)
 
 
-@compiled
+@inner
 def _log(x):
     """Return ln x of a positive float32: the exponent, and a polynomial on [√½, √2)."""
     bits = np.float32(x).view(np.int32)

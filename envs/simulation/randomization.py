@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from sb3_quad.base.compiled import compiled
+from sb3_quad.base.compiled import called
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray, StrMapping
 from sb3_quad.base.validate import Frozen, explain
@@ -326,7 +326,7 @@ def flyable(base: Vehicle, changes: StrMapping, where: str) -> Vehicle:
         raise ConfigError(f"{where}: some vehicles could not fly ({reason})") from None
 
 
-@compiled
+@called
 def between(table, k, u, nominal):
     """Return the number for u in (0, 1) from the range at ``table[k : k + 3]``; ``nominal`` if it
     is FIXED.

@@ -4,7 +4,7 @@
 
 import math
 
-from sb3_quad.base.compiled import LANES, compiled, fast, inlined
+from sb3_quad.base.compiled import LANES, fast, inlined, inner
 from sb3_quad.envs.simulation.random import STEP
 from sb3_quad.envs.simulation.vectors import dot, four, polynomial, subtract, vector
 
@@ -41,7 +41,7 @@ def _tilt(sine2, cosine2):
     return angle if sine2 <= cosine2 else math.pi - angle
 
 
-@compiled
+@inner
 def succeeds(b, lane):
     """Return whether a flight that ends now is close enough to its target, and level enough."""
     _, qx, qy, _ = four(b.quaternion, lane)

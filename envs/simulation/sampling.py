@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from sb3_quad.base.compiled import compiled, inlined
+from sb3_quad.base.compiled import called, inlined, inner
 from sb3_quad.envs.simulation.observation import GUST_WORDS
 from sb3_quad.envs.simulation.random import (
     DISTURBANCE,
@@ -17,7 +17,7 @@ from sb3_quad.envs.simulation.random import (
     uniforms,
 )
 from sb3_quad.envs.simulation.randomization import FIXED, GUST_NUMBERS, R, V, between
-from sb3_quad.envs.simulation.state import P, W, X, first_rows, row_slices
+from sb3_quad.envs.simulation.state import STATE_SIZE, P, W, X, first_rows, row_slices
 from sb3_quad.envs.simulation.tasks import T
 from sb3_quad.envs.simulation.tracks import deepest, start_course
 from sb3_quad.envs.simulation.vehicle_distribution import arm_length, sample_from_distribution
@@ -47,7 +47,7 @@ _SUM_MEAN = 3 * 127 / 2
 _SUM_STD = math.sqrt(3 * (128**2 - 1) / 12)
 
 
-@compiled
+@called
 def start_episode(
     i, state, queue, streams, task_index, vehicles, tasks, weights, course, tracks, track_numbers
 ):
@@ -65,8 +65,10 @@ def start_episode(
     :param weights: float64 (K,), cumulative.
     :param course: see :mod:`.tracks`, as for ``tracks`` and ``track_numbers``.
     """
-    u = uniforms(streams, i, 7, EPISODE_START)
-    task_index[i] = np.sum(weights[:-1] <= u[0])
+    u = uniforms(streams, i, EPISODE_START)
+    task_index[i] = 0
+    for weight in weights[:-1]:
+        task_index[i] += weight <= u[0]
     task = tasks[task_index[i]]
     s = state[:, i]
     vehicle = _column(vehicles, i)
@@ -85,12 +87,14 @@ def start_episode(
     for axis in range(3):
         s[X.position + axis] = task[T.start_position + axis]
         s[X.target + axis] = s[X.position + axis] + offset[axis]
-    s[X.target_velocity :] = 0.0
+    for k in range(X.target_velocity, STATE_SIZE):
+        s[k] = 0.0
     if course.shape[1] > 0:
         start_course(i, state, streams, course, track_numbers)
 
-    s[X.quaternion : X.velocity] = 0.0
     s[X.quaternion] = 1.0
+    for axis in range(3):
+        s[X.quaternion + 1 + axis] = 0.0
     if task[T.random_attitude] != 0.0:
         # Uniform on SO(3) (Shoemake)
         a = math.sqrt(1.0 - u[3])
@@ -109,7 +113,8 @@ def start_episode(
         hover = vehicle[P.hover_share_0 + rotor] * vehicle[P.hover_thrust]
         speed = math.sqrt(hover / vehicle[P.thrust_coefficient])
         s[X.rotor_speeds + rotor] = speed
-        queue[:, rotor, i] = speed
+        for late in range(queue.shape[0]):
+            queue[late, rotor, i] = speed
 
 
 @inlined
@@ -133,7 +138,7 @@ def _normals(first_std, second_std, u, k):
     return first_std * radius * math.cos(angle), second_std * radius * math.sin(angle)
 
 
-@compiled
+@called
 def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust, wind, wind_gust):
     """Advance row i's stream to its next episode, and sample its vehicle, constant wrench and wind,
     and first gusts, in place. Whatever is not random stays as it is.
@@ -151,62 +156,70 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
     streams[STEP, i] = 0
     has_own_vehicle = vehicles.shape[1] == wrench.shape[1]
     if has_own_vehicle:
-        vehicles[:, i] = _column(base, i)
+        for k in range(vehicles.shape[0]):
+            vehicles[k, i] = _column(base, i)[k]
         sample_from_distribution(i, streams, distribution, vehicles)
 
     # Forces in multiples of a weight refer to the vehicle before randomization.
     vehicle = _column(vehicles, i)
     weight = vehicle[P.mass] * vehicle[P.gravity]
-    u = uniforms(streams, i, 4, DISTURBANCE)
+    u = uniforms(streams, i, DISTURBANCE)
     is_disturbed = np.float64(u[0] < table[R.wrench_share])
     if table[R.force + 2] != FIXED or table[R.torque + 2] != FIXED:
-        wrench[:, i] = 0.0
+        for k in range(wrench.shape[0]):
+            wrench[k, i] = 0.0
         leverage = weight * arm_length(vehicle)
-        _sample_vector(table, R.force, is_disturbed, weight, u[1:4], wrench[W.force_world :, i])
-        _sample_vector(table, R.torque, is_disturbed, leverage, u[4:7], wrench[W.torque_world :, i])
+        force, torque = wrench[W.force_world :, i], wrench[W.torque_world :, i]
+        _sample_vector(table, R.force, is_disturbed, weight, u[1], u[2], u[3], force)
+        _sample_vector(table, R.torque, is_disturbed, leverage, u[4], u[5], u[6], torque)
     if gust.shape[1] > 0:
-        u = uniforms(streams, i, 4, GUST)
+        u = uniforms(streams, i, GUST)
         _begin_gusts(table, R.gusts, is_disturbed, weight, u, gust[:, i])
     if wind_gust.shape[1] > 0:
-        u = uniforms(streams, i, 4, WIND)
+        u = uniforms(streams, i, WIND)
         _begin_gusts(table, R.wind_gusts, is_disturbed, 1.0, u, wind_gust[:, i])
     if table[R.wind + 2] != FIXED:
-        u = uniforms(streams, i, 5, WIND)
+        u = uniforms(streams, i, WIND)
         # The wind is horizontal unless its direction is given.
-        _sample_vector(table, R.wind, is_disturbed, 1.0, (u[8], 0.5, u[9]), wind[:, i])
+        _sample_vector(table, R.wind, is_disturbed, 1.0, u[8], 0.5, u[9], wind[:, i])
     if has_own_vehicle:
         _randomize_vehicle(i, streams, table, vehicles)
 
 
-@compiled
-def _sample_vector(table, k, share, unit, u, out):
+@called
+def _sample_vector(table, k, share, unit, u, height, azimuth, out):
     """Write the vector whose numbers begin at ``k``, (3,) in the world or the next 3 in the body
     frame.
 
     :param share: 1, or 0 for none in this episode.
     :param unit: unit of a magnitude that is given by weight, in SI units.
-    :param u: three numbers on (0, 1): magnitude, height and azimuth of a random direction.
+    :param u: a number on (0, 1) for the magnitude; ``height`` and ``azimuth``, for a random
+        direction.
     """
-    size = share * between(table, k, u[0], 0.0)
+    size = share * between(table, k, u, 0.0)
     if table[k + V.by_weight] != 0.0:
         size *= unit
     # A direction of zeros means a random one.
-    direction = table[k + V.direction : k + V.axes]
-    if not direction.any():
-        direction = np.array(_spherical(1.0, 2.0 * u[1] - 1.0, TURN * u[2]))
-    axes = table[k + V.axes : k + V.axes + 3]
+    at = k + V.direction
+    x, y, z = table[at], table[at + 1], table[at + 2]
+    if x == y == z == 0.0:
+        x, y, z = _spherical(1.0, 2.0 * height - 1.0, TURN * azimuth)
     first = 3 * int(table[k + V.in_body])
-    out[first : first + 3] = size * direction * axes
+    out[first] = size * x * table[k + V.axes]
+    out[first + 1] = size * y * table[k + V.axes + 1]
+    out[first + 2] = size * z * table[k + V.axes + 2]
 
 
-@compiled
+@called
 def _randomize_vehicle(i, streams, table, vehicles):
     """Multiply the parameters of vehicle i by the factors of the row's episode, in place."""
-    u = uniforms(streams, i, 8, VEHICLE)
+    u = uniforms(streams, i, VEHICLE)
     if u[0] >= table[R.share]:
         return
     v = vehicles[:, i]
-    v[P.drag_x : P.drag_z + 1] += v[P.mass] * between(table, R.drag, u[13], 0.0)
+    drag = v[P.mass] * between(table, R.drag, u[13], 0.0)
+    for axis in range(3):
+        v[P.drag_x + axis] += drag
     for parameter, factor, number in _FACTORS:
         v[parameter] *= between(table, factor, u[number], 1.0)
     # No body has a moment of inertia larger than the sum of the other two.
@@ -222,15 +235,15 @@ def _randomize_vehicle(i, streams, table, vehicles):
     arm = between(table, R.arm, u[7], 1.0)
     x = between(table, R.center_of_mass, u[8], 0.0)
     y = between(table, R.center_of_mass, u[9], 0.0)
-    v[P.roll_arm_0 : P.yaw_arm_0] *= arm
-    v[P.roll_arm_0 : P.pitch_arm_0] -= y
-    v[P.pitch_arm_0 : P.yaw_arm_0] += x
+    for rotor in range(4):
+        v[P.roll_arm_0 + rotor] = arm * v[P.roll_arm_0 + rotor] - y
+        v[P.pitch_arm_0 + rotor] = arm * v[P.pitch_arm_0 + rotor] + x
     if table[R.delay + 2] != FIXED:
         delay = math.floor(between(table, R.delay, u[10], 0.0))
         v[P.delay] = min(delay, table[R.delay + 1] - 1.0)
 
 
-@compiled
+@called
 def _begin_gusts(table, k, share, unit, u, gust):
     """Set the parameters of an episode's gusts, (GUST_SIZE,), and sample the first one, in place.
 
@@ -248,7 +261,7 @@ def _begin_gusts(table, k, share, unit, u, gust):
         gust[GUST_ROWS.value + axis] = _normals(std, std, u, 2 + 2 * axis)[0]
 
 
-@compiled
+@inner
 def add_gusts(to, gust, first, count):
     """Add the present gusts of a block, if it has any, to its force or wind, (3, LANES)."""
     if gust.shape[1] == 0:
@@ -258,7 +271,7 @@ def add_gusts(to, gust, first, count):
             to[axis, lane] += gust[GUST_ROWS.value + axis, first + lane]
 
 
-@compiled
+@inner
 def advance_gusts(b, gust, first, count):
     """Advance the gusts of a block by a control step, in place, with two random words of each lane.
 

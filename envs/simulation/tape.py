@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numba import float32
 
-from sb3_quad.base.compiled import LANES, atomic_add, compiled
+from sb3_quad.base.compiled import LANES, atomic_add, compiled, inner
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.envs.simulation.adjoint import (
@@ -296,7 +296,7 @@ def step_vjp(
     return True
 
 
-@compiled
+@inner
 def _frames_vjp(
     b, first, count, step, lengths, actions, ages, integrals, numbers, grad_observation,
     grad_frames, grad_integral, grad_feature, grad_actions,
@@ -325,7 +325,7 @@ def _frames_vjp(
         frame[:] = 0.0
 
 
-@compiled
+@inner
 def _integral_vjp(b, lane, i, integral, numbers, frame, grad_integral):
     """Vector-Jacobian product of :func:`.frames.integrate_position` of a row.
 

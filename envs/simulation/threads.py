@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.compiled import atomic_add, compiled, give_way
+from sb3_quad.base.compiled import atomic_add, give_way, inner
 
 Function = Callable[..., Any]
 # Places in a control array, each on its own cache line, and the array's size
@@ -26,7 +26,7 @@ PATIENCE = 5_000
 REST = 100
 
 
-@compiled
+@inner
 def finish(control, chunks):
     """Wait for the chunks that other threads still have. ``control[LATE]`` says whether one has
     lost its core.

@@ -12,7 +12,7 @@ quantities only when somebody reads them, which saves a third of the cost of ref
 import numpy as np
 from numba import float32
 
-from sb3_quad.base.compiled import LANES, compiled, inlined
+from sb3_quad.base.compiled import LANES, called, compiled, inlined, inner
 from sb3_quad.envs.simulation.observation import heading_of
 from sb3_quad.envs.simulation.random import REFERENCE, STEP, uniforms
 from sb3_quad.envs.simulation.state import (
@@ -44,10 +44,10 @@ def _row_at(begin, step, numbers):
 @inlined
 def _first_row(i, streams, numbers):
     """Return the first row of the piece of the table that row i's stream chooses."""
-    return numbers[0] * np.int64(uniforms(streams, i, 1, REFERENCE)[0] * numbers[2])
+    return numbers[0] * np.int64(uniforms(streams, i, REFERENCE)[0] * numbers[2])
 
 
-@compiled
+@called
 def start_course(i, state, streams, course, numbers):
     """Let row i's reference begin at its target, with a piece that its own stream chooses."""
     for axis in range(3):
@@ -55,14 +55,17 @@ def start_course(i, state, streams, course, numbers):
     course[C.begin, i] = _first_row(i, streams, numbers)
 
 
-@compiled
+@called
 def deepest(i, streams, table, numbers):
     """Return how far below its start row i's reference goes, m."""
     begin = _first_row(i, streams, numbers)
-    return max(0.0, -table[begin : begin + numbers[0], 2].min())
+    lowest = 0.0
+    for row in range(begin, begin + numbers[0]):
+        lowest = min(lowest, table[row, 2])
+    return -lowest
 
 
-@compiled
+@called
 def follow(b, ahead, state, streams, course, table, numbers):
     """Load the targets of a block's rows as they are ``ahead`` control steps from now."""
     for lane in range(LANES):
@@ -91,7 +94,7 @@ def complete(state, streams, course, table, numbers):
             state[X.target_velocity :, i] = table[row, 3:]
 
 
-@compiled
+@inner
 def observe_preview(b, count, previews, course, table, numbers, out):
     """Write what the rows of a block observe of their references' future: the acceleration in each
     of the given control steps from now, in the frame of the present heading, at the end of ``out``.

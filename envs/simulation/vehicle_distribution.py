@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from sb3_quad.base.compiled import compiled
+from sb3_quad.base.compiled import called
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.base.yaml_files import YamlFolder
@@ -122,7 +122,7 @@ D = first_rows(DISTRIBUTION_NUMBERS)
 NO_DISTRIBUTION = np.zeros(sum(DISTRIBUTION_NUMBERS.values()))
 
 
-@compiled
+@called
 def sample_from_distribution(i, streams, table, vehicles):
     """Replace vehicle i, which is the base vehicle, by one that is sampled for the row's episode,
     in place.
@@ -133,7 +133,7 @@ def sample_from_distribution(i, streams, table, vehicles):
     """
     if table[D.mass + 2] == FIXED:
         return
-    u = uniforms(streams, i, 5, DISTRIBUTION)
+    u = uniforms(streams, i, DISTRIBUTION)
     mass = between(table, D.mass, u[0], 1.0)
     v = vehicles[:, i]
     mass_ratio = mass / v[P.mass]
@@ -162,19 +162,22 @@ def sample_from_distribution(i, streams, table, vehicles):
     size = mass_ratio ** (1.0 / 3.0) * (1.0 + x if x >= 0.0 else 1.0 / (1.0 - x))
     v[P.collision_radius] *= size
     ratio = between(table, D.moment_thrust_ratio, u[4], 1.0)
-    v[P.roll_arm_0 : P.yaw_arm_0] *= size
     for rotor in range(4):
+        v[P.roll_arm_0 + rotor] *= size
+        v[P.pitch_arm_0 + rotor] *= size
         v[P.yaw_arm_0 + rotor] = math.copysign(ratio, v[P.yaw_arm_0 + rotor])
 
     # Inertia: the ratios of its axes, then its size by Ixx.
-    inertia = v[P.ixx : P.izz + 1]
     if table[D.inertia_ratios] != 0.0:
-        inertia[:] = table[D.inertia_ratios : D.inertia_ratios + 3]
+        for axis in range(3):
+            v[P.ixx + axis] = table[D.inertia_ratios + axis]
     torque = arm_length(v) * hover * most
-    inertia *= torque / between(table, D.torque_to_inertia, u[2], 1.0) / inertia[0]
+    factor = torque / between(table, D.torque_to_inertia, u[2], 1.0) / v[P.ixx]
+    for axis in range(3):
+        v[P.ixx + axis] *= factor
 
 
-@compiled
+@called
 def arm_length(vehicle):
     """Return the distance of the outermost rotor from the centre of mass, m.
 

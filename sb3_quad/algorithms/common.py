@@ -1,7 +1,5 @@
 """The parts that all algorithms with an expert share."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -19,6 +17,7 @@ from typing_extensions import Self
 from sb3_quad.algorithms.labelling import ExpertLike, Labeller, labeller_for
 from sb3_quad.algorithms.networks import Terms, network_of
 from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
+from sb3_quad.algorithms.threads import one_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
@@ -135,7 +134,7 @@ class ExpertMixin(BaseAlgorithm):
     def _setup_model(self) -> None:
         self._check_arguments()
         # The orthogonal weights of a new network depend on the number of threads that make them.
-        with _one_thread():
+        with one_thread():
             super()._setup_model()  # type: ignore[safe-super]
         if self.env is not None:
             # The statistics of a zip, which are read before this, continue in the environment.
@@ -226,17 +225,6 @@ class ExpertMixin(BaseAlgorithm):
         # No object of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
         return [*super()._excluded_save_params(), *own, *self._not_saved]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Give PyTorch one thread for the duration of the block."""
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    try:
-        yield
-    finally:
-        th.set_num_threads(threads)
 
 
 def model_of(source: BaseAlgorithm | StrPath | None) -> Any:

@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_quad.algorithms.buffers import Batch
 from sb3_quad.algorithms.losses import Loss
+from sb3_quad.algorithms.threads import one_thread_by_default
 from sb3_quad.base.plugins import plugin
 from sb3_quad.base.types import AnyArray, Float32Array, FloatArray
 
@@ -29,14 +30,14 @@ class Network:
     def means(self, observations: AnyArray) -> Float32Array:
         """Return the means of the policy's Gaussian, (b, a), without gradients."""
         inputs = th.as_tensor(observations, device=self.policy.device)
-        with th.no_grad():
+        with th.no_grad(), one_thread_by_default():
             means = self.policy.get_distribution(inputs).mode()
         return np.asarray(means.cpu().numpy())
 
     def values(self, observations: AnyArray) -> Float32Array:
         """Return V of observations, (b,), without gradients."""
         inputs = th.as_tensor(observations, device=self.policy.device)
-        with th.no_grad():
+        with th.no_grad(), one_thread_by_default():
             values = self.policy.predict_values(inputs)
         return np.asarray(values.flatten().cpu().numpy())
 
@@ -55,8 +56,10 @@ class Network:
         return RecordedPolicy(self.policy)
 
     def acting(self) -> AbstractContextManager[None]:
-        """Return a context in which the accelerator computes ``policy(observations)``."""
-        return nullcontext()
+        """Return a context in which the accelerator computes ``policy(observations)``, or PyTorch
+        with one thread, unless it was given another number.
+        """
+        return one_thread_by_default()
 
     def learning(self) -> AbstractContextManager[None]:
         """Return a context in which an accelerator may use the threads that are PyTorch's."""

@@ -4,8 +4,9 @@ which numba lacks.
 
 import functools
 import hashlib
-import importlib
+import re
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +16,7 @@ import numba
 from numba import types
 from numba.core import event
 from numba.core.caching import IndexDataCacheFile
+from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
 from sb3_quad.base.process import print_once
@@ -22,34 +24,44 @@ from sb3_quad.base.process import print_once
 # Rows of a block: a multiple of every vector width, and few enough for a block to stay in the L1
 # cache
 LANES = 64
-# What a file contains that compiles functions by this module
-_IMPORT = b"from sb3_quad.base.compiled import"
+# An import of this package at the top of a file
+_IMPORT = re.compile(rb"^from (sb3_quad[\w.]*) import", re.MULTILINE)
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile with ``numba.njit`` without the GIL, and keep the result in a cache that notices a
-    change in any module of a folder with compiled functions.
+    change in the function's module, or in a module of this package that it imports.
 
     Numba itself looks only at the file of the function, but the code of functions from other files
-    is compiled in. Every call is inlined: otherwise a cached and a freshly compiled copy may round
-    differently under ``fastmath``.
+    is compiled in. Every call is inlined, unless you say otherwise: a cached and a freshly compiled
+    copy may round differently under ``fastmath``.
     """
     if function is None:
         return functools.partial(compiled, **options)
-    dispatcher = numba.njit(error_model="numpy", nogil=True, forceinline=True, **options)(function)
+    options = {"forceinline": True, "no_cfunc_wrapper": True, **options}
+    dispatcher = numba.njit(error_model="numpy", nogil=True, **options)(function)
+    if "no_cpython_wrapper" in options:
+        dispatcher.__class__ = _Inner
     try:
         dispatcher.enable_caching()
     except RuntimeError:
         # Neither the package's folder nor the user's cache folder is writable.
         print_once(
-            "compiled code cannot be cached and is compiled at every start, in 15 s or more;"
+            "compiled code cannot be cached and is compiled at every start, for a minute or so;"
             " set NUMBA_CACHE_DIR to a folder"
         )
     else:
         cache_file = dispatcher._cache._cache_file
-        cache_file._source_stamp = _source_stamp()
+        cache_file._source_stamp = _source_stamp(function.__module__)
         cache_file.__class__ = _CacheFile
     return dispatcher
+
+
+class _Inner(CPUDispatcher):
+    """A function that Python cannot call: without what that needs, it compiles in half the time."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        raise TypeError(f"{self.__name__}: only compiled functions can call it")
 
 
 class _CacheFile(IndexDataCacheFile):
@@ -66,44 +78,60 @@ class _CacheFile(IndexDataCacheFile):
 
 
 @functools.cache
-def _source_stamp() -> str:
-    """Return a digest of the sources. It is the same for a copy of the package elsewhere."""
+def _source_stamp(module: str) -> str:
+    """Return a digest of the sources of a module and of all in this package that it imports. It is
+    the same for a copy of the package elsewhere.
+    """
     digest = hashlib.sha256()
-    for folder in _compiled_folders():
-        for path in sorted(folder.glob("*.py")):
-            digest.update(path.name.encode())
-            digest.update(path.read_bytes())
+    seen = [module]
+    for name in seen:
+        source, imports = _read(name)
+        digest.update(source)
+        seen += [name for name in imports if name not in seen]
     return digest.hexdigest()
 
 
-def _compiled_folders() -> list[Path]:
-    """Return the folders of this package in which files compile functions."""
-    # Compiled code reads the names of a vehicle's parameters.
-    folders = {Path(root) for root in importlib.import_module("sb3_quad.envs.vehicles").__path__}
-    for name in ("sb3_quad", "sb3_quad.envs"):
-        for root in importlib.import_module(name).__path__:
-            files = Path(root).rglob("*.py")
-            folders.update(path.parent for path in files if _IMPORT in path.read_bytes())
-    # By name: a checkout's envs/ lies beside sb3_quad/, and an installed one in it.
-    return sorted(folders, key=lambda folder: folder.name)
+@functools.cache
+def _read(module: str) -> tuple[bytes, list[str]]:
+    """Return the source of an imported module, and what it imports of this package at its top."""
+    source = Path(sys.modules[module].__file__ or "").read_bytes()
+    return source, [name.decode() for name in _IMPORT.findall(source)]
 
 
-fast = compiled(fastmath=True)
-"""Compile a function whose sums may be reordered, which vectorises its loops over lanes."""
+inner = compiled(no_cpython_wrapper=True)
+"""Compile a function that only compiled functions call."""
+fast = inner(fastmath=True)
+"""Compile such a function whose sums may be reordered, which vectorises its loops over lanes."""
+called = inner(forceinline=False)
+"""Compile such a function without putting its code into every caller, which takes long to compile.
+"""
 inlined = compiled(inline="always")
 """Compile a function that numba inlines, with the options of its caller."""
 
 
 class _Notice(event.Listener):
+    """Says when the outermost function begins to compile, and how long it took."""
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._start = 0.0
+
     def on_start(self, event: event.Event) -> None:
-        print_once("compiling the simulation once, in 15 s or more; it is kept for later runs")
+        if self._depth == 0:
+            self._start = time.perf_counter()
+            print_once(
+                "compiling once, a minute or so if a core is idle; it is kept for later runs"
+            )
+        self._depth += 1
 
     def on_end(self, event: event.Event) -> None:
-        pass
+        self._depth -= 1
+        if self._depth == 0:
+            print_once(f"compiled in {time.perf_counter() - self._start:.0f} s")
 
 
 def compile_notice() -> Any:
-    """Return a context for a call that may compile, which then prints a line on stderr."""
+    """Return a context for a call that may compile, which then prints what takes so long."""
     return event.install_listener("numba:compile", _Notice())
 
 

@@ -22,6 +22,7 @@ from sb3_quad.agents.agent_settings import (
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.controller import Controller
 from sb3_quad.algorithms.labelling import warn_of_vehicle
+from sb3_quad.algorithms.threads import one_thread_by_default
 from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
@@ -224,7 +225,8 @@ def fly_settings(
     reward: Reward | None = None,
     record: StrPath | None = None,
 ) -> Flights:
-    """Fly the first episode of each seed, as :func:`fly` does, with one record of settings.
+    """Fly the first episode of each seed, as :func:`fly` does, with one record of settings. PyTorch
+    has one thread meanwhile, unless you gave it another number.
 
     :param plan: the events of the episodes.
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
@@ -237,7 +239,7 @@ def fly_settings(
     course = Course(plan.waypoints, plan.radius)
     seen: list[Float32Array] = []
     done: list[Float32Array] = []
-    with closing(FLEETS[backend](seeds, settings)) as fleet:
+    with closing(FLEETS[backend](seeds, settings)) as fleet, one_thread_by_default():
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
             controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from sb3_quad.base.compiled import compiled
+from sb3_quad.base.compiled import compiled, inner
 from sb3_quad.envs.simulation.physics import rotation, to_body, to_world
 from sb3_quad.envs.simulation.state import AHEAD, P, W, X
 from sb3_quad.envs.simulation.vectors import (
@@ -81,7 +81,7 @@ def fly_geometric(state, constants, wrench, actions):
         )
 
 
-@compiled
+@inner
 def reference_acceleration(state, i, lag, attitude):
     """Return the acceleration of the reference at the time when the vehicle can have it, world
     frame, m/s².
@@ -95,7 +95,7 @@ def reference_acceleration(state, i, lag, attitude):
     return add(now, (sideways * dx, sideways * dy, upwards * dz))
 
 
-@compiled
+@inner
 def yaw_moment(state, i, body_to_world, r, gains, izz):
     """Return the yaw moment against the yaw rate, or towards the commanded heading, N m.
 
@@ -111,7 +111,7 @@ def yaw_moment(state, i, body_to_world, r, gains, izz):
     return gain * izz * (upright * (rate + 0.25 * gain * error) - r)
 
 
-@compiled
+@inner
 def desired_force(e, v, a, gains, g):
     """Return the desired force of the rotors per mass, world frame, m/s².
 
@@ -159,7 +159,7 @@ def desired_force(e, v, a, gains, g):
     return scale * fx - ax, scale * fy - ay, max(0.1 * g, weight + scale * fz)
 
 
-@compiled
+@inner
 def braking_profile(gain, distance_by_deceleration):
     """Return the speed per distance from which the vehicle can still brake.
 
@@ -168,13 +168,13 @@ def braking_profile(gain, distance_by_deceleration):
     return 2.0 * gain / (1.0 + math.sqrt(1.0 + 2.0 * gain * gain * distance_by_deceleration))
 
 
-@compiled
+@inner
 def left_to_brake(deceleration, forward):
     """Return the deceleration to plan with if something else accelerates by ``forward``."""
     return max(0.1 * deceleration, deceleration - max(0.0, forward))
 
 
-@compiled
+@inner
 def seen_later(b, omega, time):
     """Return a direction fixed in the world as the body sees it after turning for some time.
 
@@ -195,7 +195,7 @@ def seen_later(b, omega, time):
     )
 
 
-@compiled
+@inner
 def turn_moments(b, omega, gains, inertia):
     """Return the roll and pitch moments that turn the thrust to direction b, body frame, N m."""
     p, q, r = omega
@@ -230,7 +230,7 @@ def turn_moments(b, omega, gains, inertia):
     return ixx * p_dot + (izz - iyy) * q * r, iyy * q_dot + (ixx - izz) * r * p
 
 
-@compiled
+@inner
 def allocate(thrust, moments, mixer_inverse, thrust_middle, thrust_half_range, tilting, actions):
     """Write the actions of one vehicle that produce a thrust, N, and moments, N m.
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import float32, uint64
 
-from sb3_quad.base.compiled import compiled
+from sb3_quad.base.compiled import compiled, inner
 from sb3_quad.base.types import Float32Array, IntArray
 from sb3_quad.fast.losses import actor_loss, critic_loss
 
@@ -44,7 +44,7 @@ class Layers(NamedTuple):
     parameters: Float32Array
 
 
-@compiled(fastmath=_FAST)
+@inner(fastmath=_FAST)
 def _multiply(w, x, h, size):
     """h = w x; w (rows, columns), x (columns, size), h (rows, size)."""
     # Unsigned, since support for negative indices would cost a third.
@@ -71,7 +71,7 @@ def _multiply(w, x, h, size):
                     h[j + _1, i] = other
 
 
-@compiled(fastmath=_FAST)
+@inner(fastmath=_FAST)
 def _add_products(g, x, dw, size):
     """dw += g xᵀ; g (rows, size), x (columns, size), dw (rows, columns)."""
     rows = uint64(dw.shape[0])
@@ -99,7 +99,7 @@ def _add_products(g, x, dw, size):
                     dw[row, k + _3] += sums[3]
 
 
-@compiled(fastmath=_FAST)
+@inner(fastmath=_FAST)
 def _activate(h, bias, kind, size):
     """h = f(h + bias), (rows, size).
 
@@ -132,7 +132,7 @@ def _activate(h, bias, kind, size):
                 h[j, i] += b
 
 
-@compiled(fastmath=_FAST)
+@inner(fastmath=_FAST)
 def _activation_vjp(g, h, kind, db, size):
     """g = g f'(x) with h = f(x), both (rows, size).
 
@@ -149,7 +149,7 @@ def _activation_vjp(g, h, kind, db, size):
         db[j] += total
 
 
-@compiled
+@inner
 def _touch(rows, index, first, count):
     """Prefetch rows, many at a time: otherwise each gather stalls where they lie far apart."""
     total = float32(0.0)
@@ -158,7 +158,7 @@ def _touch(rows, index, first, count):
     return total
 
 
-@compiled
+@inner
 def _load(rows, index, first, count, h, size):
     """Gather ``count`` rows of (m, size), from ``first`` on in ``index``, into a block.
 
@@ -174,13 +174,13 @@ def _load(rows, index, first, count, h, size):
             h[k, i] = row[k]
 
 
-@compiled
+@inner
 def _layer(scratch, at, width, size):
     """Return the ``width`` units of a layer at a place in the scratch memory, (width, size)."""
     return scratch[at : at + width * size].reshape(width, size)
 
 
-@compiled
+@inner
 def _forward(scratch, x, index, first, count, layers, size):
     """Compute all layers of a block, which follow one another in memory, the inputs first.
 
@@ -203,7 +203,7 @@ def _forward(scratch, x, index, first, count, layers, size):
     return at
 
 
-@compiled
+@inner
 def _backward(activations, scratch, layers, sums, last_layer, size):
     """Add the gradient of a block with respect to the parameters to ``sums``.
 

@@ -16,7 +16,7 @@ import numpy as np
 from numba import float32
 
 from sb3_quad.algorithms.losses import HUBER_DELTA, MSE_WEIGHT, NEAR, Loss
-from sb3_quad.base.compiled import compiled
+from sb3_quad.base.compiled import inner
 
 CLONING, POLICY, KL, CLIPPED, TERMS = range(5)
 """Indices of the sums of a compiled actor's loss. A critic's has only one, ``VALUE``."""
@@ -66,7 +66,7 @@ def numbers(loss: Loss, advantage_shift: float = 0.0, advantage_scale: float = 1
     )
 
 
-@compiled
+@inner
 def cloning_error(loss, error, log_std):
     """Return the error of one dimension of an action, and its derivatives with respect to mean and
     log_std.
@@ -86,7 +86,7 @@ def cloning_error(loss, error, log_std):
     return value, slope, 0.0
 
 
-@compiled
+@inner
 def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, terms):
     """Add an actor's loss over ``count`` rows of a mini-batch, from ``first`` on, to ``terms``.
 
@@ -141,7 +141,7 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
                     g_log_std[k] += slope * (z * z - 1.0)
 
 
-@compiled
+@inner
 def critic_loss(value, index, first, count, targets, loss, g, terms):
     """Add a critic's loss for values (1, ROWS), as :func:`actor_loss` does."""
     n = len(index)

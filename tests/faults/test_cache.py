@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from sb3_quad.base import compiled
+from sb3_quad.envs.simulation import kernel, sampling
+from sb3_quad.fast import kernel as fast_kernel
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -58,3 +62,33 @@ def test_a_read_only_installation_without_a_home_says_that_it_compiles_at_every_
             f"(1.0, 0.0, 0.0) {hits}\n",
             [],
         )
+
+
+@pytest.mark.parametrize(
+    ("module", "changed", "recompiles"),
+    [
+        (kernel, "envs.simulation.reward", True),
+        (sampling, "envs.simulation.reward", False),
+        (kernel, "fast.kernel", False),
+        (fast_kernel, "fast.losses", True),
+        (fast_kernel, "envs.simulation.reward", False),
+    ],
+)
+def test_a_change_recompiles_what_imports_it_and_nothing_else(
+    module, changed, recompiles, monkeypatch
+):
+    stamp = compiled._source_stamp.__wrapped__
+    read = compiled._read
+
+    def read_changed(name):
+        source, imports = read(name)
+        return source + b"#" * (name == f"sb3_quad.{changed}"), imports
+
+    before = stamp(module.__name__)
+    monkeypatch.setattr(compiled, "_read", read_changed)
+    assert (stamp(module.__name__) != before) == recompiles
+
+
+def test_python_cannot_call_what_has_no_entry_for_it():
+    with pytest.raises(TypeError, match="load_rows: only compiled functions"):
+        kernel.load_rows(None, 0, None)
