@@ -45,6 +45,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
             "compiled code cannot be cached and is compiled at every start, in 15 s or more;"
             " set NUMBA_CACHE_DIR to a folder"
         )
+        _Notice.kept = ""
     else:
         cache_file = dispatcher._cache._cache_file
         cache_file._source_stamp = _source_stamp()
@@ -95,8 +96,10 @@ inlined = compiled(inline="always")
 
 
 class _Notice(event.Listener):
+    kept = "; it is kept for later runs"
+
     def on_start(self, event: event.Event) -> None:
-        print_once("compiling the simulation once, in 15 s or more; it is kept for later runs")
+        print_once(f"compiling the simulation once, in 15 s or more{self.kept}")
 
     def on_end(self, event: event.Event) -> None:
         pass

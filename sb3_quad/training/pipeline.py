@@ -15,7 +15,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, field_va
 
 from sb3_quad.agents.zips import load_zip
 from sb3_quad.base.errors import ConfigError, TrainingError, named
-from sb3_quad.base.files import locked, save_model
+from sb3_quad.base.files import locked, refuse_links, refuse_outside, save_model
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
@@ -40,7 +40,7 @@ from sb3_quad.training.options import (
     DEFAULT_PIPELINE,
     KEPT_BY_STAGES,
 )
-from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_links, refuse_outside
+from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train
 
 STATUS_FILE = "pipeline.yml"

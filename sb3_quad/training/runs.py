@@ -183,29 +183,6 @@ def open_run(path: StrPath) -> RunFolder:
     return RunFolder(folder, configs[0].parent.name)
 
 
-def refuse_outside(path: StrPath, where: str, *folders: Path) -> None:
-    """Refuse a path of a run, which may be a stranger's, that is in none of the folders.
-
-    :param where: what the message calls the path.
-    :raises ConfigError: it is elsewhere: an absolute path, by ``..``, or through a link.
-    """
-    place = Path(path).resolve()
-    if not any(place.is_relative_to(folder.resolve()) for folder in folders):
-        raise ConfigError(
-            f"{where}: {path} is outside of {' and '.join(map(str, folders))}; "
-            "a run that is resumed writes only there"
-        )
-
-
-def refuse_links(folder: Path) -> None:
-    """Refuse a folder with links that lead out of it, through which a resumed run would write.
-
-    :raises ConfigError: there is one.
-    """
-    for path in folder.rglob("*"):
-        refuse_outside(path, str(folder), folder)
-
-
 def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
     """Find a run by rl-zoo's ``--exp-id``.
 

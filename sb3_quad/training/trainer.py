@@ -30,7 +30,16 @@ from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.labelling import Labeller
 from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
+from sb3_quad.base.files import (
+    locked,
+    make_folder,
+    one_line,
+    refuse_links,
+    refuse_outside,
+    save_model,
+    write_bytes,
+    write_text,
+)
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
@@ -49,8 +58,6 @@ from sb3_quad.training.runs import (
     claim_run,
     made_with,
     open_run,
-    refuse_links,
-    refuse_outside,
 )
 from sb3_quad.training.snapshots import load_snapshot
 
@@ -305,7 +312,7 @@ class _Training:
             finally:
                 # From here on, no signal interrupts what is saved.
                 self.signals.hold()
-        except (Exception, KeyboardInterrupt) as error:
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
             if not self.signals.received:
                 self._save_after(error)
                 raise
