@@ -58,6 +58,7 @@ from sb3_quad.training.runs import (
     claim_run,
     made_with,
     open_run,
+    refuse_elsewhere,
 )
 from sb3_quad.training.snapshots import load_snapshot
 
@@ -131,8 +132,9 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     for name in ("algo", "env", "env_kwargs", *MADE_WITH):
         options.pop(name, None)
     job = validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
+    log_folder = run.path.absolute().parent.parent
+    refuse_elsewhere(config, str(run.config), log_folder)
     if job.tensorboard_log and not changes.get("tensorboard_log"):
-        log_folder = run.path.absolute().parent.parent
         refuse_outside(job.tensorboard_log, str(run.arguments), log_folder, Path())
     with (
         StopSignals() as signals,
