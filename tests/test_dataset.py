@@ -159,8 +159,8 @@ def with_number(n, name, number):
         ([], "0 actions"),
         ([flight(2), SimpleNamespace(obs=np.zeros((5, 2)), acts=np.zeros((3, 1)))], "7 obs"),
         ([SimpleNamespace(observations={"camera": 1}, actions=np.zeros((3, 1)))], "unsized"),
-        ([flight(3, shape=(1, 2))], "dimension"),
-        ([{"observations": 1}], "no attribute 'observations'"),
+        ([flight(3, shape=(1, 2))], "zip"),
+        ([{"observations": 1}], "lacks observations or obs"),
         (3, "int: holds no flights that fit the environment"),
     ],
 )

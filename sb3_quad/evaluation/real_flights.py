@@ -41,8 +41,8 @@ LEAST_HEIGHT = 0.3
 LONGEST_GAP = 0.05
 # Below this, m/s or rad/s, velocities and rates are noise
 LEAST_MOTION = 0.2
-# The least correlation of a measurement with what it should be
-LEAST_AGREEMENT = 0.2
+# Products of what is measured and what it should be, by the squares of the larger one
+LEAST_AGREEMENT = 0.1
 # Clock offsets that are tried, s
 OFFSETS = np.arange(-0.1, 0.1005, 0.001)
 # Thrust of a motor, N, as coefficients of the powers of its voltage, from the 0th:
@@ -96,6 +96,8 @@ def read_log(path: Path, step: float) -> Log:
     missing = {*measured, *commands} - {*table}
     if missing:
         raise ConfigError(f"{path}: lacks {', '.join(sorted(missing))}; {NEEDED}")
+    if len(table) < 2:
+        raise ConfigError(f"{path}: fewer than two rows")
     # Commands may be missing; such rows do not count.
     refuse_gaps(path, table[measured])
     time = table["t"]
@@ -138,10 +140,10 @@ def read_log(path: Path, step: float) -> Log:
 
     offset = float(min(OFFSETS, key=disagreement))
     motion[:, BODY_RATES] = resampled(GYRO_COLUMNS, offset)
-    _refuse_unlike(path, GYRO_COLUMNS, motion[flying, BODY_RATES], rates, "the attitude")
+    _refuse_unlike(path, GYRO_COLUMNS, motion[flying, BODY_RATES], rates)
     speeds = np.gradient(motion[:, POSITION], step, axis=0)[flying]
     names = CAPTURE_COLUMNS[VELOCITY]
-    _refuse_unlike(path, names, motion[flying, VELOCITY], speeds, "the position")
+    _refuse_unlike(path, names, motion[flying, VELOCITY], speeds)
 
     thrusts = resampled(THRUSTS, offset)
     flying &= np.isfinite(thrusts).all(axis=1)
@@ -174,25 +176,18 @@ def _refuse_unlikely(path: Path, table: pd.DataFrame) -> None:
         raise ConfigError(f"{path}: row {worst + 1}: qw, qx, qy, qz have length {norms[worst]:.3g}")
 
 
-def _refuse_unlike(
-    path: Path, columns: list[str], measured: FloatArray, expected: FloatArray, source: str
-) -> None:
+def _refuse_unlike(path: Path, names: list[str], measured: FloatArray, other: FloatArray) -> None:
     """Refuse columns (n, 3) that have another unit, sign or axis than what others say.
 
     :raises ConfigError: the message names the column.
     """
-    if len(measured) == 0:
-        return
-    own = np.sqrt(np.square(measured).mean(axis=0))
-    other = np.sqrt(np.square(expected).mean(axis=0))
-    agreement = (measured * expected).mean(axis=0)
-    # What follows from an attitude is noisy.
-    unlike = (agreement < LEAST_AGREEMENT * own * other) | (own > 4 * other) | (other > 4 * own)
-    for column in np.flatnonzero(unlike & (np.maximum(own, other) > LEAST_MOTION)):
-        raise ConfigError(
-            f"{path}: {columns[column]} is {own[column]:.3g} (rms), where {source} says "
-            f"{other[column]:.3g}, or has another sign; check units, axes and the order of columns"
-        )
+    for name, own, expected in zip(names, measured.T, other.T, strict=True):
+        larger = max(own @ own, expected @ expected)
+        # What follows from an attitude is noisy.
+        if own @ expected < LEAST_AGREEMENT * larger and larger > len(own) * LEAST_MOTION**2:
+            raise ConfigError(
+                f"{path}: {name} contradicts the motion; check units, axes and the order of columns"
+            )
 
 
 def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
