@@ -214,8 +214,8 @@ class Vehicle(Frozen):
                 "rotor_positions: these rotors cannot give thrust, roll, pitch and yaw "
                 "independently"
             )
-        least, greatest = GYRATION_RATIOS
-        if not least < self.gyration_ratios.min() < self.gyration_ratios.max() < greatest:
+        ratios = self.gyration_ratios
+        if ratios.min() < GYRATION_RATIOS[0] or ratios.max() > GYRATION_RATIOS[1]:
             raise ValueError(
                 f"inertia {list(self.inertia)}: has nothing in common with a mass of {self.mass:g} "
                 f"kg and rotors {self.arm_length:g} m from the centre; is it in kg m²?"
