@@ -1,5 +1,6 @@
 """Callbacks that do something at regular intervals: timesteps, seconds, or ends of episodes."""
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,13 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.utils import safe_mean
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_text, save_model
+from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.files import regular_file, save_model
 from sb3_quad.base.types import Report, StrPath
+
+LONGEST_TRAINING = 1e9  # s
+# The end of an episode log holds its last line, and more than its header if that is all, bytes.
+LONGEST_LINES = 10_000
 
 
 class EveryTimesteps(EventCallback):
@@ -150,27 +155,35 @@ class EpisodeLog(BaseCallback):
         self._env_id = env_id
 
     def _on_training_start(self) -> None:
-        self._start = time.time()
-        lines: list[str] = []
-        if self._path.exists():
-            # A crash may have cut the last row.
-            with self._path.open("rb+") as file:
-                file.truncate(file.read().rfind(b"\n") + 1)
-            lines = read_text(self._path).splitlines()
-        # The first two lines are the header, which a crash may have cut, too.
-        is_new = len(lines) < 2
+        lines = self._last_lines() if self._path.exists() else []
         # The seconds of an earlier training count, too.
+        earlier = 0.0
+        # The first two lines are the header, which a crash may have cut, too.
         if len(lines) > 2:
-            self._start -= float(lines[-1].split(",")[2])
+            with raised_as(ConfigError, f"{self._path}: its last line is no episode"):
+                earlier = float(lines[-1].split(b",")[2])
+                if not 0.0 <= earlier < LONGEST_TRAINING:
+                    raise ValueError(f"t is {earlier:g}")
+        # The clock of the day may be set back.
+        self._start = time.monotonic() - earlier
         self._writer = ResultsWriter(
             str(self._path),
-            {"t_start": self._start, "env_id": self._env_id},
+            {"t_start": time.time() - earlier, "env_id": self._env_id},
             ("is_success",),
-            override_existing=is_new,
+            override_existing=len(lines) < 2,
         )
 
+    def _last_lines(self) -> list[bytes]:
+        """Return the last lines of the file, without one that a crash has cut, which it loses."""
+        with regular_file(self._path).open("rb+") as file:
+            size = file.seek(0, os.SEEK_END)
+            begin = file.seek(max(0, size - LONGEST_LINES))
+            whole, newline, _ = file.read().rpartition(b"\n")
+            file.truncate(begin + len(whole + newline))
+        return whole.splitlines()
+
     def _on_step(self) -> bool:
-        seconds = round(time.time() - self._start, 3)
+        seconds = round(time.monotonic() - self._start, 3)
         for row in np.flatnonzero(self.locals["dones"]):
             info = self.locals["infos"][row]
             if "episode" in info:

@@ -115,13 +115,33 @@ class SnapshotFile(BaseCallback):
         is_early = isinstance(self.model, OffPolicyAlgorithm) and start < self._next_taken
         if is_early and not self._signals.received:
             return
+        self._next_taken = start + PAUSE
+        self._take()
+        start = time.monotonic()
+        if self._every > 0 and start >= self._next_write:
+            try:
+                self.write()
+            except ConfigError as error:
+                self._report(f"warning: no new snapshot, the one before is kept: {error}")
+            self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
+
+    def _on_training_end(self) -> None:
+        # A later callback may raise, and the finished model would be lost. After a signal, the
+        # training has ended within a rollout.
+        if not self._signals.received:
+            self._take()
+
+    def _take(self) -> None:
+        """Keep the training as it is now.
+
+        :raises TrainingError: its parameters are no longer finite.
+        """
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
                 raise TrainingError(
                     f"after {self.num_timesteps:,} timesteps {name} is no longer finite; "
                     "lower learning_rate"
                 )
-        self._next_taken = start + PAUSE
         model = io.BytesIO()
         self.model.save(model)
         # The rows of the stores are read when the snapshot is written. A rollout later there are
@@ -137,13 +157,6 @@ class SnapshotFile(BaseCallback):
             self._state["episodes"] = np.array(self._episodes.stat().st_size)
         if self._best_model.is_file():
             self._state["best_model"] = np.fromfile(self._best_model, np.uint8)
-        start = time.monotonic()
-        if self._every > 0 and start >= self._next_write:
-            try:
-                self.write()
-            except ConfigError as error:
-                self._report(f"warning: no new snapshot, the one before is kept: {error}")
-            self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
 
     def write(self) -> None:
         """Write the latest snapshot; until it is complete, the file keeps the one before.

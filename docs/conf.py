@@ -39,7 +39,7 @@ autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False
 linkcheck_anchors = False
 # Other packages document their names themselves.
-IGNORED = "Bounded|a_number|StopSignals|Perceptrons"
+IGNORED = "Bounded|StopSignals|Perceptrons"
 nitpick_ignore_regex = [("py:.*", r"(?!sb3_quad).*"), ("py:class", rf".*\.({IGNORED})")]
 
 # The reference must have every name in the __all__ of these.

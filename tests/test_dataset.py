@@ -104,6 +104,26 @@ def test_flights_of_others_are_taken_without_their_last_observations(short):
     np.testing.assert_array_equal(actions.ravel(), [-1, 0, 1, -1, 1])
 
 
+@pytest.mark.parametrize(
+    "names", [("obs", "actions"), ("obs", "acts"), ("observations", "actions")]
+)
+def test_files_of_others_are_taken(tmp_path, names):
+    """Of Stable-Baselines 2, of imitation with its pickled infos, and of flights in a row."""
+    dataset = filled(8, 5)
+    dataset.action_range = (-1.0, 1.0)
+    arrays = [np.arange(12.0).reshape(2, 3, 2), np.linspace(-1.0000001, 1.0, 4).reshape(2, 2, 1)]
+    infos = np.array([{}, {}], dtype=object)
+    np.savez(tmp_path / "many.npz", infos=infos, **dict(zip(names, arrays, strict=True)))
+    dataset.load(tmp_path / "many.npz")
+    observations, actions = contents(dataset)
+    np.testing.assert_array_equal(observations, [[0, 1], [2, 3], [6, 7], [8, 9]])
+    assert actions.min() == -1.0
+    flat = [arrays[0].reshape(6, 2)[:4], arrays[1].reshape(4, 1)]
+    np.savez(tmp_path / "one.npz", infos=infos, **dict(zip(names, flat, strict=True)))
+    dataset.load(tmp_path / "one.npz")
+    np.testing.assert_array_equal(contents(dataset)[1], actions)
+
+
 def test_trajectories_of_imitation_are_taken():
     types = pytest.importorskip("imitation.data.types")
     rng = np.random.default_rng(0)
@@ -139,8 +159,8 @@ def with_number(n, name, number):
         ([], "0 actions"),
         ([flight(2), SimpleNamespace(obs=np.zeros((5, 2)), acts=np.zeros((3, 1)))], "7 obs"),
         ([SimpleNamespace(observations={"camera": 1}, actions=np.zeros((3, 1)))], "unsized"),
-        ([flight(3, shape=(1, 2))], "dimension"),
-        ([{"observations": 1}], "no attribute 'observations'"),
+        ([flight(3, shape=(1, 2))], "zip"),
+        ([{"observations": 1}], "lacks observations or obs"),
         (3, "int: holds no flights that fit the environment"),
     ],
 )

@@ -153,6 +153,18 @@ def test_check_vehicle_prints_the_errors(folder, capsys):
         (lambda table: table.assign(t=table["t"].where(table.index != 8, 0.01)), "row 9: t"),
         (lambda table: table.assign(pz=0.0), "0.3 m"),
         (lambda table: table.drop(columns=THRUSTS), PWM[0]),
+        # In other units, axes or orders, or damaged
+        (lambda table: table.assign(t=1e6 * table["t"]), "is t in s"),
+        (lambda table: table.assign(t=table["t"].where(table.index < 199, 1e300)), "is t in s"),
+        (lambda table: table[:50], "shorter than 1 s"),
+        (lambda table: table.assign(imu_gyro_x=57.3 * table["imu_gyro_x"]), "imu_gyro_x"),
+        (lambda table: table.assign(imu_gyro_z=-table["imu_gyro_z"]), "imu_gyro_z"),
+        (lambda table: table.assign(px=1000.0 * np.sin(table["t"])), "vx"),
+        (lambda table: table.assign(vy=1e300), "vy"),
+        (lambda table: table.assign(qw=table["qw"].where(table.index != 8, 9.0)), "row 9: qw"),
+        (lambda table: table.assign(thrust_m2=-0.1), "M2"),
+        (lambda table: table.assign(thrust_m2=1e300), "thrust_m2"),
+        (lambda table: table.rename(columns={"vz": "vx"}), "twice"),
     ],
 )
 def test_a_log_that_does_not_fit_is_refused_in_a_line(tmp_path, capsys, change, named):

@@ -1,5 +1,6 @@
 """Motions: positions as functions of time, from curves, points in a file, or waypoints."""
 
+import io
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.files import read_bytes
 from sb3_quad.base.types import FloatArray
 
 if TYPE_CHECKING:
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
 Motion = Callable[[FloatArray], FloatArray]
 """The position at given times (t,), s: (t, 3) or with a heading (t, 4); m and rad."""
 HARMONICS = np.arange(1, 7)
+# bytes
+LARGEST_TABLE = 20_000_000
+LONGEST_ROW = 20_000
 _COLUMNS = ["t", "x", "y", "z", "heading"]
 # Number of coefficients of a segment of a polynomial with the least snap
 _COEFFICIENTS = 8
@@ -46,15 +51,7 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     :raises ConfigError: a file that cannot be read, or whose times do not rise; the message names
         the row, counted from 1 after the header.
     """
-    # Other references do not wait for it.
-    import pandas as pd
-
-    with raised_as(ConfigError, str(path)):
-        frame = pd.read_csv(path, dtype=np.float64, skipinitialspace=True)
-    # Pandas would take surplus numbers in the rows for an index, and shift all columns.
-    if not isinstance(frame.index, pd.RangeIndex):
-        raise ConfigError(f"{path}: its rows have more numbers than its first line has names")
-    frame.columns = frame.columns.str.strip()
+    frame = read_table(path)
     names = [*frame.columns]
     if names not in (_COLUMNS[:4], _COLUMNS):
         raise ConfigError(
@@ -69,6 +66,32 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     # Headings may be wrapped to [-π, π]: take the shorter way between two of them.
     numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)
     return times, numbers[:, 1:]
+
+
+def read_table(path: Path) -> "pd.DataFrame":
+    """Return the numbers of a CSV file by the names of the columns in its first line.
+
+    :raises ConfigError: a file that cannot be read, or holds something else; a column given twice.
+    """
+    # Other references do not wait for it.
+    import pandas as pd
+
+    content = read_bytes(path, LARGEST_TABLE)
+    # Pandas takes a kilobyte for each column.
+    ends = np.flatnonzero(np.frombuffer(content, np.uint8) == ord("\n"))
+    longest = np.diff(ends, prepend=-1, append=len(content)).max()
+    if longest > LONGEST_ROW:
+        raise ConfigError(f"{path}: has a row of more than {LONGEST_ROW:,} bytes")
+    with raised_as(ConfigError, f"{path}: not a table of numbers"):
+        names = content.partition(b"\n")[0].decode("utf-8-sig").split(",")
+        frame = pd.read_csv(io.BytesIO(content), dtype=np.float64, skipinitialspace=True)
+    # Pandas would take surplus numbers in the rows for an index, and shift all columns.
+    if not isinstance(frame.index, pd.RangeIndex):
+        raise ConfigError(f"{path}: its rows have more numbers than its first line has names")
+    frame.columns = frame.columns.str.strip()
+    if len({*map(str.strip, names)}) < len(names):
+        raise ConfigError(f"{path}: its first line names a column twice")
+    return frame
 
 
 def refuse_gaps(path: Path, frame: "pd.DataFrame") -> None:

@@ -15,7 +15,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray
-from sb3_quad.base.validate import Frozen
+from sb3_quad.base.validate import Frozen, Number
 from sb3_quad.envs.simulation.motions import (
     HARMONICS,
     SINES,
@@ -26,7 +26,6 @@ from sb3_quad.envs.simulation.motions import (
     sum_of_sines,
 )
 from sb3_quad.envs.simulation.state import AHEAD, REFERENCE_PARTS, REFERENCE_SIZE, row_slices
-from sb3_quad.envs.vehicles.vehicle import Number
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]

@@ -19,18 +19,18 @@ from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.references import Reference
 from sb3_quad.envs.simulation.tasks import find_mixture, resolve_tasks
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
-from sb3_quad.envs.vehicles.vehicle import Vehicle, a_number, first_vehicle, load_vehicle
+from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
 # The largest number of control steps that an episode can have
 ENDLESS = 2**62 - 1
-Steps = Annotated[int, BeforeValidator(a_number), Field(gt=0, le=ENDLESS)]
+Steps = Annotated[int, Field(gt=0, le=ENDLESS)]
 AsList = BeforeValidator(
     lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 )
 Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
 # The attribute of a model, and so the key of the JSON in its zip
 KEY = FLIGHT_SETTINGS
-Level = Annotated[float, BeforeValidator(a_number), Field(ge=0, le=100)]
+Level = Annotated[float, Field(ge=0, le=100)]
 
 
 _OBSERVATION = set(ObservationSettings.model_fields)
@@ -74,7 +74,9 @@ class FlightSettings(ObservationSettings):
     observation_std: Scaling = None
     """σ of Eq. 3.16, (18,) or (n, 18), in units; None: Table A.2"""
     vehicles: VehicleDistribution | None = None
-    """fields of VehicleDistribution, or {distribution: name}: a vehicle for each episode"""
+    """fields of VehicleDistribution, or {distribution: name}: a vehicle for each episode, which has
+    the layout, delay, time steps and gravity of ``vehicle``
+    """
     randomize: Randomization | None = None
     """fields of Randomization: dynamics that differ by episode"""
     reference: Reference | None = None

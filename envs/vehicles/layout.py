@@ -5,11 +5,11 @@ import math
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, PositiveFloat
+from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray, StrDict
-from sb3_quad.base.validate import Frozen
+from sb3_quad.base.validate import Frozen, Quantity
 
 if TYPE_CHECKING:
     from sb3_quad.envs.vehicles.vehicle import Vehicle
@@ -40,7 +40,7 @@ class NamedLayout(Frozen):
     """the flight stack whose motors 1 to 4 these are"""
     props: Literal["in", "out"] = "in"
     """in: the front left rotor turns clockwise seen from above, as all four have it; out: not"""
-    arm_length: PositiveFloat
+    arm_length: Quantity
     """from the middle of the rotors to each, m"""
     arm_angle: Annotated[float, Field(gt=0.0, lt=90.0)] = 45.0
     """from forward to the front arms, degrees; above 45 the rotors are farther apart in width than

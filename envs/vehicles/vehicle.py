@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.base.process import print_once
 from sb3_quad.base.types import FloatArray, StrDict, StrMapping, StrPath
-from sb3_quad.base.validate import Frozen, check, validate
+from sb3_quad.base.validate import LARGEST, Frozen, Quantity, check, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.vehicles.gains import GeometricGains
 from sb3_quad.envs.vehicles.layout import NamedLayout, Turn, find_turn
@@ -68,23 +68,16 @@ PARAMETER_NAMES = (
     "hover_share_3",
 )
 # A name is a part of file names, and of what reports and exported files say.
-NAME = r"^[^/\\<>\p{C}]{1,100}$"
-
-
-def a_number(value: Any) -> Any:
-    """Refuse true and false, which pydantic would read as 1 and 0."""
-    if isinstance(value, bool):
-        raise ValueError("true and false are not numbers")
-    return value
-
-
-# No quadcopter has larger numbers, and the square of one would overflow.
-LARGEST = 1e6
-Number = Annotated[float, BeforeValidator(a_number), Field(le=LARGEST)]
-PositiveFloat = Annotated[Number, Field(gt=0.0)]
-NonNegativeFloat = Annotated[Number, Field(ge=0.0)]
-Limits = tuple[NonNegativeFloat, PositiveFloat]
-Place = tuple[Number, Number]
+# Of blanks, it may hold the space alone, since others end a line.
+NAME = r"^([^/\\<>\p{C}\p{Z}]| ){1,100}$"
+NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
+Limits = tuple[NonNegative, Quantity]
+# Below, nothing spins up or falls within a flight.
+Rate = Annotated[float, Field(ge=0.01, le=LARGEST)]
+Coordinate = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+Place = tuple[Coordinate, Coordinate]
+# Radii of gyration by the rotors' distance from the centre; beyond, an inertia has another unit.
+GYRATION_RATIOS = (1e-4, 1e3)
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 CONTROL_STEP = 0.01  # s
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
@@ -112,9 +105,9 @@ class Vehicle(Frozen):
 
     name: str = Field(pattern=NAME)
     """what the vehicle is called; up to 100 characters, none of / \\ < > or control"""
-    mass: PositiveFloat
+    mass: Quantity
     """m, kg"""
-    inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+    inertia: tuple[Quantity, Quantity, Quantity]
     """Ixx, Iyy, Izz of the diagonal inertia, kg m^2"""
     allow_impossible_inertia: bool = False
     """whether to fly an inertia that no rigid body has, by more than 5 %"""
@@ -122,19 +115,19 @@ class Vehicle(Frozen):
     """x, y of each rotor from the centre of mass (x forward, y left), m; or give rotor_order"""
     rotor_directions: tuple[int, int, int, int]
     """sign of the yaw moment of each rotor: two of 1, two of -1"""
-    moment_thrust_ratio: PositiveFloat
+    moment_thrust_ratio: Quantity
     """kM / kF, m"""
-    thrust_coefficient: NonNegativeFloat = 0.0
+    thrust_coefficient: NonNegative = 0.0
     """kF, N s^2, in F = kF ω^2 (Eq. 2.4); 0 if unknown: the rotors then hover at 1,000 rad/s"""
-    motor_gain_up: PositiveFloat
+    motor_gain_up: Rate
     """k_m of a rotor that speeds up, 1/s (Eq. 4.1)"""
-    motor_gain_down: PositiveFloat
+    motor_gain_down: Rate
     """k_m of a rotor that slows down, 1/s"""
     motor_integration: Literal["euler", "exact"] = "euler"
     """euler: Eq. 4.1 as printed; exact: the exponential, and the thrust at the middle of a step"""
-    drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
+    drag: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
     """d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"""
-    gravity: PositiveFloat = GRAVITY
+    gravity: Rate = GRAVITY
     """g, m/s^2"""
     thrust_limits: Limits = _NO_LIMITS
     """least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"""
@@ -146,17 +139,17 @@ class Vehicle(Frozen):
     """if a low battery (randomize) cannot provide a commanded speed, each: this rotor turns as fast
     as it can; shared: the missing speed is subtracted from all four, as in Crazyflie's firmware
     """
-    physics_step: PositiveFloat = Field(default=MAX_PHYSICS_STEP, le=MAX_PHYSICS_STEP)
+    physics_step: Quantity = Field(default=MAX_PHYSICS_STEP, le=MAX_PHYSICS_STEP)
     """s; at most 0.0025"""
-    control_step: PositiveFloat = CONTROL_STEP
+    control_step: Quantity = CONTROL_STEP
     """s; a whole number of physics steps"""
     delay: int = Field(default=1, ge=0, le=100)
     """control steps from a command to its effect; or give latency, s, a multiple of control_step"""
-    collision_radius: PositiveFloat
+    collision_radius: Quantity
     """radius of the collision sphere at the centre of mass, m"""
     geometric_gains: GeometricGains | None = Field(default=None, repr=False)
     """gains of the geometric expert, found for this vehicle; without them it derives gains"""
-    time_optimal: dict[PositiveFloat, PositiveFloat] | None = Field(default=None, repr=False)
+    time_optimal: dict[Quantity, Quantity] | None = Field(default=None, repr=False)
     """from distances, m, to least times to rest there, s, as an optimal control finds them"""
 
     @model_validator(mode="before")
@@ -172,8 +165,8 @@ class Vehicle(Frozen):
         if "motor_gain" in data:
             meant = dict.fromkeys(MOTOR_GAINS, data.pop("motor_gain"))
         if "latency" in data:
-            step = check(PositiveFloat, data.get("control_step", CONTROL_STEP), "control_step")
-            latency = check(NonNegativeFloat, data.pop("latency"), "latency")
+            step = check(Quantity, data.get("control_step", CONTROL_STEP), "control_step")
+            latency = check(NonNegative, data.pop("latency"), "latency")
             meant["delay"] = _delay(latency, step)
         given = {key: data.pop(key) for key in NamedLayout.model_fields if key in data}
         if given:
@@ -230,6 +223,17 @@ class Vehicle(Frozen):
             raise ValueError(
                 "rotor_positions: these rotors cannot give thrust, roll, pitch and yaw "
                 "independently"
+            )
+        ratios = self.gyration_ratios
+        if ratios.min() < GYRATION_RATIOS[0] or ratios.max() > GYRATION_RATIOS[1]:
+            raise ValueError(
+                f"inertia {list(self.inertia)}: has nothing in common with a mass of {self.mass:g} "
+                f"kg and rotors {self.arm_length:g} m from the centre; is it in kg m²?"
+            )
+        if not 1.0 < self.hover_rotor_speed < LARGEST:
+            raise ValueError(
+                f"thrust_coefficient {self.thrust_coefficient:g}: rotors would hover at "
+                f"{self.hover_rotor_speed:.3g} rad/s; is it in N s²?"
             )
         shares = self.hover_shares
         if not low < shares.min() <= shares.max() < high:

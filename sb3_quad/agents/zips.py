@@ -24,6 +24,7 @@ from sb3_quad.agents.pickles import read_pickle
 from sb3_quad.agents.pretrained import pretrained_names
 from sb3_quad.algorithms.statistics import STATISTICS
 from sb3_quad.base.errors import ConfigError, did_you_mean, raised_as
+from sb3_quad.base.files import read_bytes
 from sb3_quad.base.process import trusted
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
@@ -145,9 +146,7 @@ def _read_file(path: Path) -> io.BytesIO:
         guess = did_you_mean(path, pretrained_names())
         problem = f"model {path}: no such file, or no agent in this folder; {guess}"
         raise ConfigError(problem.rstrip("; "))
-    if path.stat().st_size > _LARGEST:
-        raise ConfigError(f"{path}: is larger than {_LARGEST:,} bytes")
-    return io.BytesIO(path.read_bytes())
+    return io.BytesIO(read_bytes(path, _LARGEST))
 
 
 def _open(source: StrPath | io.BytesIO) -> zipfile.ZipFile:

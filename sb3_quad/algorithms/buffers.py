@@ -1,6 +1,6 @@
 """Buffers with an expert's actions: SB3's rollout buffer, and DAgger's dataset."""
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -13,6 +13,10 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_arrays, write_arrays
 from sb3_quad.base.types import AnyArray, Arrays, Float32Array, IntArray, StrDict, StrPath
+
+# Names of arrays in files; Stable-Baselines 2 and imitation use the shorter ones.
+_OBSERVATIONS = ("observations", "obs")
+_ACTIONS = ("actions", "acts")
 
 
 class Batch(NamedTuple):
@@ -79,7 +83,8 @@ class ExpertRolloutBuffer(RolloutBuffer):
         :param shuffle: whether they are in random order. False: consecutive in time, that is the
             first step of all environments, then the second.
         """
-        assert self.full, "the rollout is not complete"
+        if not self.full:
+            raise ValueError("the rollout is not complete")
         n_rows = self.buffer_size * self.n_envs
         if shuffle:
             rows = np.random.permutation(n_rows)  # noqa: NPY002 - as SB3 does, bit for bit
@@ -187,31 +192,28 @@ class AggregatedDataset:
         """Replace the present pairs with those of recorded flights.
 
         :param source: an ``.npz`` file with the arrays ``observations`` and ``actions``, as
-            :meth:`save` and ``fly(..., record=...)`` write them, or ``obs`` and ``acts``; or
-            several flights, each with arrays of these names: a Minari dataset, or a list of
-            trajectories of imitation. A flight may have one observation more than actions, its
-            last.
+            :meth:`save` and ``fly(..., record=...)`` write them, or ``obs`` and ``acts``, of one
+            flight or (flights, steps, …); or several flights, each with arrays of these names: a
+            Minari dataset, or a list of trajectories of imitation. A flight may have one
+            observation more than actions, its last.
         :raises ConfigError: a file that is missing or damaged, belongs to other spaces, or has more
             pairs than ``capacity``; the present pairs are kept.
         """
         where = type(source).__name__
         if isinstance(source, (str, Path)):
             where = str(source)
-            source = [SimpleNamespace(**read_arrays(source))]
+            source = [SimpleNamespace(**read_arrays(source, (*_OBSERVATIONS, *_ACTIONS)))]
         # Start with zero rows of ours, so that concatenating another shape fails.
         seen = [self.observations[:0]]
         acted = [self.actions[:0]]
         # Third-party files may contain anything.
         with raised_as(ConfigError, f"{where}: holds no flights that fit the environment"):
             for flight in source:
-                # imitation uses the shorter names.
-                short = hasattr(flight, "acts")
-                observations = np.asarray(flight.obs if short else flight.observations)
-                actions = np.asarray(flight.acts if short else flight.actions)
-                if len(observations) == len(actions) + 1:
-                    observations = observations[:-1]
-                seen.append(observations)
-                acted.append(actions.reshape(len(actions), -1))
+                for observations, actions in self._flights(flight):
+                    if len(observations) == len(actions) + 1:
+                        observations = observations[:-1]
+                    seen.append(observations)
+                    acted.append(actions.reshape(len(actions), -1))
             observations = np.concatenate(seen, dtype=seen[0].dtype, casting="same_kind")
             actions = np.concatenate(acted, dtype=np.float32)
             if not 0 < len(observations) == len(actions) <= self.capacity:
@@ -219,13 +221,38 @@ class AggregatedDataset:
                     f"{len(observations)} observations, {len(actions)} actions, room for"
                     f" {self.capacity}"
                 )
-            # This refuses NaN, too, which differs from itself.
-            if (actions != actions.clip(*self.action_range)).any():
-                raise ValueError(f"actions from {actions.min():g} to {actions.max():g}")
+            valid = actions.clip(*self.action_range)
+            # This refuses NaN, too, but not what rounding leaves.
+            if not np.allclose(actions, valid, rtol=0.0, atol=1e-6):
+                low, high = actions.min(), actions.max()
+                raise ValueError(f"actions from {low:.9g} to {high:.9g}, beyond the valid ones")
             if not np.isfinite(observations).all():
                 raise ValueError("observations that are not finite")
         self.clear()
-        self.add(observations, actions)
+        self.add(observations, valid)
+
+    def _flights(self, flight: Any) -> Iterator[tuple[AnyArray, AnyArray]]:
+        """Yield the observations and the actions of a flight, or of several, (flights, steps, …).
+
+        :raises ValueError: an array is missing.
+        """
+        observations = _first(flight, _OBSERVATIONS)
+        actions = _first(flight, _ACTIONS)
+        if observations.ndim > self.observations.ndim:
+            yield from zip(observations, actions, strict=True)
+        else:
+            yield observations, actions
+
+
+def _first(flight: Any, names: Sequence[str]) -> AnyArray:
+    """Return the array that has one of the names.
+
+    :raises ValueError: there is none.
+    """
+    for name in names:
+        if hasattr(flight, name):
+            return np.asarray(getattr(flight, name))
+    raise ValueError(f"lacks {' or '.join(names)}")
 
 
 def sample_rows(

@@ -50,6 +50,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
             "compiled code cannot be cached and is compiled at every start, for a minute or so;"
             " set NUMBA_CACHE_DIR to a folder"
         )
+        _Notice.kept = ""
     else:
         cache_file = dispatcher._cache._cache_file
         cache_file._source_stamp = _source_stamp(function.__module__)
@@ -112,6 +113,8 @@ inlined = compiled(inline="always")
 class _Notice(event.Listener):
     """Says when the outermost function begins to compile, and how long it took."""
 
+    kept = "; it is kept for later runs"
+
     def __init__(self) -> None:
         self._depth = 0
         self._start = 0.0
@@ -119,9 +122,7 @@ class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
         if self._depth == 0:
             self._start = time.perf_counter()
-            print_once(
-                "compiling once, a minute or so if a core is idle; it is kept for later runs"
-            )
+            print_once(f"compiling once, a minute or so if a core is idle{self.kept}")
         self._depth += 1
 
     def on_end(self, event: event.Event) -> None:

@@ -1,6 +1,7 @@
 """Files that appear whole or not at all, with a clear error if a folder cannot be written to."""
 
 import os
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,6 +14,10 @@ from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import StrDict, StrPath
 
 LOCK = ".lock"
+# The largest text that is read, and what the arrays of a file may take, in bytes. A file that is
+# larger than the latter may take a few times its size, since it may be compressed.
+LARGEST_TEXT = 5_000_000
+LARGEST_ARRAYS = 2**27
 
 
 @contextmanager
@@ -31,7 +36,9 @@ def replacing(path: StrPath) -> Iterator[BinaryIO]:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with temporary.open("wb") as stream:
+            # Through a link of this name, the target would be written to.
+            temporary.unlink(missing_ok=True)
+            with temporary.open("xb") as stream:
                 yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -101,33 +108,63 @@ def write_arrays(path: StrPath, compressed: bool = False, **arrays: Any) -> None
         save(stream, **arrays)
 
 
-def read_arrays(path: StrPath, prefix: str = "") -> StrDict:
-    """Return the arrays of an ``.npz`` file whose names begin with ``prefix``.
+def read_arrays(path: StrPath, prefix: str | tuple[str, ...] = "") -> StrDict:
+    """Return the arrays of an ``.npz`` file whose names begin with ``prefix``, or with one of them.
 
     Arrays with other names are not even read.
 
-    :raises ConfigError: A missing or damaged file.
+    :raises ConfigError: A missing or damaged file, or one that takes far more memory than it says.
     """
+    file = regular_file(path)
     # A damaged archive may raise anything, depending on where the damage is.
     with (
         raised_as(ConfigError, f"{path}: cannot be read"),
-        np.load(path, allow_pickle=False) as file,
+        zipfile.ZipFile(file) as archive,
+        np.load(file, allow_pickle=False) as arrays,
     ):
-        return {name: file[name] for name in file.files if name.startswith(prefix)}
+        size = sum(part.file_size for part in archive.infolist())
+        if size > max(LARGEST_ARRAYS, 4 * file.stat().st_size):
+            raise ValueError(f"its arrays take {size:,} bytes")
+        return {name: arrays[name] for name in arrays.files if name.startswith(prefix)}
+
+
+def regular_file(path: StrPath) -> Path:
+    """Return the path of a file that exists.
+
+    :raises ConfigError: There is none, or it is a folder, or a device or pipe, which may never end.
+    """
+    file = Path(path)
+    if not file.is_file():
+        problem = "no such file"
+        if file.exists():
+            problem = "cannot be read, since it is a folder, a device or a pipe"
+        raise ConfigError(f"{path}: {problem}")
+    return file
+
+
+def read_bytes(path: StrPath, most: int = LARGEST_TEXT) -> bytes:
+    """Return the content of a file.
+
+    :param most: The largest size, in bytes.
+    :raises ConfigError: See :func:`regular_file`; it is larger, or cannot be read.
+    """
+    file = regular_file(path)
+    size = file.stat().st_size
+    if size > most:
+        raise ConfigError(f"{path}: is larger than {most:,} bytes")
+    with raised_as(ConfigError, f"{path}: cannot be read"), file.open("rb") as stream:
+        # Some files of Linux never end, although their size is 0.
+        return stream.read(size)
 
 
 def read_text(path: StrPath) -> str:
     """Return the text of a file.
 
-    :raises ConfigError: It is missing or cannot be read.
+    :raises ConfigError: See :func:`read_bytes`; or it is not UTF-8.
     """
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        # ValueError: the content is not UTF-8, or the path holds a null character.
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    content = read_bytes(path)
+    with raised_as(ConfigError, f"{path}: cannot be read"):
+        return content.decode("utf-8")
 
 
 def refuse_existing(path: StrPath, overwrite: bool) -> None:
@@ -139,6 +176,32 @@ def refuse_existing(path: StrPath, overwrite: bool) -> None:
         raise ConfigError(f"{path}: is a folder; name a file")
     if Path(path).exists() and not overwrite:
         raise ConfigError(f"{path}: exists already; name another file, or add --overwrite")
+
+
+def refuse_outside(path: StrPath, where: str, *folders: Path) -> None:
+    """Refuse a path, which may be a stranger's, that is in none of the folders.
+
+    :param where: What the message calls the path.
+    :raises ConfigError: It is elsewhere: an absolute path, by ``..``, or through a link.
+    """
+    # It may hold a null character, or be a link to itself.
+    with raised_as(ConfigError, f"{where}: {str(path)!r} cannot be used"):
+        place = Path(path).resolve()
+        outside = not any(place.is_relative_to(folder.resolve()) for folder in folders)
+    if outside:
+        raise ConfigError(
+            f"{where}: {path} is outside of {' and '.join(map(str, folders))}, where alone files "
+            "of strangers may write"
+        )
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder with links that lead out of it, through which a command would write.
+
+    :raises ConfigError: There is one.
+    """
+    for path in folder.rglob("*"):
+        refuse_outside(path, str(folder), folder)
 
 
 def make_folder(path: StrPath, what: str, flag: str) -> None:

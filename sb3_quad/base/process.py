@@ -12,11 +12,15 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
+from sb3_quad.base.errors import ConfigError
+
 # A closed terminal sends SIGHUP. Windows has no such signal.
 _SIGHUP: "signal.Signals | None" = getattr(signal, "SIGHUP", None)
 _FROM_THE_TERMINAL = [number for number in (signal.SIGINT, _SIGHUP) if number is not None]
 SIGNALS = (*_FROM_THE_TERMINAL, signal.SIGTERM)
 TRUST_VARIABLE = "SB3_QUAD_TRUST"
+_YES = ("1", "true", "yes", "on")
+_NO = ("", "0", "false", "no", "off")
 
 _most_cpus = sys.maxsize
 
@@ -119,8 +123,14 @@ def available_cpus() -> int:
 
 
 def trusted() -> bool:
-    """Whether files may run their own code: after ``--trust``, or by ``SB3_QUAD_TRUST=1``."""
-    return os.environ.get(TRUST_VARIABLE, "").lower() in ("1", "true", "yes")
+    """Whether files may run their own code: after ``--trust``, or by ``SB3_QUAD_TRUST=1``.
+
+    :raises ConfigError: the variable is neither yes nor no.
+    """
+    value = os.environ.get(TRUST_VARIABLE, "").lower()
+    if value not in (*_YES, *_NO):
+        raise ConfigError(f"{TRUST_VARIABLE}={value!r}: must be 1 to trust files, or 0")
+    return value in _YES
 
 
 @contextmanager

@@ -15,6 +15,8 @@ from pydantic import (
     PydanticUserError,
     TypeAdapter,
     ValidationError,
+    ValidationInfo,
+    field_validator,
     model_validator,
 )
 
@@ -28,6 +30,11 @@ Count = Annotated[int, Field(ge=1)]
 Natural = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0)]
+# A quantity of a vehicle in SI units. None is larger or smaller, and ratios of their squares do not
+# overflow.
+LARGEST = 1e6
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Quantity = Annotated[float, Field(ge=1e-12, le=LARGEST)]
 _EXPECTED = {
     "callable": "a number or lin_<number>",
     "float": "a number",
@@ -36,6 +43,10 @@ _EXPECTED = {
 """What a value must be, by the kind of pydantic's error; the first that applies."""
 # Names of a union's alternatives in the place of an error: `int`, `list[str]`, `Vehicle`
 _ALTERNATIVE = re.compile(r"int|float|str|bool|none|literal|[A-Z]\w+|.*[\[(].*")
+# Annotations that take true and false
+_TAKES_BOOL = re.compile("bool|Any")
+# The most keys that a line names
+_MOST_NAMED = 20
 _CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -47,6 +58,16 @@ class Frozen(BaseModel):
     )
     short_keys: ClassVar[tuple[str, ...]] = ()
     """keys that a subclass replaces by fields before this class sees them"""
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _true_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse true and false for numbers, which pydantic would read as 1 and 0."""
+        if _holds_bool(value):
+            kind = cls.model_fields[str(info.field_name)].annotation
+            if not _TAKES_BOOL.search(str(kind)):
+                raise ValueError("true and false are not numbers")
+        return value
 
     @model_validator(mode="before")
     @classmethod
@@ -65,6 +86,13 @@ class Frozen(BaseModel):
         for name, value in super().__repr_args__():
             if name is None or value != type(self).model_fields[name].default:
                 yield name, value
+
+
+def _holds_bool(value: Any) -> bool:
+    """Whether a value is true or false, or a list with one of them."""
+    if isinstance(value, (list, tuple)):
+        return any(map(_holds_bool, value))
+    return isinstance(value, bool)
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
@@ -164,4 +192,4 @@ def explain(error: ValidationError) -> str:
             text = f"{key}: {text}"
         # Each alternative of a union has its own errors. Only those of the first one are shown.
         lines.setdefault(key, text)
-    return "; ".join(lines.values())
+    return "; ".join([*lines.values()][:_MOST_NAMED])

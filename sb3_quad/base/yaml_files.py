@@ -1,6 +1,7 @@
 """YAML files, by the name of one that comes with the package, or by path."""
 
 import os
+from collections import Counter
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,9 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text, write_text
 from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
+
+# The most characters of a text, which take a few seconds
+LONGEST = 100_000
 
 
 class Loader(yaml.SafeLoader):
@@ -27,9 +31,10 @@ class Loader(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
-        keys = [key.value for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
+        # A key may also be a list.
+        keys = Counter(key.value for key, _ in node.value if isinstance(key.value, str))
+        for key, times in keys.items():
+            if times > 1:
                 raise yaml.YAMLError(f"{key}: given twice{node.start_mark}")
         return node
 
@@ -60,6 +65,8 @@ def parse_keys(text: str, where: str) -> dict[Any, Any]:
 
     :raises ConfigError: The text is not YAML, or holds something else. The message is one line.
     """
+    if len(text) > LONGEST:
+        raise ConfigError(f"{where}: is longer than {LONGEST:,} characters")
     try:
         content = yaml.load(text, Loader=Loader)
     except Exception as error:

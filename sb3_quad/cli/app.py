@@ -78,6 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True, errors="replace")
     try:
+        _refuse_removed_folder()
         options = _parse(arguments)
         if options is None:
             return 0
@@ -100,6 +101,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         message = str(error) if isinstance(error, SB3QuadError) else _unexpected(error)
         print(f"error: {' '.join(message.split())}", file=sys.stderr)
         return 2
+
+
+def _refuse_removed_folder() -> None:
+    """:raises ConfigError: the current folder no longer exists, and relative paths mean nothing."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise ConfigError("the current folder was removed; go to another one with cd") from None
 
 
 def _parse(arguments: list[str]) -> Namespace | None:
@@ -131,6 +140,8 @@ def _unexpected(error: BaseException) -> str:
     """Return the message of an exception that no check foresaw, with the place that raised it."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'a file'}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        return "there is not enough memory; take fewer environments or episodes"
     message = f"{type(error).__name__}: {one_line(error)}"
     text = "; ".join([message, *getattr(error, "__notes__", ())])
     last = traceback.extract_tb(error.__traceback__)[-1]

@@ -2,6 +2,7 @@
 folder.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,15 @@ from typing import Any
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError
-from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
+from sb3_quad.base.files import (
+    locked,
+    make_folder,
+    read_text,
+    refuse_existing,
+    refuse_outside,
+    write_arrays,
+    write_text,
+)
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, known_settings
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
@@ -17,7 +26,9 @@ from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
+    FIGURES,
     FLIGHTS,
+    REPORT,
     RESULTS,
     WRITTEN,
     Entry,
@@ -129,12 +140,18 @@ def _flown_before(folder: Path, results: Results, overwrite: bool) -> list[Entry
     :raises ConfigError: the folder holds other results that are not to be overwritten, or damaged
         ones.
     """
+    for pattern in (FLIGHTS, f"{FLIGHTS}/*", FIGURES):
+        for path in folder.glob(pattern):
+            refuse_outside(path, str(folder), folder)
     if not (folder / RESULTS).is_file():
         for name in WRITTEN:
             refuse_existing(folder / name, overwrite)
         return []
     before = load_results(folder)
     if overwrite:
+        pictures: list[str] = []
+        if (folder / REPORT).is_file():
+            pictures = re.findall(rf"\({FIGURES}/([\w.-]+\.png)\)", read_text(folder / REPORT))
         for name in WRITTEN:
             (folder / name).unlink(missing_ok=True)
         # Only files of the results; users may keep other files beside them.
@@ -142,6 +159,8 @@ def _flown_before(folder: Path, results: Results, overwrite: bool) -> list[Entry
         for file in (folder / FLIGHTS).glob("*/*.npz"):
             if file in made:
                 file.unlink()
+        for name in pictures:
+            (folder / FIGURES / name).unlink(missing_ok=True)
         return []
     # Code and files outside of this package may have changed in between.
     may_differ = [record.kind == "factory" for record in results.controllers]

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, FloatArray, StrPath
+from sb3_quad.base.validate import LARGEST
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
-from sb3_quad.envs.simulation.motions import refuse_falling_times, refuse_gaps
+from sb3_quad.envs.simulation.motions import read_table, refuse_falling_times, refuse_gaps
 from sb3_quad.envs.simulation.physics import quaternion_product
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import (
@@ -38,6 +39,10 @@ WARM_UP = 0.5
 LEAST_HEIGHT = 0.3
 # Longer gaps between rows are not filled, s
 LONGEST_GAP = 0.05
+# Below this, m/s or rad/s, velocities and rates are noise
+LEAST_MOTION = 0.2
+# Products of what is measured and what it should be, by the squares of the larger one
+LEAST_AGREEMENT = 0.1
 # Clock offsets that are tried, s
 OFFSETS = np.arange(-0.1, 0.1005, 0.001)
 # Thrust of a motor, N, as coefficients of the powers of its voltage, from the 0th:
@@ -86,8 +91,7 @@ def read_logs(folder: StrPath, step: float) -> list[Log]:
 def read_log(path: Path, step: float) -> Log:
     """Read one log, see :func:`read_logs`."""
     measured = ["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS]
-    with raised_as(ConfigError, f"{path}: not a table of numbers"):
-        table = pd.read_csv(path).astype(float)
+    table = read_table(path)
     commands = THRUSTS if THRUSTS[0] in table else [*PWM, BATTERY]
     missing = {*measured, *commands} - {*table}
     if missing:
@@ -98,14 +102,20 @@ def read_log(path: Path, step: float) -> Log:
     refuse_gaps(path, table[measured])
     time = table["t"]
     refuse_falling_times(path, time)
+    _refuse_unlikely(path, table[measured])
     if commands is not THRUSTS:
         table[THRUSTS] = motor_thrusts(table[PWM].to_numpy(), table[[BATTERY]].to_numpy())
+    numbers = table[[*measured[1:], *THRUSTS]]
+    for row, column in np.argwhere(numbers.abs().to_numpy() > LARGEST):
+        raise ConfigError(f"{path}: row {row + 1}: {numbers.columns[column]} is too large")
     # q and -q are the same attitude, but interpolation between them would pass through others.
     quaternions = table[CAPTURE_COLUMNS[QUATERNION]]
     cosines = (quaternions * quaternions.shift()).sum(axis=1)
     signs = np.where(cosines < 0.0, -1.0, 1.0).cumprod()
     table[CAPTURE_COLUMNS[QUATERNION]] = quaternions.mul(signs, axis=0)
     grid = np.arange(time.iloc[0], time.iloc[-1], step)
+    if len(grid) * step < WARM_UP + HORIZONS[-1]:
+        raise ConfigError(f"{path}: is shorter than {WARM_UP + HORIZONS[-1]:g} s")
 
     def resampled(names: list[str], behind: float = 0.0) -> FloatArray:
         return np.stack([np.interp(grid + behind, time, table[name]) for name in names], axis=1)
@@ -130,6 +140,10 @@ def read_log(path: Path, step: float) -> Log:
 
     offset = float(min(OFFSETS, key=disagreement))
     motion[:, BODY_RATES] = resampled(GYRO_COLUMNS, offset)
+    _refuse_unlike(path, GYRO_COLUMNS, motion[flying, BODY_RATES], rates)
+    speeds = np.gradient(motion[:, POSITION], step, axis=0)[flying]
+    names = CAPTURE_COLUMNS[VELOCITY]
+    _refuse_unlike(path, names, motion[flying, VELOCITY], speeds)
 
     thrusts = resampled(THRUSTS, offset)
     flying &= np.isfinite(thrusts).all(axis=1)
@@ -139,8 +153,41 @@ def read_log(path: Path, step: float) -> Log:
         x, y, z = np.einsum("nji,nj->ni", rotation, force)[flying].mean(axis=0)
         motion[:, QUATERNION] = rotated_by(attitude, np.array([[-y / z, x / z, 0.0]]))
         mean = thrusts[flying].mean(axis=0)
+        if mean.min() <= 0.0:
+            raise ConfigError(f"{path}: motor M{mean.argmin() + 1} pushes with {mean.min():.3g} N")
         thrusts *= mean.mean() / mean
     return Log(path, motion, thrusts, flying, offset)
+
+
+def _refuse_unlikely(path: Path, table: pd.DataFrame) -> None:
+    """Refuse a log whose times or attitudes cannot be those of a flight in SI units.
+
+    :raises ConfigError: the message names the column.
+    """
+    apart = np.ptp(table["t"]) / len(table)
+    if apart > LONGEST_GAP:
+        raise ConfigError(
+            f"{path}: rows are {apart:.3g} s apart on average, where {LONGEST_GAP:g} s is the "
+            "longest gap; is t in s?"
+        )
+    norms = np.linalg.norm(table[CAPTURE_COLUMNS[QUATERNION]], axis=1)
+    worst = np.abs(norms - 1.0).argmax()
+    if not 0.9 < norms[worst] < 1.1:
+        raise ConfigError(f"{path}: row {worst + 1}: qw, qx, qy, qz have length {norms[worst]:.3g}")
+
+
+def _refuse_unlike(path: Path, names: list[str], measured: FloatArray, other: FloatArray) -> None:
+    """Refuse columns (n, 3) that have another unit, sign or axis than what others say.
+
+    :raises ConfigError: the message names the column.
+    """
+    for name, own, expected in zip(names, measured.T, other.T, strict=True):
+        larger = max(own @ own, expected @ expected)
+        # What follows from an attitude is noisy.
+        if own @ expected < LEAST_AGREEMENT * larger and larger > len(own) * LEAST_MOTION**2:
+            raise ConfigError(
+                f"{path}: {name} contradicts the motion; check units, axes and the order of columns"
+            )
 
 
 def motor_thrusts(pwm: FloatArray, battery: FloatArray) -> FloatArray:
@@ -192,7 +239,10 @@ def open_loop(
     flights = [pd.Series(log.flying).rolling(length).sum().shift(-ends[-1]) for log in logs]
     rows = np.flatnonzero(np.concatenate(flights) == length)[::stride]
     if rows.size == 0:
-        raise ConfigError(f"no log flies above {LEAST_HEIGHT:g} m for {WARM_UP + HORIZONS[-1]:g} s")
+        raise ConfigError(
+            f"no log flies above {LEAST_HEIGHT:g} m for {WARM_UP + HORIZONS[-1]:g} s with commands "
+            "for all motors; does pz point up?"
+        )
     record = np.concatenate([log.motion for log in logs])
     thrusts = np.concatenate([log.thrusts for log in logs])
     actions = vehicle.thrust_to_action(np.nan_to_num(thrusts))

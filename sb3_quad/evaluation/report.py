@@ -13,11 +13,9 @@ from sb3_quad.base.types import StrPath
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import CAPTION, group_table, scenario_groups
 from sb3_quad.evaluation.plots import paths_plot, save_figure, success_plot
-from sb3_quad.evaluation.results import REPORT, Results, load_results
+from sb3_quad.evaluation.results import FIGURES, REPORT, Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_name
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-
-FIGURES = "figures"
 
 
 def write_report(folder: StrPath) -> Path:

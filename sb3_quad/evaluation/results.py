@@ -13,10 +13,11 @@ import re
 from collections.abc import Iterable
 from itertools import count
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
+from pydantic import FailFast
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
@@ -31,6 +32,7 @@ EPISODES = "episodes.csv"
 FLIGHTS = "flights"
 # Files that are removed together with the results; a report writes the last two.
 REPORT = "report.md"
+FIGURES = "figures"
 WRITTEN = (RESULTS, EPISODES, REPORT)
 # Names of the columns of episodes.csv, for arrays of several numbers
 _START = "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z"
@@ -78,10 +80,10 @@ class Results(Frozen):
     source: str = "published"
     """where the scenarios' published metrics come from"""
     package_version: str
-    controllers: list[ControllerRecord]
-    scenarios: list[Scenario]
-    entries: list[Entry] = []
-    failures: list[str] = []
+    controllers: Annotated[list[ControllerRecord], FailFast()]
+    scenarios: Annotated[list[Scenario], FailFast()]
+    entries: Annotated[list[Entry], FailFast()] = []
+    failures: Annotated[list[str], FailFast()] = []
     """controller, scenario, and what went wrong, in one line each"""
 
     @property

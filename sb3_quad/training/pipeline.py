@@ -15,7 +15,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, field_va
 
 from sb3_quad.agents.zips import load_zip
 from sb3_quad.base.errors import ConfigError, TrainingError, named
-from sb3_quad.base.files import locked, save_model
+from sb3_quad.base.files import locked, refuse_links, refuse_outside, save_model
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
@@ -40,7 +40,7 @@ from sb3_quad.training.options import (
     DEFAULT_PIPELINE,
     KEPT_BY_STAGES,
 )
-from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_links, refuse_outside
+from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_elsewhere
 from sb3_quad.training.trainer import resume, train
 
 STATUS_FILE = "pipeline.yml"
@@ -279,6 +279,8 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     if not changes.get("tensorboard_log"):
         refuse_outside(options.get("tensorboard_log") or ".", where, log_folder, Path())
     jobs = stage_jobs(Pipeline(stages=stages), options)
+    for job in jobs:
+        refuse_elsewhere(job.config, where, log_folder)
     runs = []
     for name in status.runs:
         refuse_outside(log_folder / name, f"{where}: runs", log_folder)

@@ -12,9 +12,11 @@ from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.agents.zips import saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import make_folder, write_text
+from sb3_quad.base.files import make_folder, refuse_outside, write_text
+from sb3_quad.base.process import trusted
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml, write_yaml
+from sb3_quad.training.config import TrainingConfig
 
 MADE_WITH = ("commit", "versions")  # keys of args.yml
 
@@ -183,27 +185,16 @@ def open_run(path: StrPath) -> RunFolder:
     return RunFolder(folder, configs[0].parent.name)
 
 
-def refuse_outside(path: StrPath, where: str, *folders: Path) -> None:
-    """Refuse a path of a run, which may be a stranger's, that is in none of the folders.
+def refuse_elsewhere(config: TrainingConfig, where: str, log_folder: Path) -> None:
+    """Refuse callbacks and wrappers of a run, which may be a stranger's, that may write elsewhere.
 
-    :param where: what the message calls the path.
-    :raises ConfigError: it is elsewhere: an absolute path, by ``..``, or through a link.
+    :param where: what the message calls the run's settings.
+    :raises ConfigError: one of their keywords is a path out of the log folder and the current one.
     """
-    place = Path(path).resolve()
-    if not any(place.is_relative_to(folder.resolve()) for folder in folders):
-        raise ConfigError(
-            f"{where}: {path} is outside of {' and '.join(map(str, folders))}; "
-            "a run that is resumed writes only there"
-        )
-
-
-def refuse_links(folder: Path) -> None:
-    """Refuse a folder with links that lead out of it, through which a resumed run would write.
-
-    :raises ConfigError: there is one.
-    """
-    for path in folder.rglob("*"):
-        refuse_outside(path, str(folder), folder)
+    for name, keywords in (*config.callback, *config.env_wrapper, *config.vec_env_wrapper):
+        for value in keywords.values():
+            if isinstance(value, str) and not trusted():
+                refuse_outside(value, f"{where}: {name}", log_folder, Path())
 
 
 def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:

@@ -30,7 +30,16 @@ from sb3_quad.algorithms.common import flight_settings_of
 from sb3_quad.algorithms.labelling import Labeller
 from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes, write_text
+from sb3_quad.base.files import (
+    locked,
+    make_folder,
+    one_line,
+    refuse_links,
+    refuse_outside,
+    save_model,
+    write_bytes,
+    write_text,
+)
 from sb3_quad.base.imports import require
 from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
@@ -49,8 +58,7 @@ from sb3_quad.training.runs import (
     claim_run,
     made_with,
     open_run,
-    refuse_links,
-    refuse_outside,
+    refuse_elsewhere,
 )
 from sb3_quad.training.snapshots import load_snapshot
 
@@ -124,8 +132,9 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     for name in ("algo", "env", "env_kwargs", *MADE_WITH):
         options.pop(name, None)
     job = validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
+    log_folder = run.path.absolute().parent.parent
+    refuse_elsewhere(config, str(run.config), log_folder)
     if job.tensorboard_log and not changes.get("tensorboard_log"):
-        log_folder = run.path.absolute().parent.parent
         refuse_outside(job.tensorboard_log, str(run.arguments), log_folder, Path())
     with (
         StopSignals() as signals,
@@ -305,7 +314,7 @@ class _Training:
             finally:
                 # From here on, no signal interrupts what is saved.
                 self.signals.hold()
-        except (Exception, KeyboardInterrupt) as error:
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
             if not self.signals.received:
                 self._save_after(error)
                 raise

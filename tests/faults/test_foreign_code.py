@@ -167,12 +167,15 @@ def test_trust_ends_with_the_command_and_has_to_be_meant(monkeypatch):
     main([*export, "--trust"])
     assert MARK.exists()
     MARK.unlink()
-    for value in ("false", "no", "0", "", " "):
+    for value in ("false", "no", "0", "", " ", "off", "00", "maybe"):
         monkeypatch.setenv("SB3_QUAD_TRUST", value)
         assert main(export) == 2
     assert not MARK.exists()
-    monkeypatch.setenv("SB3_QUAD_TRUST", "True")
-    assert trusted()
+    with pytest.raises(ConfigError, match="SB3_QUAD_TRUST='maybe'"):
+        trusted()
+    for value in ("True", "on"):
+        monkeypatch.setenv("SB3_QUAD_TRUST", value)
+        assert trusted()
 
 
 def test_no_class_is_changed():
@@ -329,6 +332,7 @@ def test_a_zip_imports_nothing(monkeypatch):
         {"vehicle": {"name": "../outside"}},
         {"vehicle": {"name": "*/ int x; /*"}},
         {"vehicle": {"name": "two\nlines"}},
+        {"vehicle": {"name": "two\u2028lines"}},
     ],
 )
 def test_a_zip_names_no_file_of_this_machine(change):

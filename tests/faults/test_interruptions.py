@@ -4,6 +4,7 @@ nothing twice.
 
 import shutil
 import signal
+import sys
 
 import numpy as np
 import pytest
@@ -128,6 +129,24 @@ def test_the_traceback_of_an_unexpected_error_is_kept_until_the_run_is_resumed(
     assert traceback.read_text().endswith("RuntimeError: the simulation failed\n")
     # It has the same files.
     assert the_same(resume(str(broken), quiet).run, whole)
+
+
+def test_a_callback_that_leaves_python_leaves_the_model_too(tmp_path):
+    Trouble.what = sys.exit
+    with pytest.raises(SystemExit) as left:
+        train(job(tmp_path), quiet)
+    assert "the model after 800 timesteps is in" in left.value.__notes__[0]
+    assert (tmp_path / "dagger" / f"{ENV}_1" / f"{ENV}.zip").is_file()
+
+
+def test_a_callback_that_raises_at_the_end_leaves_the_finished_model(tmp_path, monkeypatch, whole):
+    monkeypatch.setattr(Trouble, "_on_training_end", lambda self: fail(), raising=False)
+    with pytest.raises(RuntimeError) as failed:
+        train(job(tmp_path), quiet)
+    assert "the model after 1,600 timesteps is in" in failed.value.__notes__[0]
+    path = tmp_path / "dagger" / f"{ENV}_1" / f"{ENV}.zip"
+    ours, theirs = (PPO.load(file).get_parameters()["policy"] for file in (path, whole.model))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
 def test_the_seconds_of_the_episodes_continue(broken):

@@ -42,10 +42,10 @@ FLAGS: Flags = {
 def run(options: Namespace) -> int:
     """Train and compare, or list the runs. Returns the exit code."""
     from sb3_quad.base.errors import ConfigError
-    from sb3_quad.base.files import locked, write_text
+    from sb3_quad.base.files import locked, refuse_links, write_text
     from sb3_quad.base.process import trusted
     from sb3_quad.cli.output import console
-    from sb3_quad.training.runs import claim_folder, refuse_links
+    from sb3_quad.training.runs import claim_folder
     from sb3_quad.training.sweep import (
         SWEEPS,
         checked_configurations,
