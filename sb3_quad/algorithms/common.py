@@ -1,7 +1,11 @@
 """The parts that all algorithms with an expert share."""
 
+import math
+import warnings
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any
 
 import gymnasium
@@ -22,7 +26,7 @@ from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statist
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
-from sb3_quad.base.types import Float32Array, StrDict, StrPath
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.base.validate import Share, Weight, check_arguments
 
 RateOrSchedule = Share | Schedule
@@ -48,6 +52,8 @@ _OF_NETWORKS = (
     "use_expln",
     "full_std",
 )
+# A training's first episodes are compared with its last ones if there are at least this many.
+_COMPARED = 50
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 
@@ -65,6 +71,9 @@ class ExpertMixin(BaseAlgorithm):
     expert: ExpertLike | None = None
     # Queries the expert, and keeps a recurrent expert's state.
     _labeller: Labeller | None = None
+    # Return and length of the first and last episodes of each environment
+    _first_episodes: list[list[tuple[float, float]]]
+    _last_episodes: list[deque[tuple[float, float]]]
     # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
 
@@ -176,12 +185,40 @@ class ExpertMixin(BaseAlgorithm):
     def learn(self, *arguments: Any, **keywords: Any) -> Self:
         """Learn as SB3 does. While an accelerator learns, PyTorch has one thread.
 
+        A warning says if the last episodes have far lower returns than the first ones.
+
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
+        kept = math.ceil(_COMPARED / self.n_envs)
+        self._first_episodes = [[] for _ in range(self.n_envs)]
+        self._last_episodes = [deque(maxlen=kept) for _ in range(self.n_envs)]
         if self.env is not None and self.will_clone():
             self._labeller = labeller_for(self.expert, self.env, self._labeller)
         with network_of(self.policy).learning():
-            return super().learn(*arguments, **keywords)  # type: ignore[safe-super]
+            super().learn(*arguments, **keywords)  # type: ignore[safe-super]
+        first, last = (
+            np.array([*chain.from_iterable(rows)]).reshape(-1, 2)
+            for rows in (self._first_episodes, self._last_episodes)
+        )
+        warn_if_worse(type(self).__name__, first, last)
+        return self
+
+    def _update_info_buffer(self, infos: list[StrDict], dones: BoolArray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        if dones is None or not self._shows_in_returns():
+            return
+        for row in np.flatnonzero(dones).tolist():
+            episode = infos[row].get("episode")
+            if episode is None:
+                continue
+            last = self._last_episodes[row]
+            last.append((episode["r"], episode["l"]))
+            if len(self._first_episodes[row]) < (last.maxlen or 0):
+                self._first_episodes[row].append(last[-1])
+
+    def _shows_in_returns(self) -> bool:
+        """Return whether the returns of the present rollout say how well the agent flies."""
+        return True
 
     def _labels(self, env: VecEnv) -> Float32Array:
         """Return the expert's actions for the present states, (n_envs, action_dim).
@@ -225,6 +262,7 @@ class ExpertMixin(BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         # No object of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
+        own += ["_first_episodes", "_last_episodes"]
         return [*super()._excluded_save_params(), *own, *self._not_saved]
 
 
@@ -237,6 +275,32 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(threads)
+
+
+def warn_if_worse(name: str, first: FloatArray, last: FloatArray) -> None:
+    """Warn if the last episodes of a training have far lower returns than its first ones.
+
+    That is, by more than the standard deviation of the first ones plus half of that of the last
+    ones, and by more than a quarter of the first ones' mean. Where the last ones are longer, they
+    may cost more in proportion: the first ones of many environments often end early.
+
+    :param name: what learned.
+    :param first: the return and the length of each episode, (n, 2).
+    :param last: likewise, of the same number of episodes.
+    """
+    if len(first) < _COMPARED:
+        return
+    start, first_length = first.mean(axis=0)
+    end, last_length = last.mean(axis=0)
+    usual = first[:, 0].std() + 0.5 * last[:, 0].std()
+    longer = max(last_length / first_length, 1.0)
+    if end < min(start, longer * start) - max(usual, 0.25 * abs(start)):
+        warnings.warn(
+            f"{name}: the training ends far below its start: the mean reward of the last"
+            f" {len(last)} episodes is {end:.3g}, that of the first ones was {start:.3g}; keep"
+            " the agent that you had, or lower learning_rate",
+            stacklevel=4,
+        )
 
 
 def model_of(source: BaseAlgorithm | StrPath | None) -> Any:
