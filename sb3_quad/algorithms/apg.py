@@ -20,7 +20,13 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import ExpertMixin, RateOrSchedule, model_of, policy_arguments
+from sb3_quad.algorithms.common import (
+    ExpertMixin,
+    History,
+    RateOrSchedule,
+    model_of,
+    policy_arguments,
+)
 from sb3_quad.algorithms.networks import network_of
 from sb3_quad.algorithms.soap import SOAP
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
@@ -31,12 +37,12 @@ from sb3_quad.base.validate import Count, Weight
 # step moves the mean actions further than this. Ordinary ones reach 3, and 0.03 at a rate of 5e-3.
 COST_RISE = 6.0
 ACTION_CHANGE = 0.2
-# Decay of the usual change of the cost between two updates; what it begins with, and what it is at
-# least, as shares of the cost
-CHANGE_DECAY = 0.9
-FIRST_CHANGE, LEAST_CHANGE = 0.05, 0.02
-# The least cost is forgotten slowly, since each update has other starts.
-LEAST_DECAY = 0.98
+# What the usual change of the cost between two updates begins with, and what it is at least, as
+# shares of the cost
+FIRST_CHANGE = 0.05
+LEAST_CHANGE = 0.02
+# Share of the least cost that an update forgets, since each one has other starts
+FORGOTTEN = 0.02
 # The mean actions are compared at every so many recorded steps.
 COMPARED = 16
 
@@ -94,7 +100,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     An update is undone if its cost lies far above the least so far (by more than 6 times the usual
     change between two updates), or if its step moves the mean actions over the recorded
     observations by more than 0.2 (root mean square). A warning says so, the best weights come back,
-    and the optimiser begins anew at half the learning rate. The least cost is forgotten slowly,
+    and the optimiser begins again at half the learning rate. The least cost is forgotten slowly,
     since each update has other starts. If the best weights then fly as badly, the task has become
     harder, and the rate is what it was. With ``continue_flights`` the cost depends on where the
     windows begin, so only the step is judged.
@@ -145,10 +151,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     # The least cost so far, whose weights are in the optimiser's state; None: the next one
     _least_cost: float | None = None
     _last_cost = 0.0
-    _cost_change = 0.0
+    _usual_change = 0.0
     # If the best weights cost more than this when they are back, they are not to blame.
     _blamed_cost = np.inf
-    _rate_factor = 1.0
     _n_undone = 0
 
     def __init__(
@@ -280,8 +285,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         network = network_of(self.policy)
         self._recorded_policy = network.recorded(self.n_steps, self.n_envs)
         if reset_num_timesteps:
-            self._least_cost, self._cost_change, self._blamed_cost = None, 0.0, np.inf
-            self._rate_factor, self._n_undone = 1.0, 0
+            self._least_cost = None
+            self._usual_change = 0.0
+            self._n_undone = 0
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
@@ -335,12 +341,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         optimizer = self.policy.optimizer
         self._update_learning_rate(optimizer)
+        for group in optimizer.param_groups:
+            group["lr"] *= 0.5**self._n_undone
         cost = self._tape.begin()
         rise = self._cost_rise(cost)
-        history = {"cost": [cost], "cost_rise": [rise]}
+        history: History = {"cost": [cost], "cost_rise": [rise]}
         if COST_RISE < rise < np.inf:
-            self._undo(f"the cost of {cost:.3g} is far above the least so far")
-            self._log_update(history | {"n_undone": [self._n_undone]})
+            self._undo(f"the cost of {cost:.3g} is far above the least so far", history)
             return
 
         # Autograd adds to gradients that the critic or an earlier update has left.
@@ -366,17 +373,11 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             for weights, best in zip(learnt, before, strict=True):
                 optimizer.state[weights]["best"] = best
         change = self._action_change()
-        if change > ACTION_CHANGE:
-            self._undo(f"a step changed the mean actions by {change:.3g}")
-
         history |= {"gradient_norm": [float(norm)], "action_change": [change]}
-        self._log_update(history | {"n_undone": [self._n_undone]})
-
-    def _update_learning_rate(self, optimizers: Any) -> None:
-        super()._update_learning_rate(optimizers)
-        for group in optimizers.param_groups:
-            group["lr"] *= self._rate_factor
-        self.logger.record("train/learning_rate", optimizers.param_groups[0]["lr"])
+        if change > ACTION_CHANGE:
+            self._undo(f"a step changed the mean actions by {change:.3g}", history)
+        else:
+            self._log_update(history | {"n_undone": [self._n_undone]})
 
     def _cost_rise(self, cost: float) -> float:
         """Return how far an update's cost lies above the least so far, in usual changes.
@@ -385,23 +386,21 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         """
         cost *= self.n_steps / float(np.mean(self._tape.episodes()[1]))
         if self._least_cost is None or self.continue_flights:
-            if cost > self._blamed_cost:
-                self._rate_factor *= 2.0
+            self._n_undone -= cost > self._blamed_cost
             self._blamed_cost = np.inf
             self._least_cost = self._last_cost = cost
-            self._cost_change = max(self._cost_change, FIRST_CHANGE * abs(cost))
+            self._usual_change = max(self._usual_change, FIRST_CHANGE * abs(cost))
             return 0.0
         above = cost - self._least_cost
-        usual = max(self._cost_change, LEAST_CHANGE * abs(self._least_cost), 1e-12)
-        rise = above / usual
-        if rise > COST_RISE:
+        usual = max(self._usual_change, LEAST_CHANGE * abs(self._least_cost), 1e-12)
+        if above > COST_RISE * usual:
             self._blamed_cost = cost - 0.5 * above
         else:
             change = abs(cost - self._last_cost)
-            self._cost_change += (1.0 - CHANGE_DECAY) * (change - self._cost_change)
-            self._least_cost += above if above < 0.0 else (1.0 - LEAST_DECAY) * above
+            self._usual_change += 0.1 * (change - self._usual_change)
+            self._least_cost += above if above < 0.0 else FORGOTTEN * above
             self._last_cost = cost
-        return rise
+        return above / usual
 
     def _action_change(self) -> float:
         """Return how far the last step moved the mean actions, as a root mean square."""
@@ -409,21 +408,21 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         change = network_of(self.policy).means(observations) - actions
         return float(np.sqrt(np.square(change).mean()))
 
-    def _undo(self, reason: str) -> None:
-        """Bring the best weights back, and let the optimiser begin anew at half the rate."""
+    def _undo(self, reason: str, history: History) -> None:
+        """Bring the best weights back, and let the optimiser begin again at half the rate."""
         state = self.policy.optimizer.state
         with th.no_grad():
             for weights, kept in state.items():
                 weights.copy_(kept.get("best", weights))
         state.clear()
-        # The next update measures these weights anew, in case that the task has changed.
+        # The next update measures these weights again, in case that the task has changed.
         self._least_cost = None
-        self._rate_factor /= 2.0
         self._n_undone += 1
+        self._log_update(history | {"n_undone": [self._n_undone]})
         warnings.warn(
             f"APG after {self.num_timesteps:,} timesteps: {reason}; the best weights are back, and"
             " the learning rate is halved",
-            stacklevel=2,
+            stacklevel=3,
         )
 
     def _limited(self, gradients: FloatArray) -> FloatArray:

@@ -1,11 +1,8 @@
 """The parts that all algorithms with an expert share."""
 
-import math
 import warnings
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain
 from typing import Any
 
 import gymnasium
@@ -52,8 +49,8 @@ _OF_NETWORKS = (
     "use_expln",
     "full_std",
 )
-# A training's first episodes are compared with its last ones if there are at least this many.
-_COMPARED = 50
+# The first episodes of environments are compared with their last ones if there are this many.
+_COMPARED = 10
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 
@@ -71,9 +68,9 @@ class ExpertMixin(BaseAlgorithm):
     expert: ExpertLike | None = None
     # Queries the expert, and keeps a recurrent expert's state.
     _labeller: Labeller | None = None
-    # Return and length of the first and last episodes of each environment
-    _first_episodes: list[list[tuple[float, float]]]
-    _last_episodes: list[deque[tuple[float, float]]]
+    # Return and length of each environment's first episode and of its last one
+    _first_episodes: dict[int, tuple[float, float]]
+    _last_episodes: dict[int, tuple[float, float]]
     # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
 
@@ -189,32 +186,24 @@ class ExpertMixin(BaseAlgorithm):
 
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
-        kept = math.ceil(_COMPARED / self.n_envs)
-        self._first_episodes = [[] for _ in range(self.n_envs)]
-        self._last_episodes = [deque(maxlen=kept) for _ in range(self.n_envs)]
+        self._first_episodes = {}
+        self._last_episodes = {}
         if self.env is not None and self.will_clone():
             self._labeller = labeller_for(self.expert, self.env, self._labeller)
         with network_of(self.policy).learning():
             super().learn(*arguments, **keywords)  # type: ignore[safe-super]
-        first, last = (
-            np.array([*chain.from_iterable(rows)]).reshape(-1, 2)
-            for rows in (self._first_episodes, self._last_episodes)
-        )
-        warn_if_worse(type(self).__name__, first, last)
+        if len(self._first_episodes) >= _COMPARED:
+            first = np.array([*self._first_episodes.values()])
+            warn_if_worse(type(self).__name__, first, np.array([*self._last_episodes.values()]))
         return self
 
     def _update_info_buffer(self, infos: list[StrDict], dones: BoolArray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
-        if dones is None or not self._shows_in_returns():
-            return
         for row in np.flatnonzero(dones).tolist():
             episode = infos[row].get("episode")
-            if episode is None:
-                continue
-            last = self._last_episodes[row]
-            last.append((episode["r"], episode["l"]))
-            if len(self._first_episodes[row]) < (last.maxlen or 0):
-                self._first_episodes[row].append(last[-1])
+            if episode is not None and self._shows_in_returns():
+                self._last_episodes[row] = (episode["r"], episode["l"])
+                self._first_episodes.setdefault(row, self._last_episodes[row])
 
     def _shows_in_returns(self) -> bool:
         """Return whether the returns of the present rollout say how well the agent flies."""
@@ -286,19 +275,17 @@ def warn_if_worse(name: str, first: FloatArray, last: FloatArray) -> None:
 
     :param name: what learned.
     :param first: the return and the length of each episode, (n, 2).
-    :param last: likewise, of the same number of episodes.
+    :param last: likewise.
     """
-    if len(first) < _COMPARED:
-        return
     start, first_length = first.mean(axis=0)
     end, last_length = last.mean(axis=0)
     usual = first[:, 0].std() + 0.5 * last[:, 0].std()
     longer = max(last_length / first_length, 1.0)
     if end < min(start, longer * start) - max(usual, 0.25 * abs(start)):
         warnings.warn(
-            f"{name}: the training ends far below its start: the mean reward of the last"
-            f" {len(last)} episodes is {end:.3g}, that of the first ones was {start:.3g}; keep"
-            " the agent that you had, or lower learning_rate",
+            f"{name}: the training ends far below its start: the last episodes have a mean reward"
+            f" of {end:.3g}, the first ones had {start:.3g}; keep the agent that you had, or lower"
+            " learning_rate",
             stacklevel=4,
         )
 
