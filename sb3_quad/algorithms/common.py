@@ -11,6 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
@@ -186,8 +187,6 @@ class ExpertMixin(BaseAlgorithm):
 
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
-        self._first_episodes = {}
-        self._last_episodes = {}
         if self.env is not None and self.will_clone():
             self._labeller = labeller_for(self.expert, self.env, self._labeller)
         with network_of(self.policy).learning():
@@ -196,6 +195,11 @@ class ExpertMixin(BaseAlgorithm):
             first = np.array([*self._first_episodes.values()])
             warn_if_worse(type(self).__name__, first, np.array([*self._last_episodes.values()]))
         return self
+
+    def _setup_learn(self, *arguments: Any, **keywords: Any) -> tuple[int, BaseCallback]:
+        self._first_episodes = {}
+        self._last_episodes = {}
+        return super()._setup_learn(*arguments, **keywords)
 
     def _update_info_buffer(self, infos: list[StrDict], dones: BoolArray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
