@@ -44,7 +44,7 @@ LEAST_CHANGE = 0.02
 # Share of the least cost that an update forgets, since each one has other starts
 FORGOTTEN = 0.02
 # The mean actions are compared at every so many recorded steps.
-COMPARED = 16
+COMPARED = 32
 
 
 class Tape(Protocol):
