@@ -203,7 +203,7 @@ class ExpertMixin(BaseAlgorithm):
 
     def _update_info_buffer(self, infos: list[StrDict], dones: BoolArray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
-        for row in np.flatnonzero(dones).tolist():
+        for row in np.flatnonzero([] if dones is None else dones).tolist():
             episode = infos[row].get("episode")
             if episode is not None and self._shows_in_returns():
                 self._last_episodes[row] = (episode["r"], episode["l"])
