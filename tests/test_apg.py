@@ -1,15 +1,19 @@
 """APG: it learns, its zips are stock, it resumes, and what it cannot differentiate is refused."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor
 
 from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv, fly, load_pretrained
 from sb3_quad.agents.zips import load_model, saved_algorithm
+from sb3_quad.algorithms.apg import ACTION_CHANGE
 from sb3_quad.algorithms.networks import network_of
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.envs.flight_cost import flight_cost
@@ -26,7 +30,7 @@ def test_a_clone_becomes_faster_and_survives_more_recoveries():
     env = QuadcopterVecEnv(240, task=TASKS, seed=0)
     clone = DAgger("MlpPolicy", env, expert="geometric", seed=0).learn(240_000)
     env = QuadcopterVecEnv(256, task=TASKS, seed=1)
-    agent = APG("MlpPolicy", env, initial_policy=clone, learning_rate=1e-3, seed=0)
+    agent = APG("MlpPolicy", env, initial_policy=clone, learning_rate=4e-3, seed=0)
     agent.learn(25 * 256 * 300)
     before, after = (fly(model, "target_tracking", 120, seed=3) for model in (clone, agent))
     assert after.survival.mean() > 0.95
@@ -265,3 +269,107 @@ def test_an_own_cost_must_be_given_again(tmp_path):
         with pytest.raises(ConfigError, match="a cost of your own, which no zip holds"):
             APG.load(tmp_path / name, env=env).learn(10)
     APG.load(tmp_path / "default", env=env).learn(10)
+
+
+def effort(flown):
+    return flight_cost(flown) + flown.actions.square().sum(dim=-1)
+
+
+def tracking(**keywords):
+    """Return an agent whose updates change nothing unless it has a learning rate, and its
+    environment.
+    """
+    env = QuadcopterVecEnv(16, task="target_tracking", max_episode_steps=100, seed=0)
+    settings = {"initial_policy": "itm-recovery", "cost": effort, "learning_rate": 0.0}
+    return APG("MlpPolicy", env, n_steps=20, seed=0, **(settings | keywords)), env
+
+
+class At(BaseCallback):
+    """Calls a function before one of the updates."""
+
+    def __init__(self, update, function):
+        super().__init__()
+        self._update = update
+        self._function = function
+
+    def _on_rollout_start(self):
+        self._update -= 1
+        if self._update == -1:
+            self._function(self.model)
+
+    def _on_step(self):
+        return True
+
+
+def spoil(model):
+    """Let the rotors hardly turn."""
+    model.policy.action_net.bias.data -= 2.0
+
+
+UPDATE = 16 * 20
+
+
+def test_weights_that_fly_far_worse_are_replaced_by_the_best_at_half_the_rate():
+    agent, _ = tracking()
+    before = weights(agent)
+    with pytest.warns(UserWarning, match=r"APG after 1,920 .* far above .* rate is halved"):
+        agent.learn(7 * UPDATE, callback=At(5, spoil))
+    assert all(th.equal(a, b) for a, b in zip(before, weights(agent), strict=True))
+    assert agent.logger.name_to_value["train/n_undone"] == 1
+
+
+def test_a_step_that_moves_the_actions_too_far_is_undone():
+    agent, _ = tracking(learning_rate=1.0)
+    before = weights(agent)
+    with pytest.warns(UserWarning, match="a step changed the mean actions by"):
+        agent.learn(UPDATE)
+    assert all(th.equal(a, b) for a, b in zip(before, weights(agent), strict=True))
+    # The rate falls until steps are short enough.
+    with pytest.warns(UserWarning, match="the best weights are back"):
+        agent.learn(20 * UPDATE)
+    assert agent.logger.name_to_value["train/action_change"] < ACTION_CHANGE
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_task_that_becomes_harder_keeps_its_rate(sign):
+    """Costs may be negative."""
+    offset = [0.0]
+    agent, _ = tracking(cost=lambda flown: sign * flight_cost(flown) + offset[0])
+    with pytest.warns(UserWarning, match="far above"):
+        agent.learn(12 * UPDATE, callback=At(5, lambda _: offset.append(offset.pop() + 10.0)))
+    assert agent._n_undone == 0
+
+
+@pytest.mark.parametrize("continue_flights", [False, True])
+def test_an_ordinary_training_is_as_without_the_guard(monkeypatch, continue_flights):
+    """With windows that begin in the hover, and now and then at other starts."""
+
+    def train():
+        settings = {"learning_rate": 1e-3, "cost": None, "continue_flights": continue_flights}
+        agent, _ = tracking(**settings)
+        return weights(agent.learn(8 * UPDATE))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        guarded = train()
+    monkeypatch.setattr(APG, "_cost_rise", lambda self, cost: 0.0)
+    monkeypatch.setattr(APG, "_action_change", lambda self: 0.0)
+    assert all(th.equal(a, b) for a, b in zip(guarded, train(), strict=True))
+
+
+def test_the_best_weights_are_there_after_resuming(tmp_path):
+    def go_on(agent):
+        with pytest.warns(UserWarning, match="the best weights are back"):
+            agent.learn(4 * UPDATE, callback=At(1, spoil), reset_num_timesteps=False)
+        return [*weights(agent), th.tensor([agent._n_undone, agent._least_cost])]
+
+    agent, env = tracking(learning_rate=1e-3)
+    agent.learn(6 * UPDATE)
+    agent.save(tmp_path / "agent")
+    snapshot = env.batch.snapshot()
+    whole = go_on(agent)
+
+    _, env = tracking()
+    resumed = APG.load(tmp_path / "agent", env=env, force_reset=False, cost=effort)
+    env.batch.restore(snapshot)
+    assert all(th.equal(a, b) for a, b in zip(whole, go_on(resumed), strict=True))

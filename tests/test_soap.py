@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3 import PPO
 
 from sb3_quad import APG, QuadcopterVecEnv
-from sb3_quad.algorithms.soap import SOAP
+from sb3_quad.algorithms.soap import REFRESH, SOAP
 from sb3_quad.base.errors import ConfigError
 
 
@@ -48,6 +48,21 @@ def test_it_descends_further_than_adam_where_weights_are_correlated():
     """Over five problems, by the geometric mean, which is about 0.43; single ones vary a lot."""
     ratios = [least(SOAP, seed) / least(th.optim.Adam, seed) for seed in range(5)]
     assert th.tensor(ratios).log().mean().exp() < 0.9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_first_change_of_bases_does_not_lengthen_the_update(seed):
+    """Where gradients are large in a few directions, and each spans some others."""
+    th.manual_seed(seed)
+    weights = th.zeros(16, 32, requires_grad=True)
+    optimizer = SOAP([weights])
+    lengths = []
+    for _ in range(REFRESH):
+        before = weights.detach().clone()
+        weights.grad = th.logspace(0.0, -3.0, 16)[:, None] * th.randn(16, 4) @ th.randn(4, 32)
+        optimizer.step()
+        lengths.append(th.dist(weights, before).item())
+    assert lengths[-1] < 3.0 * lengths[-2]
 
 
 def test_its_state_resumes_exactly():

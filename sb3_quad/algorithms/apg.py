@@ -1,5 +1,6 @@
 """Analytic policy gradient: an agent learns from the exact gradient of its flights' cost."""
 
+import warnings
 from collections import deque
 from collections.abc import Callable
 from typing import Annotated, Any, Protocol
@@ -19,12 +20,31 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from typing_extensions import Self
 
-from sb3_quad.algorithms.common import ExpertMixin, RateOrSchedule, model_of, policy_arguments
+from sb3_quad.algorithms.common import (
+    ExpertMixin,
+    History,
+    RateOrSchedule,
+    model_of,
+    policy_arguments,
+)
 from sb3_quad.algorithms.networks import network_of
 from sb3_quad.algorithms.soap import SOAP
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.base.validate import Count, Weight
+
+# An update is undone if its cost lies this many usual changes above the least so far, or if its
+# step moves the mean actions further than this. In ordinary trainings 4.2 was reached, and 0.02.
+COST_RISE = 8.0
+ACTION_CHANGE = 0.2
+# What the usual change of the cost between two updates begins with, and what it is at least, as
+# shares of the cost
+FIRST_CHANGE = 0.05
+LEAST_CHANGE = 0.02
+# Share of the least cost that an update forgets, since each one has other starts
+FORGOTTEN = 0.02
+# The mean actions are compared at every so many recorded steps.
+COMPARED = 32
 
 
 class Tape(Protocol):
@@ -77,6 +97,14 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     :class:`~sb3_quad.algorithms.soap.SOAP`, unless ``policy_kwargs`` has an ``optimizer_class``.
     Only the actor learns; the critic stays as it is.
 
+    An update is undone if its cost lies far above the least so far (by more than 8 times the usual
+    change between two updates), or if its step moves the mean actions over the recorded
+    observations by more than 0.2 (root mean square). A warning says so, the best weights come back,
+    and the optimiser begins again at half the learning rate. The least cost is forgotten slowly,
+    since each update has other starts. If the best weights then fly as badly, the task has become
+    harder, and the rate is what it was. With ``continue_flights`` the cost depends on where the
+    windows begin, so only the step is judged.
+
     ``env`` must be differentiable: a :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` with any of
     its settings, or an environment of your own whose ``record(n_steps, substeps)`` returns a
     :class:`Tape`; docs/apg.md shows one.
@@ -112,8 +140,20 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
     policy_aliases = PPO.policy_aliases
     # If they were saved, algorithms with a critic would adopt these placeholders.
-    _not_saved = ("cost", "_tape", "_recorded_policy", "gamma", "gae_lambda", "ent_coef", "vf_coef")
+    _not_saved = (
+        *("cost", "_tape", "_recorded_policy", "_compared"),
+        *("gamma", "gae_lambda", "ent_coef", "vf_coef"),
+    )
     _tape: Tape
+    # Observations of some recorded steps, and the mean actions there
+    _compared: list[tuple[Float32Array, Float32Array]]
+    # The least cost so far, whose weights are in the optimiser's state; None: the next one
+    _least_cost: float | None = None
+    _last_cost = 0.0
+    _usual_change = 0.0
+    # If the best weights cost more than this when they are back, they are not to blame.
+    _blamed_cost = np.inf
+    _n_undone = 0
 
     def __init__(
         self,
@@ -189,6 +229,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         """Return False: APG has no expert."""
         return False
 
+    def _shows_in_returns(self) -> bool:
+        """Return whether the reward says what the cost says."""
+        return not self.own_cost
+
     def learn(
         self,
         total_timesteps: int,
@@ -239,6 +283,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             self._tape = env.record(self.n_steps, self.substeps, **options)
         network = network_of(self.policy)
         self._recorded_policy = network.recorded(self.n_steps, self.n_envs)
+        if reset_num_timesteps:
+            self._least_cost = None
+            self._usual_change = 0.0
+            self._n_undone = 0
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
@@ -255,8 +303,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         callback.on_rollout_start()
         observations = self._tape.reset(self.continue_flights)
         infos: list[StrDict] = [{} for _ in range(env.num_envs)]
+        self._compared = []
         for step in range(n_rollout_steps):
-            observations = self._tape.step(self._recorded_policy.forward(step, observations))
+            actions = self._recorded_policy.forward(step, observations)
+            if step % COMPARED == 0:
+                # A tape may write the next step's observations into the same array.
+                self._compared.append((observations.copy(), actions))
+            observations = self._tape.step(actions)
             self.num_timesteps += env.num_envs
             # To callbacks, every flight ends with the recording.
             dones = np.full(env.num_envs, step == n_rollout_steps - 1)
@@ -285,11 +338,19 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         """
         # Layers such as dropout must act as they did in the recorded flight.
         self.policy.set_training_mode(False)
-        self._update_learning_rate(self.policy.optimizer)
+        optimizer = self.policy.optimizer
+        self._update_learning_rate(optimizer)
+        for group in optimizer.param_groups:
+            group["lr"] *= 0.5**self._n_undone
         cost = self._tape.begin()
+        rise = self._cost_rise(cost)
+        history: History = {"cost": [cost], "cost_rise": [rise]}
+        if COST_RISE < rise < np.inf:
+            self._undo(f"the cost of {cost:.3g} is far above the least so far", history)
+            return
 
         # Autograd adds to gradients that the critic or an earlier update has left.
-        self.policy.optimizer.zero_grad()
+        optimizer.zero_grad()
         # The observation after the last step leads to no action.
         grad_observations = np.zeros_like(self._last_obs)
         for step in reversed(range(self.n_steps)):
@@ -302,10 +363,66 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 f"the gradient is not finite after {self.num_timesteps} timesteps (cost"
                 f" {cost:.3g}): try a smaller learning_rate or shorter flights (n_steps)"
             )
-        self.policy.optimizer.step()
+        learnt = [weights for weights in self.policy.parameters() if weights.grad is not None]
+        before = [weights.detach().clone() for weights in learnt]
+        optimizer.step()
         self._n_updates += 1
+        if rise <= 0.0:
+            # As part of the optimiser's state they are in zips and snapshots.
+            for weights, best in zip(learnt, before, strict=True):
+                optimizer.state[weights]["best"] = best
+        change = self._action_change()
+        history |= {"gradient_norm": [float(norm)], "action_change": [change]}
+        if change > ACTION_CHANGE:
+            self._undo(f"a step changed the mean actions by {change:.3g}", history)
+        else:
+            self._log_update(history | {"n_undone": [self._n_undone]})
 
-        self._log_update({"cost": [cost], "gradient_norm": [float(norm)]})
+    def _cost_rise(self, cost: float) -> float:
+        """Return how far an update's cost lies above the least so far, in usual changes.
+
+        A flight that is lost costs nothing more, so costs are those of a step in flight.
+        """
+        cost *= self.n_steps / float(np.mean(self._tape.episodes()[1]))
+        if self._least_cost is None or self.continue_flights:
+            self._n_undone -= cost > self._blamed_cost
+            self._blamed_cost = np.inf
+            self._least_cost = self._last_cost = cost
+            self._usual_change = max(self._usual_change, FIRST_CHANGE * abs(cost))
+            return 0.0
+        above = cost - self._least_cost
+        usual = max(self._usual_change, LEAST_CHANGE * abs(self._least_cost), 1e-12)
+        if above > COST_RISE * usual:
+            self._blamed_cost = cost - 0.5 * above
+        else:
+            change = abs(cost - self._last_cost)
+            self._usual_change += 0.1 * (change - self._usual_change)
+            self._least_cost += above if above < 0.0 else FORGOTTEN * above
+            self._last_cost = cost
+        return above / usual
+
+    def _action_change(self) -> float:
+        """Return how far the last step moved the mean actions, as a root mean square."""
+        observations, actions = map(np.concatenate, zip(*self._compared, strict=True))
+        change = network_of(self.policy).means(observations) - actions
+        return float(np.sqrt(np.square(change).mean()))
+
+    def _undo(self, reason: str, history: History) -> None:
+        """Bring the best weights back, and let the optimiser begin again at half the rate."""
+        state = self.policy.optimizer.state
+        with th.no_grad():
+            for weights, kept in state.items():
+                weights.copy_(kept.get("best", weights))
+        state.clear()
+        # The next update measures these weights again, in case that the task has changed.
+        self._least_cost = None
+        self._n_undone += 1
+        self._log_update(history | {"n_undone": [self._n_undone]})
+        warnings.warn(
+            f"APG after {self.num_timesteps:,} timesteps: {reason}; the best weights are back, and"
+            " the learning rate is halved",
+            stacklevel=3,
+        )
 
     def _limited(self, gradients: FloatArray) -> FloatArray:
         """Return gradients (n, a), their norms limited to ``max_row_ratio`` times the median."""

@@ -1,5 +1,6 @@
 """The parts that all algorithms with an expert share."""
 
+import warnings
 from typing import Any
 
 import gymnasium
@@ -8,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
@@ -21,7 +23,7 @@ from sb3_quad.algorithms.threads import one_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
-from sb3_quad.base.types import Float32Array, StrDict, StrPath
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.base.validate import Share, Weight, check_arguments
 
 RateOrSchedule = Share | Schedule
@@ -47,6 +49,8 @@ _OF_NETWORKS = (
     "use_expln",
     "full_std",
 )
+# The first episodes of environments are compared with their last ones if there are this many.
+_COMPARED = 10
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 
@@ -64,6 +68,9 @@ class ExpertMixin(BaseAlgorithm):
     expert: ExpertLike | None = None
     # Queries the expert, and keeps a recurrent expert's state.
     _labeller: Labeller | None = None
+    # Return and length of each environment's first episode and of its last one
+    _first_episodes: dict[int, tuple[float, float]]
+    _last_episodes: dict[int, tuple[float, float]]
     # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
 
@@ -175,12 +182,35 @@ class ExpertMixin(BaseAlgorithm):
     def learn(self, *arguments: Any, **keywords: Any) -> Self:
         """Learn as SB3 does. While an accelerator learns, PyTorch has one thread.
 
+        A warning says if the last episodes have far lower returns than the first ones.
+
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
         if self.env is not None and self.will_clone():
             self._labeller = labeller_for(self.expert, self.env, self._labeller)
         with network_of(self.policy).learning():
-            return super().learn(*arguments, **keywords)  # type: ignore[safe-super]
+            super().learn(*arguments, **keywords)  # type: ignore[safe-super]
+        if len(self._first_episodes) >= _COMPARED:
+            first = np.array([*self._first_episodes.values()])
+            warn_if_worse(type(self).__name__, first, np.array([*self._last_episodes.values()]))
+        return self
+
+    def _setup_learn(self, *arguments: Any, **keywords: Any) -> tuple[int, BaseCallback]:
+        self._first_episodes = {}
+        self._last_episodes = {}
+        return super()._setup_learn(*arguments, **keywords)
+
+    def _update_info_buffer(self, infos: list[StrDict], dones: BoolArray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        for row in np.flatnonzero([] if dones is None else dones).tolist():
+            episode = infos[row].get("episode")
+            if episode is not None and self._shows_in_returns():
+                self._last_episodes[row] = (episode["r"], episode["l"])
+                self._first_episodes.setdefault(row, self._last_episodes[row])
+
+    def _shows_in_returns(self) -> bool:
+        """Return whether the returns of the present rollout say how well the agent flies."""
+        return True
 
     def _labels(self, env: VecEnv) -> Float32Array:
         """Return the expert's actions for the present states, (n_envs, action_dim).
@@ -224,7 +254,32 @@ class ExpertMixin(BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         # No object of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
+        own += ["_first_episodes", "_last_episodes"]
         return [*super()._excluded_save_params(), *own, *self._not_saved]
+
+
+def warn_if_worse(name: str, first: FloatArray, last: FloatArray) -> None:
+    """Warn if the last episodes of a training have far lower returns than its first ones.
+
+    That is, by more than the standard deviation of the first ones plus half of that of the last
+    ones, and by more than a quarter of the first ones' mean. Where the last ones are longer, they
+    may cost more in proportion: the first ones of many environments often end early.
+
+    :param name: what learned.
+    :param first: the return and the length of each episode, (n, 2).
+    :param last: likewise.
+    """
+    start, first_length = first.mean(axis=0)
+    end, last_length = last.mean(axis=0)
+    usual = first[:, 0].std() + 0.5 * last[:, 0].std()
+    longer = max(last_length / first_length, 1.0)
+    if end < min(start, longer * start) - max(usual, 0.25 * abs(start)):
+        warnings.warn(
+            f"{name}: the training ends far below its start: the last episodes have a mean reward"
+            f" of {end:.3g}, the first ones had {start:.3g}; keep the agent that you had, or lower"
+            " learning_rate",
+            stacklevel=4,
+        )
 
 
 def model_of(source: BaseAlgorithm | StrPath | None) -> Any:

@@ -91,7 +91,9 @@ class SOAP(th.optim.Adam):
         ):
             moment.lerp_(product, 1.0 - MOMENT_DECAY)
         if "bases" not in state:
-            state["bases"] = [th.linalg.eigh(moment)[1] for moment in state["moments"]]
+            # The power iteration sorts by falling eigenvalues. In another order it would exchange
+            # the vectors, and updates would be divided by the moments of other ones.
+            state["bases"] = [th.linalg.eigh(moment)[1].flip(1) for moment in state["moments"]]
         elif state["step"] % REFRESH == 0:
             # One step of the power iteration: the moments have changed little since the last one.
             state["bases"] = [
