@@ -152,7 +152,7 @@ class TrainingConfig(Frozen):
         if not self.normalize:
             return self.vec_env_wrapper
         # As in rl_zoo3.
-        keywords = {"gamma": self.hyperparams.get("gamma", 0.99)}
+        keywords = {"gamma": self.keyword("gamma")}
         if self.normalize is not True:
             keywords |= self.normalize
         return [*self.vec_env_wrapper, (NORMALIZE, keywords)]
