@@ -81,10 +81,12 @@ class Chain:
         inwards. VecNormalize is not among them: a model has its statistics. Nor is
         VecTransposeImage, which SB3 adds to environments of pictures.
     :ivar outside: the wrappers around a VecNormalize that change observations, or may change them.
+    :ivar names: all wrappers.
     """
 
     links: dict[str, str]
     outside: tuple[str, ...] = ()
+    names: frozenset[str] = frozenset()
 
     @property
     def changes(self) -> str:
@@ -140,7 +142,8 @@ def _describe(env: VecEnv) -> Chain:
             # Whether it changes what others change as well cannot be told.
             if letters == "?" and found is not None and not known & {*"oar"}:
                 links[name] = "".join(sorted(found[0] - known))
-    return Chain({name: letters for name, letters in links.items() if letters}, tuple(outside))
+    changing = {name: letters for name, letters in links.items() if letters}
+    return Chain(changing, tuple(outside), frozenset(links))
 
 
 def _around_statistics(env: VecEnv) -> tuple[list[VecEnvWrapper], VecEnv]:
@@ -199,8 +202,14 @@ def chain_of(model: Any) -> list[str] | None:
     if env is not None:
         return describe(env).record
     if hasattr(model, WRAPPERS):
-        return [*getattr(model, WRAPPERS)]
+        return read_record(getattr(model, WRAPPERS))
     return [] if hasattr(model, FLIGHT_SETTINGS) else None
+
+
+def read_record(record: Any) -> list[str]:
+    """Return the record in a zip, which may be a stranger's."""
+    texts = [*map(str, record if isinstance(record, list) else [record])]
+    return [text if text.isprintable() else WORDS["?"] for text in texts]
 
 
 def note_chain(model: Any, env: VecEnv | None) -> Any:
@@ -229,10 +238,25 @@ def refuse_wrapped(name: str, model: Any, here: list[str]) -> None:
     theirs = model if isinstance(model, list) else chain_of(model)
     if theirs and theirs != here:
         raise ConfigError(
-            f"{name}: was trained behind wrappers that change what it sees or does"
-            f" ({', '.join(theirs)}), and flies otherwise without them; fly it in an environment"
-            " that has them, by model.predict, or train one without them"
+            f"{name}: was trained with wrappers that change what it sees or does, or may do so"
+            f" ({', '.join(theirs)}), without which it flies otherwise; use it in an environment"
+            " that has them, such as by evaluate_policy, or train without them"
         )
+
+
+def refuse_other_wrappers(model: Any, env: VecEnv) -> None:
+    """Check that a model is evaluated behind the wrappers that it learns behind.
+
+    :raises ConfigError: one side has a wrapper that changes something, and the other has not.
+    """
+    ours, theirs = describe(model.get_env()), describe(env)
+    for has, lacks, where in ((ours, theirs, "evaluation"), (theirs, ours, "training")):
+        missing = has.links.keys() - lacks.names
+        if missing:
+            raise ConfigError(
+                f"{', '.join(sorted(missing))}: the environment of the {where} lacks this wrapper,"
+                " which changes what an agent sees or does"
+            )
 
 
 # A trial

@@ -1,5 +1,6 @@
 """The parts that all algorithms with an expert share."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -197,17 +198,48 @@ class ExpertMixin(BaseAlgorithm):
         self._labeller = labeller_for(self.expert, env, self._labeller, self.check_expert)
         return self._labeller.labels(self._last_obs, self._last_episode_starts)
 
-    def _look(self, observations: Any, dones: BoolArray) -> None:
+    def _look(self, observations: Any, dones: BoolArray, infos: Any = ()) -> None:
         """Label the states that the policy has just observed, before a callback changes them."""
+        for row in np.flatnonzero(dones) if infos else ():
+            if "terminal_observation" not in infos[row]:
+                warnings.warn(
+                    f"row {row} ended without info['terminal_observation'], so the critic takes"
+                    " its last reward for the end; a wrapper drops infos",
+                    stacklevel=2,
+                )
         if self._labeller is not None and self.expert is not None:
             self._labeller.look(observations, dones)
 
     def _setup_learn(self, *arguments: Any, **keywords: Any) -> Any:
-        before = self._last_obs
+        before, planned = self._last_obs, getattr(self, "_total_timesteps", 0)
         results = super()._setup_learn(*arguments, **keywords)
         if self._last_obs is not before:
             self._look(self._last_obs, self._last_episode_starts)
+        # A training that goes on after an interruption keeps its plan.
+        if self.num_timesteps > 0 and self._total_timesteps > planned:
+            self._warn_of_schedules()
         return results
+
+    def _warn_of_schedules(self) -> None:
+        """Warn of schedules that have ended before and end again with this call."""
+        schedules = {"learning_rate": self.lr_schedule, "bc_coef": getattr(self, "bc_coef", None)}
+        for name, schedule in schedules.items():
+            if schedule is not None and schedule(1.0) != schedule(0.0):
+                begin = schedule(1.0 - self.num_timesteps / self._total_timesteps)
+                warnings.warn(
+                    f"{name}: its schedule ends with each call of learn; this one goes from"
+                    f" {begin:.3g} to {schedule(0.0):.3g}. Give one call all timesteps, or"
+                    f" {name} a number",
+                    stacklevel=4,
+                )
+
+    def _update_info_buffer(self, infos: Any, dones: Any = None) -> None:
+        # The batch tells which infos are not empty.
+        known = getattr(infos, "known", None)
+        if known is not None and dones is not None:
+            rows = known()
+            infos, dones = [infos[row] for row in rows], dones[rows]
+        super()._update_info_buffer(infos, dones)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:

@@ -359,8 +359,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             # + A callback may change what it sees of the environment.
             if normalize:
                 self._raw = (new_obs, normalize.get_original_obs())
-            if self.expert is not None:
-                self._look(new_obs, dones)
+            self._look(new_obs, dones, infos)
 
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())

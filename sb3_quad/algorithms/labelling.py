@@ -256,14 +256,14 @@ class LabellingVecEnv(VecEnvWrapper):
     """Labels the states of an environment.
 
     :param label: called before the actions of a step are passed on.
-    :param look: called after a step, with the observations and which rows have ended.
+    :param look: called after a step, with the observations, which rows have ended, and the infos.
     """
 
     def __init__(
         self,
         venv: VecEnv,
         label: Callable[[], None],
-        look: Callable[[Any, BoolArray], None],
+        look: Callable[[Any, BoolArray, Any], None],
     ) -> None:
         super().__init__(venv)
         self._label = label
@@ -278,7 +278,7 @@ class LabellingVecEnv(VecEnvWrapper):
 
     def step_wait(self) -> VecEnvStepReturn:
         results = self.venv.step_wait()
-        self._look(results[0], results[2])
+        self._look(results[0], results[2], results[3])
         return results
 
 
