@@ -184,9 +184,7 @@ class ExpertMixin(BaseAlgorithm):
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
         if self.env is not None and self.will_clone():
-            self._labeller = labeller_for(
-                self.expert, self.env, self._labeller, self.check_expert
-            )
+            self._labeller = labeller_for(self.expert, self.env, self._labeller, self.check_expert)
         with network_of(self.policy).learning():
             return super().learn(*arguments, **keywords)  # type: ignore[safe-super]
 
@@ -258,7 +256,10 @@ class ExpertMixin(BaseAlgorithm):
 
     def _log_expert(self) -> None:
         """Log the return that the expert itself reaches."""
-        if self.check_expert and self._labeller and self._labeller.expert_return is not None:
+        # It takes flights, which would be in vain without a log.
+        if not (self.check_expert and self._labeller and self.logger.output_formats):
+            return
+        if self._labeller.expert_return is not None:
             self.logger.record("rollout/expert_return", self._labeller.expert_return)
 
     def _log_update(self, history: History) -> None:

@@ -29,7 +29,6 @@ from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
 from sb3_quad.base.types import AnyArray, BoolArray, Float32Array
 
-
 # How to train where the check of an expert says no.
 GO_ON = "check_expert=False"
 
@@ -211,8 +210,8 @@ class Labeller:
 
     @cached_property
     def expert_return(self) -> float | None:
-        """The mean return of 16 episodes of the expert, of at most 1,500 steps each, in a batch like
-        the environment's without its wrappers; the reward is the task's.
+        """The mean return of 16 episodes of the expert, of at most 1,500 steps each, in a batch as
+        this one without its wrappers; the reward is the task's.
 
         None: a function, an expert that fails there, or an environment that is no batch.
         """
