@@ -368,7 +368,7 @@ class Trial:
         outer: Any = self.env.action_space
         low, high = limits_of(outer)
         least, most = limits_of(inner)
-        found = set() if np.array_equal((low, high), (least, most)) else {"s"}
+        found: set[str] = set() if np.array_equal((low, high), (least, most)) else {"s"}
         is_batch = isinstance(self.taps[0], _Vectorised)
         observation: Any = self.env.reset()
         for _ in range(self.n_steps):
@@ -395,7 +395,7 @@ class Trial:
 
 def _differences(tap: Any, wanted: AnyArray, shown: Any, space: spaces.Box) -> set[str]:
     """Return the letters of what differs between both ends of the chain in a step."""
-    found = set()
+    found: set[str] = set()
     if len(tap.heard) != 1:
         found.add("r")
     for actions in tap.heard:
