@@ -211,7 +211,9 @@ def test_each_chain_is_described_and_teaches_right_or_is_refused(name, batch):
 
 
 def test_the_check_names_the_wrapper_and_both_returns_and_can_be_left_out():
-    with pytest.raises(ExpertError, match=r"Half \(actions\): in 200 steps .* return -.*and -"):
+    with pytest.raises(
+        ExpertError, match=r"Half \(actions\): in a trial flight .* return -.*and -"
+    ):
         DAgger("MlpPolicy", wrapped("half", True), expert="pid", **TINY)
     DAgger("MlpPolicy", wrapped("half", True), expert="pid", check_expert=False, **TINY).learn(32)
 

@@ -15,7 +15,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_n
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_quad.algorithms.chain import (
-    N_STEPS,
     TURNED,
     Chain,
     chain_of,
@@ -157,7 +156,7 @@ class Labeller:
         returns = "no copy of it can be flown to find that out"
         if flown is not None:
             alone = try_out(self.env, self._pilot, bare=True)
-            returns = f"in {N_STEPS} steps its own labels return {flown[1]:.2f} there"
+            returns = f"in a trial flight its own labels return {flown[1]:.2f} there"
             if alone is not None:
                 returns += f", and {alone[1]:.2f} without it"
         raise ExpertError(
