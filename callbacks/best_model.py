@@ -13,6 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_quad.algorithms.chain import refuse_other_wrappers
 from sb3_quad.algorithms.statistics import share_statistics
 from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
@@ -134,6 +135,7 @@ class BestModel(EveryTimesteps):
         self.stopped = False
         for evaluations in self._evaluations.values():
             share_statistics(self.model.get_vec_normalize_env(), evaluations.env)
+            refuse_other_wrappers(self.model, evaluations.env)
             evaluations.read(self._n_episodes)
         # A resumed training continues the clock and knows the best model so far.
         self._start = time.perf_counter()

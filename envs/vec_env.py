@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.errors import unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.types import IntArray, StrDict
+from sb3_quad.base.types import IntArray
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.batch_vec_env import BatchVecEnv, refuse_options
 from sb3_quad.envs.flight_cost import (
@@ -24,6 +24,7 @@ from sb3_quad.envs.flight_cost import (
     flight_cost,
     whole_cost,
 )
+from sb3_quad.envs.infos import Infos
 from sb3_quad.envs.simulation.tape import FlightTape
 from sb3_quad.envs.simulation.tasks import TaskSpec
 
@@ -69,8 +70,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     A row that ends begins its next episode within the same step. Its info then holds
     ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``, ``l``, ``t`` as of SB3's
     Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
-    infos of other rows are empty. The environment reuses the list of infos and the dictionaries in
-    it: a wrapper that writes into one should write into a copy. The arrays are new ones.
+    infos of other rows are empty. All of them are new in each step, as are the arrays.
 
     Further keywords are the fields of :class:`~sb3_quad.envs.simulation.settings.FlightSettings`.
 
@@ -96,9 +96,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     ) -> None:
         self._make_batch(n_envs, seed, n_threads, task, autoreset=True, **keywords)
         self._staggered = staggered
-        # The list is reused in every step; only rows that end or have just ended change.
-        self._infos: list[StrDict] = [{} for _ in range(self.batch.n)]
-        self._ended: list[int] = []
+        self._nothing = [None] * self.batch.n
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces(self.batch.observation.size))
 
@@ -123,26 +121,23 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
 
         :return: observations (n, observation size), rewards (n,), done (n,), infos.
         """
-        # An info is valid until the next step.
-        for row in self._ended:
-            self._infos[row] = {}
         observations, rewards, dones = self._fly(self._actions)
+        infos = Infos(self._nothing)
         rows = dones.nonzero()[0]
-        self._ended = rows.tolist()
-        if self._ended:
-            self._write_infos(rows)
-        return observations, rewards, dones, self._infos
+        if rows.size:
+            self._write_infos(infos, rows)
+        return observations, rewards, dones, infos
 
-    def _write_infos(self, rows: npt.NDArray[np.intp]) -> None:
+    def _write_infos(self, infos: Infos, rows: npt.NDArray[np.intp]) -> None:
         """Write the infos of rows that have ended."""
         elapsed = round(time.time() - self._start, 6)
         # Indexing copies, so that the next step does not change them.
         outcomes = self.batch.outcome[rows].tolist()
         observations = self.batch.last_observations[rows]
-        for row, outcome, observation in zip(self._ended, outcomes, observations, strict=True):
+        for row, outcome, observation in zip(rows.tolist(), outcomes, observations, strict=True):
             total, _, length, distance, collision, out_of_range, truncated, success = outcome
             # Not by a loop over ``INFOS``, which takes twice as long.
-            self._infos[row] = {
+            infos[row] = {
                 "terminal_observation": observation,
                 "TimeLimit.truncated": truncated,
                 "episode": {"r": round(total, 6), "l": length, "t": elapsed},

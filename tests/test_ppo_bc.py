@@ -429,6 +429,7 @@ def test_the_signature_is_ppos_and_what_is_added_after_it_by_keyword():
         "l2_coef",
         "critic_warmup",
         "shuffle",
+        "check_expert",
     ]
     theirs = ("_init_setup_model", "rollout_buffer_class", "rollout_buffer_kwargs")
     stock = [name for name in inspect.signature(PPO).parameters if name not in theirs]

@@ -19,7 +19,7 @@ from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.agents.transfer import transfer_policy
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.labelling import Labeller
-from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.callbacks import BestModel
 from sb3_quad.cli import main
@@ -136,6 +136,27 @@ def zoo_agent(tmp_path):
     return folder / "Pendulum-v1.zip", labels
 
 
+def test_statistics_are_found_where_others_keep_them(zoo_agent):
+    path, _ = zoo_agent
+    file = path.parent / "Pendulum-v1" / "vecnormalize.pkl"
+    wanted = statistics(path).mean
+    own = file.rename(path.with_name("vec_normalize.pkl"))
+    np.testing.assert_array_equal(statistics(path).mean, wanted)
+    # Those of a checkpoint belong to that of the same step.
+    checkpoint = path.rename(path.with_name("rl_model_600_steps.zip"))
+    own.rename(path.with_name("rl_model_vecnormalize_600_steps.pkl"))
+    other = path.with_name("rl_model_vecnormalize_800_steps.pkl")
+    other.write_bytes(b"of another step")
+    np.testing.assert_array_equal(statistics(checkpoint).mean, wanted)
+    path.with_name("rl_model_vecnormalize_600_steps.pkl").unlink()
+    with pytest.raises(ConfigError, match=r"which statistics are its own.*800_steps\.pkl"):
+        load_model(checkpoint)
+    other.write_bytes(pickle.dumps(VecNormalize(QuadcopterVecEnv(1))))
+    other.rename(path.with_name("vec_normalize.pkl"))
+    with pytest.raises(ConfigError, match=r"is of observations \(18,\)"):
+        load_model(checkpoint)
+
+
 @pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize])
 def test_an_agent_with_statistics_labels_as_it_flies(zoo_agent, wrap):
     path, labels = zoo_agent
@@ -223,10 +244,8 @@ def test_dagger_keeps_raw_rows_and_normalises_them_by_the_present_statistics(mon
     clone = DAgger("MlpPolicy", env, **given).learn(80)
     np.testing.assert_array_equal(learnt_from[-1], env.normalize_obs(rows))
     assert len(clone.dataset) == len(rows)
-    stacked = DAgger("MlpPolicy", VecFrameStack(env, 2), expert=None, beta=0.0, **settings)
-    stacked.dataset.add(np.zeros((1, 6), np.float32), np.zeros((1, 1), np.float32))
     with pytest.raises(ConfigError, match="make VecNormalize the outermost wrapper"):
-        stacked.learn(80)
+        DAgger("MlpPolicy", VecFrameStack(env, 2), expert=None, beta=0.0, **settings)
 
 
 def test_statistics_go_on_in_an_environment_that_is_set_later(run):
@@ -323,5 +342,5 @@ def test_an_expert_that_is_a_function_sees_raw_observations():
     labeller = Labeller(swing_back, env)
     labeller.labels(env.reset())
     np.testing.assert_array_equal(seen[-1], env.get_original_obs())
-    with pytest.raises(ExpertError, match="make VecNormalize the outermost wrapper"):
+    with pytest.raises(ConfigError, match="make VecNormalize the outermost wrapper"):
         Labeller(swing_back, VecFrameStack(env, 2))

@@ -8,6 +8,7 @@ of a stranger.
 import base64
 import io
 import json
+import re
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -46,6 +47,7 @@ _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs",
 # SB3 and this package never save these, and loading them would import the modules that they name.
 _NEVER_READ = ("env", "expert", "_labeller")
 WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
+_STATISTICS = re.compile("vec_?normalize", re.IGNORECASE)
 # The variables that SB3 saves besides policies and optimisers.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 # The largest zip, in bytes.
@@ -105,7 +107,7 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
             )
     # A zip of this package contains all that its agent needs.
     if not {KEY, STATISTICS} & vars(model).keys():
-        setattr(model, STATISTICS, _statistics_beside(path))
+        setattr(model, STATISTICS, _statistics_beside(path, model))
     return model
 
 
@@ -244,18 +246,38 @@ def _check_size(data: StrDict, most: int) -> None:
         raise ValueError(f"it asks for {asked:,} parameters, which its file does not hold")
 
 
-def _statistics_beside(path: StrPath) -> VecNormalize | None:
-    """Return what is in the ``vecnormalize.pkl`` that rl_zoo3 keeps in a folder next to a zip.
+def _statistics_beside(path: StrPath, model: BaseAlgorithm) -> VecNormalize | None:
+    """Return the statistics that lie beside a zip.
 
-    None: the agent was trained without statistics.
+    rl_zoo3 keeps ``vecnormalize.pkl`` in a folder next to the zip, SB3's pages and the Hub
+    ``vec_normalize.pkl`` in the zip's own folder, and SB3's CheckpointCallback
+    ``rl_model_vecnormalize_600_steps.pkl`` beside ``rl_model_600_steps.zip``. None: the agent was
+    trained without statistics.
 
-    :raises ConfigError: a file that cannot be read, or no file although the run had statistics.
+    :raises ConfigError: a file that cannot be read or does not fit; several, none of which is of
+        the same step; or no file although the run had statistics.
     """
-    for file in Path(path).parent.glob("*/vecnormalize.pkl"):
+    zip_file = Path(path)
+    files = sorted(zip_file.parent.glob("*/vecnormalize.pkl"))
+    files += [file for file in zip_file.parent.glob("*.pkl") if _STATISTICS.search(file.stem)]
+    prefix, _, step = zip_file.stem.removesuffix("_steps").rpartition("_")
+    same = zip_file.with_name(f"{prefix}_vecnormalize_{step}_steps.pkl")
+    if same in files:
+        files = [same]
+    others = [file for file in files if file.stem.endswith("_steps") and file != same]
+    if len(files) > 1 or others:
+        raise ConfigError(
+            f"{path}: which statistics are its own? Leave one vec_normalize.pkl beside it, of"
+            f" {', '.join(file.name for file in files)}"
+        )
+    for file in files:
         with _safely(str(file)):
             statistics = read_pickle(_read_file(file).getvalue())
         if not isinstance(statistics, VecNormalize):
             raise ConfigError(f"{file}: holds no VecNormalize")
+        ours, theirs = model.observation_space, statistics.observation_space
+        if ours.shape != theirs.shape:
+            raise ConfigError(f"{file}: is of observations {theirs.shape}, {path} of {ours.shape}")
         return statistics
     refuse_settings(path, ("normalize",))
     return None

@@ -3,7 +3,6 @@
 import warnings
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -13,9 +12,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
 from typing_extensions import Self
 
+from sb3_quad.algorithms.chain import TURNED, chain_of, describe, note_chain, refuse_wrapped
 from sb3_quad.algorithms.labelling import ExpertLike, Labeller, labeller_for
 from sb3_quad.algorithms.networks import Terms, network_of
 from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
@@ -23,6 +23,7 @@ from sb3_quad.algorithms.threads import one_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
+from sb3_quad.base.process import print_once
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.base.validate import Share, Weight, check_arguments
 
@@ -71,6 +72,7 @@ class ExpertMixin(BaseAlgorithm):
     # Return and length of each environment's first episode and of its last one
     _first_episodes: dict[int, tuple[float, float]]
     _last_episodes: dict[int, tuple[float, float]]
+    check_expert: bool = True
     # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
 
@@ -80,7 +82,7 @@ class ExpertMixin(BaseAlgorithm):
         :raises ExpertError: an expert that does not fit the environment.
         """
         if expert is not None and self.env is not None:
-            self._labeller = labeller_for(expert, self.env, self._labeller)
+            self._labeller = labeller_for(expert, self.env, self._labeller, self.check_expert)
         self.expert = expert
 
     def _check_expert(self) -> None:
@@ -171,7 +173,9 @@ class ExpertMixin(BaseAlgorithm):
             raise RuntimeError(f"set_parameters: {one_line(error)}") from None
 
     def _note_flight_settings(self) -> None:
-        settings = flight_settings_of(self.env)
+        settings = note_chain(self, self.env)
+        if self.env is not None:
+            describe(self.env).refuse_inner_statistics()
         if settings is not None:
             settings.write_into(self)
         elif hasattr(self, FLIGHT_SETTINGS):
@@ -187,7 +191,7 @@ class ExpertMixin(BaseAlgorithm):
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
         if self.env is not None and self.will_clone():
-            self._labeller = labeller_for(self.expert, self.env, self._labeller)
+            self._labeller = labeller_for(self.expert, self.env, self._labeller, self.check_expert)
         with network_of(self.policy).learning():
             super().learn(*arguments, **keywords)  # type: ignore[safe-super]
         if len(self._first_episodes) >= _COMPARED:
@@ -217,8 +221,58 @@ class ExpertMixin(BaseAlgorithm):
 
         Call it before the step.
         """
-        self._labeller = labeller_for(self.expert, env, self._labeller)
+        self._labeller = labeller_for(self.expert, env, self._labeller, self.check_expert)
         return self._labeller.labels(self._last_obs, self._last_episode_starts)
+
+    def _look(self, observations: Any, dones: BoolArray, infos: Any = ()) -> None:
+        """Label the states that the policy has just observed, before a callback changes them."""
+        for row in np.flatnonzero(dones) if infos else ():
+            if "terminal_observation" not in infos[row]:
+                warnings.warn(
+                    f"row {row} ended without info['terminal_observation'], so the critic takes"
+                    " its last reward for the end; a wrapper drops infos",
+                    stacklevel=2,
+                )
+        if self._labeller is not None and self.expert is not None:
+            self._labeller.look(observations, dones)
+
+    def _setup_learn(self, *arguments: Any, **keywords: Any) -> Any:
+        before, planned = self._last_obs, getattr(self, "_total_timesteps", 0)
+        results = super()._setup_learn(*arguments, **keywords)
+        if self._last_obs is not before:
+            self._look(self._last_obs, self._last_episode_starts)
+        # A training that goes on after an interruption keeps its plan.
+        if self.num_timesteps > 0 and self._total_timesteps > planned:
+            self._warn_of_schedules()
+        return results
+
+    def _warn_of_schedules(self) -> None:
+        """Warn of schedules that have ended before and end again with this call."""
+        schedules = {"learning_rate": self.lr_schedule, "bc_coef": getattr(self, "bc_coef", None)}
+        for name, schedule in schedules.items():
+            if schedule is not None and schedule(1.0) != schedule(0.0):
+                begin = schedule(1.0 - self.num_timesteps / self._total_timesteps)
+                warnings.warn(
+                    f"{name}: its schedule ends with each call of learn; this one goes from"
+                    f" {begin:.3g} to {schedule(0.0):.3g}. Give one call all timesteps, or"
+                    f" {name} a number",
+                    stacklevel=4,
+                )
+
+    def _update_info_buffer(self, infos: Any, dones: Any = None) -> None:
+        # The batch tells which infos are not empty.
+        known = getattr(infos, "known", None)
+        if known is not None and dones is not None:
+            rows = known()
+            infos, dones = [infos[row] for row in rows], dones[rows]
+        super()._update_info_buffer(infos, dones)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        if isinstance(wrapped, VecTransposeImage) and wrapped is not env:
+            setattr(wrapped, TURNED, True)
+        return wrapped
 
     def _refuse_dict_observations(self) -> None:
         space = self.observation_space
@@ -227,6 +281,14 @@ class ExpertMixin(BaseAlgorithm):
                 f"observation space {space}: {type(self).__name__} does not support Dict with an"
                 " expert; wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
+
+    def _log_expert(self) -> None:
+        """Log the return that the expert itself reaches."""
+        # It takes flights, which would be in vain without a log.
+        if not (self.check_expert and self._labeller and self.logger.output_formats):
+            return
+        if self._labeller.expert_return is not None:
+            self.logger.record("rollout/expert_return", self._labeller.expert_return)
 
     def _log_update(self, history: History) -> None:
         """Log the mean of each term of an update."""
@@ -307,6 +369,10 @@ def copy_policy(teacher: Any, model: BaseAlgorithm, name: str = "") -> None:
     record = getattr(model, FLIGHT_SETTINGS, {})
     if record and hasattr(teacher, FLIGHT_SETTINGS):
         plugin("observation")(name, teacher, record)
+    here = chain_of(model) or []
+    refuse_wrapped(name, teacher, here)
+    if here and chain_of(teacher) == []:
+        print_once(f"warning: {name}: was trained without {', '.join(here)}")
     theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()
     if teacher.action_space != model.action_space:
@@ -344,28 +410,6 @@ def copy_policy(teacher: Any, model: BaseAlgorithm, name: str = "") -> None:
                 f"{name}: its weights give other actions here; give the policy and policy_kwargs"
                 " that it has, such as activation_fn or features_extractor_class"
             )
-
-
-def flight_settings_of(env: VecEnv | None) -> Any:
-    """Return how an environment says that it flies, or None if that would not describe its agents.
-
-    Wrappers may change rewards, and VecNormalize may be among them, since its statistics are in a
-    model's zips. None: the environment says nothing, or a wrapper changes observations or actions,
-    so that its agent would fly differently without the wrapper.
-    """
-    if env is None or not env.has_attr(FLIGHT_SETTINGS):
-        return None
-    changing = (
-        gymnasium.ObservationWrapper,
-        gymnasium.ActionWrapper,
-        gymnasium.wrappers.MaxAndSkipObservation,
-    )
-    if any(any(env.env_is_wrapped(wrapper)) for wrapper in changing):
-        return None
-    settings = env.get_attr(FLIGHT_SETTINGS, [0])[0]
-    if env.observation_space.shape != (settings.observation.size,):
-        return None
-    return settings
 
 
 def policy_arguments(given: StrDict | None, initial: Any, log_std_init: float) -> StrDict:

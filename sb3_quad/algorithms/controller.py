@@ -1,12 +1,13 @@
 """A common way to ask a controller for actions, be it an expert, an SB3 model or a function."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from sb3_quad.algorithms.chain import limits_of, refuse_wrapped
 from sb3_quad.algorithms.statistics import statistics_of
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.plugins import FLIGHT_SETTINGS
@@ -40,8 +41,11 @@ class Controller:
     :param kind: the word for the controller in messages. With ``"expert"``, errors are
         ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
+    :param wrappers: the record of the wrappers that it flies behind, of
+        :func:`~sb3_quad.algorithms.chain.describe`. None: any will do.
     :raises ControllerError: the source is none of the above, or its spaces do not fit
         (``ExpertError`` for an expert).
+    :raises ConfigError: a model that was trained behind other wrappers.
     """
 
     # Whether it has warned about actions outside of the action space.
@@ -55,6 +59,7 @@ class Controller:
         true_state: Callable[[], Any] | None = None,
         kind: str = "controller",
         deterministic: bool = True,
+        wrappers: Sequence[str] | None = (),
     ) -> None:
         self.source = source
         self._deterministic = deterministic
@@ -76,6 +81,8 @@ class Controller:
                 "predict(observation), or actions(state) if the environment has true_state()"
             )
         self._check_spaces(action_space, observation_space)
+        if wrappers is not None and self._true_state is None:
+            refuse_wrapped(self.name, source, [*wrappers])
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
         self._limits = limits_of(action_space)
@@ -185,8 +192,3 @@ class Controller:
             observation, deterministic=self._deterministic, **keywords
         )
         return actions
-
-
-def limits_of(space: spaces.Box) -> Float32Array:
-    """Return the lower and the upper limits of actions, (2, action_dim)."""
-    return np.stack([space.low.ravel(), space.high.ravel()]).astype(np.float32)

@@ -26,6 +26,7 @@ from sb3_quad.algorithms.buffers import (
     ExpertRolloutBuffer,
     sample_rows,
 )
+from sb3_quad.algorithms.chain import limits_of
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
@@ -35,7 +36,6 @@ from sb3_quad.algorithms.common import (
     model_of,
     policy_arguments,
 )
-from sb3_quad.algorithms.controller import limits_of
 from sb3_quad.algorithms.labelling import ExpertLike, refuse_wide_actions
 from sb3_quad.algorithms.losses import (
     CloningLoss,
@@ -119,6 +119,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         rollout only, as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
         prepares them ("chronologically", 4.2.3)
+    :param check_expert: whether to refuse an expert whose labels the environment's wrappers would
+        falsify (docs/experts.md). False: train all the same
     :param demonstrations: a file of recorded flights that the dataset begins with, in a format that
         ``dataset.load`` reads. With ``beta=0`` no expert is needed: the agent clones these flights
         alone, and its own flights train the critic
@@ -127,7 +129,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     """
 
     policy_aliases = PPO.policy_aliases
-    _not_saved = ("dataset",)
+    _not_saved = ("dataset", "_raw")
+    # The latest observations, and what VecNormalize has made them of.
+    _raw: tuple[Any, Any] = (None, None)
 
     def __init__(
         self,
@@ -160,6 +164,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         l2_coef: Weight = 0.0,
         dataset_capacity: Natural = 500_000,
         shuffle: bool = True,
+        check_expert: bool = True,
         demonstrations: StrPath | None = None,
         _init_setup_model: bool = True,
     ):
@@ -197,6 +202,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
+        self.check_expert = check_expert
         self.expert = None
         self._n_rollouts = 0
         # Seeds the generators if no ``seed`` is given.
@@ -302,6 +308,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         seed = self._entropy if self.seed is None else self.seed
         return np.random.default_rng([seed, purpose, self._n_updates])
 
+    def _raw_observations(self, normalize: Any) -> Any:
+        """Return the present observations as they were before VecNormalize."""
+        latest, raw = self._raw
+        return raw if latest is self._last_obs else normalize.get_original_obs()
+
     def collect_rollouts(
         self,
         env: VecEnv,
@@ -322,11 +333,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             raise ExpertError(f"beta {beta:g}: no expert to fly; call set_expert, or set_beta(0)")
         # + The dataset stores raw observations: the statistics of VecNormalize keep changing.
         normalize = statistics_of(self)
-        if normalize and normalize.observation_space.shape != self.observation_space.shape:
-            raise ConfigError(
-                "VecNormalize: DAgger keeps its raw observations, and a wrapper around it changes"
-                " their shape; make VecNormalize the outermost wrapper"
-            )
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         by_expert = np.empty((n_rollout_steps, env.num_envs), dtype=np.bool_)
         not_yet = th.zeros(env.num_envs)
@@ -345,7 +351,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             # policy.
             observations = self._last_obs
             if normalize:
-                raw[step] = normalize.get_original_obs()
+                raw[step] = self._raw_observations(normalize)
             means = network.means(observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta
@@ -354,6 +360,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             clipped_actions = shaped.clip(self.action_space.low, self.action_space.high)
 
             new_obs, rewards, dones, infos = env.step(clipped_actions)
+            # + A callback may change what it sees of the environment.
+            if normalize:
+                self._raw = (new_obs, normalize.get_original_obs())
+            self._look(new_obs, dones, infos)
 
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -391,6 +401,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         self.logger.record("dagger/beta", beta)
         self.logger.record("dagger/dataset_size", len(self.dataset))
+        self._log_expert()
         self.logger.record("rollout/expert_fraction", by_expert.mean())
         callback.update_locals(locals())
         callback.on_rollout_end()

@@ -1,7 +1,10 @@
 """Labels for imitation: what an expert would do in the present states of an environment."""
 
+import copy
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,10 +14,22 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_quad.algorithms.controller import Controller, limits_of
-from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.algorithms.chain import (
+    TURNED,
+    Chain,
+    chain_of,
+    describe,
+    limits_of,
+    try_out,
+    untouched,
+)
+from sb3_quad.algorithms.controller import Controller
+from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
 from sb3_quad.base.types import AnyArray, BoolArray, Float32Array
+
+# How to train where the check of an expert says no.
+GO_ON = "check_expert=False"
 
 
 class StateExpert(Protocol):
@@ -39,16 +54,23 @@ class Labeller:
     """Labels the states of a vector environment with an expert's actions.
 
     With ``VecNormalize``, experts see the raw observations. An SB3 model normalises them as in its
-    own training. An expert that acts within other limits than the environment's, such as those
-    below a ``RescaleAction``, is labelled in the environment's.
+    own training. A function sees pictures as the user's environment makes them; SB3 moves the
+    channels to the front. An expert that acts within other limits than the environment's, such as
+    those below a ``RescaleAction``, is labelled in the environment's.
 
     :param expert: the expert. A name is resolved for the vehicle of row 0.
-    :raises ConfigError: an unknown name, or an environment whose actions go beyond [-1, 1].
-    :raises ExpertError: no expert, one of the wrong kind, or one whose spaces do not fit the
-        environment.
+    :param check: whether to refuse an expert whose labels the environment's wrappers would falsify.
+        Where it takes a flight to find out, a copy of the environment flies.
+    :raises ConfigError: an unknown name; an environment whose actions go beyond [-1, 1]; a model
+        that was trained behind other wrappers; a wrapper around VecNormalize.
+    :raises ExpertError: no expert, one of the wrong kind, or one whose spaces or labels do not fit
+        the environment.
     """
 
-    def __init__(self, expert: ExpertLike | None, env: VecEnv) -> None:
+    # The observations that :meth:`look` has labelled, and their labels.
+    _seen: tuple[Any, Any] = (None, None)
+
+    def __init__(self, expert: ExpertLike | None, env: VecEnv, check: bool = True) -> None:
         if expert is None:
             raise ExpertError(
                 "no expert: give expert=... when building or loading the model, "
@@ -63,42 +85,107 @@ class Labeller:
         if isinstance(expert, (str, Path)):
             source = plugin("expert")(expert, vehicles[0])
         warn_of_vehicle(source, vehicles)
-        true_state = true_state_of(env) if hasattr(source, "actions") else None
+        self._true_state = true_state_of(env) if hasattr(source, "actions") else None
 
         # The source may act within other limits: a model within those that it has learnt with, an
         # expert on the true state within those of the quadcopter below any wrappers.
         own: Any = getattr(source, "action_space", None)
-        converts_actions = False
-        if true_state is not None and env.has_attr(FLIGHT_SETTINGS):
+        if self._true_state is not None and env.has_attr(FLIGHT_SETTINGS):
             own = spaces.Box(-1.0, 1.0, env.action_space.shape)
-            converts_actions = env.has_attr("action")
         if not isinstance(own, spaces.Box) or own.shape != env.action_space.shape:
             own = env.action_space
-        self._controller = Controller(source, own, env.observation_space, true_state, "expert")
+        self._controller = Controller(
+            source,
+            own,
+            env.observation_space,
+            self._true_state,
+            "expert",
+            wrappers=describe(env).record if check else None,
+        )
         name = self._controller.name
         space: Any = env.action_space
         self._limits = limits_of(space)
         self._own_limits = limits_of(own)
-        converts_actions |= not np.allclose(self._own_limits, self._limits)
-        if converts_actions and not _is_straight(env, own):
-            raise ExpertError(
-                f"{name}: its actions are of {own}, the environment's of {env.action_space}; no"
-                " wrapper such as RescaleAction converts one into the other"
-            )
+        if check:
+            self._refuse_wrappers(describe(env))
         # Only a model of this package says what it has learnt to observe.
         if env.has_attr(FLIGHT_SETTINGS) and hasattr(source, FLIGHT_SETTINGS):
             plugin("observation")(name, source, env.get_attr(FLIGHT_SETTINGS, [0])[0])
-        self._raw: Any = None
-        if true_state is None:
-            self._raw = unwrap_vec_normalize(env)
-            if self._raw and self._raw.observation_space != env.observation_space:
+        self._raw: Any = None if self._true_state else unwrap_vec_normalize(env)
+        self._turned = getattr(env, TURNED, False) and not self._is_model
+
+    @property
+    def _is_model(self) -> bool:
+        """Whether it is a model of SB3, which sees what it has learnt to see."""
+        return self._true_state is None and hasattr(self._controller.source, "observation_space")
+
+    def _refuse_wrappers(self, chain: Chain) -> None:
+        """:raises ExpertError: wrappers behind which the labels would be wrong."""
+        chain.refuse_inner_statistics()
+        name = self._controller.name
+        source = self._controller.source
+        changes = {*chain.changes}
+        if self._true_state is None and not self._is_model:
+            # A function sees what the wrappers give, and returns what they take.
+            if "NormalizeObservation" in chain.links:
                 raise ExpertError(
-                    f"{name}: sees raw observations, and a wrapper around VecNormalize changes"
-                    " them; make VecNormalize the outermost wrapper"
+                    f"{name}: NormalizeObservation would change what it sees while its statistics"
+                    " go on; use VecNormalize, behind which it sees raw observations"
                 )
+        elif self._is_model and changes & {*"o?"} and chain_of(source) != chain.record:
+            raise ExpertError(
+                f"{name}: was not trained behind {chain}, or does not say so; normalise by"
+                f" VecNormalize instead, or give {GO_ON} if it was"
+            )
+        elif changes & {*"sa?"}:
+            self._refuse_actions(chain)
+        elif not np.allclose(self._own_limits, self._limits):
+            raise ExpertError(
+                f"{name}: its actions are of {source.action_space}, the environment's of"
+                f" {self.env.action_space}; no wrapper such as RescaleAction converts one into the"
+                " other"
+            )
+
+    def _refuse_actions(self, chain: Chain) -> None:
+        """:raises ExpertError: wrappers that give the simulator other actions than the expert's."""
+        name = self._controller.name
+        flown = try_out(self.env, self._pilot)
+        changes = {*chain.changes} if flown is None else flown[0] | {*chain.changes} - {"?"}
+        if not changes & {*"a?"}:
+            return
+        returns = "no copy of it can be flown to find that out"
+        if flown is not None:
+            alone = try_out(self.env, self._pilot, bare=True)
+            returns = f"in a trial flight its own labels return {flown[1]:.2f} there"
+            if alone is not None:
+                returns += f", and {alone[1]:.2f} without it"
+        raise ExpertError(
+            f"{name}: its actions may not reach the simulator through {chain}: {returns}; scale"
+            f" actions by RescaleAction, or give {GO_ON}"
+        )
+
+    def _pilot(self, env: VecEnv) -> Callable[[Any], AnyArray]:
+        """Return what acts in a copy of the environment as the expert does here."""
+        source = self._controller.source
+        # An SB3 model remembers nothing, and may hold environments.
+        if not self._is_model:
+            source = copy.deepcopy(source)
+        labels = Labeller(source, env, check=False).labels
+        shape = (env.num_envs, *(env.action_space.shape or ()))
+        return lambda observation: labels(observation).reshape(shape)
+
+    def look(self, observation: Any, episode_start: BoolArray) -> None:
+        """Label the present states, which a callback may change before the next step.
+
+        :param observation: the environment's observations of these states, (n, ...).
+        :param episode_start: bool (n,), the rows that have just begun an episode.
+        """
+        self._seen = (None, None)
+        self._seen = (observation, self.labels(observation, episode_start))
 
     def labels(self, observation: Any, episode_start: BoolArray | None = None) -> Float32Array:
-        """Return the expert's actions for the present states within the action space, (n, a).
+        """Return the expert's actions for the present states within the action space, (n, a); for
+        observations that :meth:`look` has got, those of that time.
 
         Call it before ``env.step``.
 
@@ -106,8 +193,13 @@ class Labeller:
         :param episode_start: bool (n,), the rows that have just begun an episode. None: none.
         :raises ExpertError: the expert fails, or its actions are not finite or have another shape.
         """
+        before, labels = self._seen
+        if before is observation:
+            return labels  # type: ignore[no-any-return]
         if self._raw is not None:
             observation = self._raw.get_original_obs()
+        if self._turned:
+            observation = np.moveaxis(observation, 1, -1)
         actions = self._controller.actions(observation, episode_start=episode_start)
         low, high = self._limits
         least, most = self._own_limits
@@ -115,26 +207,65 @@ class Labeller:
             actions = low + (actions - least) * ((high - low) / (most - least))
         return actions.clip(low, high)
 
+    @cached_property
+    def expert_return(self) -> float | None:
+        """The mean return of 16 episodes of the expert, of at most 1,500 steps each, in a batch as
+        this one without its wrappers; the reward is the task's.
 
-def labeller_for(expert: ExpertLike | None, env: VecEnv, present: Labeller | None) -> Labeller:
+        None: a function, an expert that fails there, or an environment that is no batch.
+        """
+        base: Any = self.env.unwrapped
+        is_function = self._true_state is None and not self._is_model
+        if is_function or not hasattr(base, FLIGHT_SETTINGS):
+            return None
+        settings = dict(getattr(base, FLIGHT_SETTINGS))
+        # Settings may hold a list, with a value for each row.
+        n = 16
+        if isinstance(settings["max_episode_steps"], int):
+            settings["max_episode_steps"] = min(settings["max_episode_steps"], 1500)
+        if any(isinstance(settings[key], list) for key in ("max_episode_steps", "vehicle")):
+            n = self.env.num_envs
+        with untouched(), suppress(SB3QuadError):
+            env = type(base)(n, seed=0, **settings)
+            act = self._pilot(env)
+            observation = env.reset()
+            total, flying = np.zeros(n), np.ones(n, np.bool_)
+            while flying.any():
+                observation, rewards, dones, _ = env.step(act(observation))
+                total += np.where(flying, rewards, 0.0)
+                flying &= ~dones
+            return float(total.mean())
+        return None
+
+
+def labeller_for(
+    expert: ExpertLike | None, env: VecEnv, present: Labeller | None, check: bool = True
+) -> Labeller:
     """Return the present labeller if it is for this expert and environment, otherwise a new one.
 
     A recurrent expert thus keeps its state while it labels the same environment.
     """
     if present and present.expert is expert and present.env is env:
         return present
-    return Labeller(expert, env)
+    return Labeller(expert, env, check)
 
 
 class LabellingVecEnv(VecEnvWrapper):
-    """Labels the present state of an environment before each step.
+    """Labels the states of an environment.
 
     :param label: called before the actions of a step are passed on.
+    :param look: called after a step, with the observations, which rows have ended, and the infos.
     """
 
-    def __init__(self, venv: VecEnv, label: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        venv: VecEnv,
+        label: Callable[[], None],
+        look: Callable[[Any, BoolArray, Any], None],
+    ) -> None:
         super().__init__(venv)
         self._label = label
+        self._look = look
 
     def reset(self) -> VecEnvObs:
         return self.venv.reset()
@@ -144,7 +275,9 @@ class LabellingVecEnv(VecEnvWrapper):
         self.venv.step_async(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
-        return self.venv.step_wait()
+        results = self.venv.step_wait()
+        self._look(results[0], results[2], results[3])
+        return results
 
 
 def refuse_wide_actions(space: spaces.Space[Any]) -> None:
@@ -185,25 +318,6 @@ def name_beside(known: Any, flown: Any) -> str:
     if known.name == flown.name:
         return f"{flown.name} with other parameters"
     return str(flown.name)
-
-
-def _is_straight(env: VecEnv, own: spaces.Box) -> bool:
-    """Whether the outermost action wrapper scales the environment's actions to those of ``own``,
-    component by component.
-    """
-    if not env.has_attr("action"):
-        return False
-    space: Any = env.action_space
-    # Inside the limits, with another share for each component, a wrapper that is not linear or
-    # reorders components is noticed.
-    inner = np.linspace(0.2, 0.8, space.low.size).reshape(space.shape)
-    for share in (0.0, 1.0, inner, 0.7 * inner):
-        action = space.low + share * (space.high - space.low)
-        expected = own.low + share * (own.high - own.low)
-        made = env.env_method("action", action.astype(space.dtype), indices=[0])[0]
-        if not np.allclose(made, expected, atol=1e-5):
-            return False
-    return True
 
 
 def true_state_of(env: VecEnv) -> Callable[[], Any] | None:

@@ -99,6 +99,8 @@ class PPOBC(ExpertMixin, PPO):
         advantages.
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis
         prepares them ("chronologically", 4.2.3).
+    :param check_expert: whether to refuse an expert whose labels the environment's wrappers would
+        falsify (docs/experts.md). False: train all the same.
     :raises ConfigError: on construction: a value out of range, an unknown name, or a space that is
         not supported.
     :raises ExpertError: when learning starts, or at the latest in the first rollout to be cloned:
@@ -141,6 +143,7 @@ class PPOBC(ExpertMixin, PPO):
         l2_coef: Weight = 0.0,
         critic_warmup: Natural = 4,
         shuffle: bool = True,
+        check_expert: bool = True,
         _init_setup_model: bool = True,
     ):
         initial = model_of(initial_policy)
@@ -179,6 +182,7 @@ class PPOBC(ExpertMixin, PPO):
         self.l2_coef = l2_coef
         self.critic_warmup = critic_warmup
         self.shuffle = shuffle
+        self.check_expert = check_expert
         self._n_rollouts_trained = 0
 
         if _init_setup_model:
@@ -270,7 +274,8 @@ class PPOBC(ExpertMixin, PPO):
             # SB3 adds the step to the buffer after it.
             buffer.expert_actions[buffer.pos] = self._labels(env)
 
-        labelling = LabellingVecEnv(env, label)
+        labelling = LabellingVecEnv(env, label, self._look)
+        self._log_expert()
         with network_of(self.policy).acting():
             return super().collect_rollouts(labelling, callback, buffer, n_rollout_steps)
 

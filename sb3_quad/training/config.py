@@ -25,6 +25,7 @@ from sb3_quad.agents.agent_settings import agent_settings, settings_of_model, un
 from sb3_quad.agents.pretrained import agent_path, pretrained_names
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.agents.zips import load_model
+from sb3_quad.algorithms.chain import chain_of
 from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.process import print_once
@@ -152,7 +153,7 @@ class TrainingConfig(Frozen):
         if not self.normalize:
             return self.vec_env_wrapper
         # As in rl_zoo3.
-        keywords = {"gamma": self.hyperparams.get("gamma", 0.99)}
+        keywords = {"gamma": self.keyword("gamma")}
         if self.normalize is not True:
             keywords |= self.normalize
         return [*self.vec_env_wrapper, (NORMALIZE, keywords)]
@@ -451,7 +452,7 @@ def load_agent(source: str) -> BaseAlgorithm:
     """
     path = agent_path(source)
     agent = load_model(path)
-    if settings_of_model(agent) is None:
+    if settings_of_model(agent) is None and not chain_of(agent):
         # The settings of a run of rl_zoo3 lie next to its zip.
         settings, file = agent_settings(path)
         if file is not None:

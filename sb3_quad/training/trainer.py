@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.agents.transfer import transfer_policy
-from sb3_quad.algorithms.common import flight_settings_of
+from sb3_quad.algorithms.chain import note_chain
 from sb3_quad.algorithms.labelling import Labeller
 from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
@@ -220,7 +220,9 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         ) from error
     # Query the expert once, so that it fails before there is a run folder.
     if getattr(model, "will_clone", lambda: False)():
-        Labeller(keywords.get("expert"), env).labels(env.reset())
+        learner: Any = model
+        learner.set_expert(learner.expert)
+        Labeller(learner.expert, env, check=False).labels(env.reset())
         # The reset has changed the statistics that the agent brought.
         if agent is not None:
             share_statistics(statistics_of(agent), env, training=True)
@@ -304,7 +306,8 @@ class _Training:
         statistics = self.model.get_vec_normalize_env()
         setattr(self.model, STATISTICS, statistics)
         # A zip says how its agent flies, but a flight cannot have the user's wrappers.
-        if self.job.config.task and flight_settings_of(self.model.get_env()) is not None:
+        settings = note_chain(self.model, self.model.get_env())
+        if self.job.config.task and settings is not None:
             self.job.flight_settings.write_into(self.model)
         self.run.error.unlink(missing_ok=True)
         start = time.perf_counter()
