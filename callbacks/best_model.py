@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_quad.algorithms.statistics import share_statistics
-from sb3_quad.base.errors import ConfigError, refuse_unknown
+from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
-from sb3_quad.base.plugins import plugin
 from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
 
@@ -95,6 +94,8 @@ class BestModel(EveryTimesteps):
         be the best: for a training that starts from an agent.
     :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations``
         that cannot be read or flew another number of episodes.
+    :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's
+        Monitor.
     """
 
     def __init__(
@@ -207,7 +208,8 @@ class BestModel(EveryTimesteps):
         self._report(line)
         # As EvalCallback does; a later evaluation in the same rollout would replace these values.
         self.logger.dump(self.num_timesteps)
-        self.stopped = not self._should_continue(*latest)
+        # The start is no result of the training.
+        self.stopped = self.num_timesteps > 0 and not self._should_continue(*latest)
 
 
 @dataclass
@@ -269,63 +271,38 @@ def score(row: StrDict, by: str) -> Score:
 
 
 def fly_episodes(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
-    """Return the arrays of an evaluation, (n_episodes,) each, in the order of the rows.
+    """Return the arrays of an evaluation that the environments report, (n_episodes,) each.
 
-    As in SB3's ``evaluate_policy``, the rows share the episodes evenly. In the same order the same
-    episodes of two models stand side by side, whichever ends first.
+    They are in the order of the rows, so that the same episodes of two models stand side by side,
+    whichever ends first.
 
-    :param env: rewards are those that it returns, as its outermost wrapper changed them.
+    :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
-    shares = (n_episodes + np.arange(env.num_envs)) // env.num_envs
-    ends: list[list[StrDict]] = [[] for _ in shares]
-    rewards = np.zeros(env.num_envs)
-    lengths = np.zeros(env.num_envs, int)
+    rows = []
+    own = []
+    ends = []
+
+    def note(local_variables: StrDict, global_variables: StrDict) -> None:
+        if not local_variables["done"]:
+            return
+        rows.append(local_variables["i"])
+        own.append(local_variables["current_rewards"][rows[-1]])
+        ends.append(local_variables["info"])
+        # evaluate_policy would count no episode and never end.
+        if local_variables.get("is_monitor_wrapped") and "episode" not in ends[-1]:
+            raise TrainingError(
+                "evaluation: a wrapper drops info['episode'], by which SB3 counts episodes"
+            )
+
     env.seed(seed)
-    observations = env.reset()
-    predict = _predict_of(model)
-    states = None
-    starts = np.ones(env.num_envs, bool)
-    while any(len(row) < share for row, share in zip(ends, shares, strict=True)):
-        actions, states = predict(
-            observations, state=states, episode_start=starts, deterministic=True
-        )
-        observations, gained, starts, infos = env.step(actions)
-        rewards += gained
-        lengths += 1
-        for row in np.flatnonzero(starts):
-            ends[row].append({**infos[row], "flown": (rewards[row], lengths[row])})
-        rewards[starts] = 0.0
-        lengths[starts] = 0
-    counted = []
-    for row, share in zip(ends, shares, strict=True):
-        counted += row[:share]
-    return _arrays(counted)
-
-
-def _predict_of(model: Any) -> Callable[..., tuple[Any, Any]]:
-    """Return the ``predict`` of a model, with a compiled network if there is one."""
-    network = None
-    if type(model).predict is BaseAlgorithm.predict:
-        network = plugin("accelerate")(model.policy)
-    if network is None:
-        return model.predict  # type: ignore[no-any-return]
-    space = model.action_space
-    return lambda seen, **_: (network.means(seen).clip(space.low, space.high), None)
-
-
-def _arrays(ends: list[StrDict]) -> StrDict:
-    """Return the arrays of episodes, given the last info of each, with ``"flown"``: its reward and
-    its length.
-    """
-    results, lengths = map(np.array, zip(*(info["flown"] for info in ends), strict=True))
-    values: StrDict = {"results": results, "ep_lengths": lengths}
-    # What SB3's Monitor recorded below the wrappers, rounded, from which float32 differs a little.
-    episodes = [info.get("episode", {}) for info in ends]
-    own = np.array([episode.get("r", np.nan) for episode in episodes])
-    if np.allclose(results, own, rtol=1e-4, atol=1e-3):
-        values["results"] = own
-    elif not np.isnan(own).any():
-        values["task_results"] = own
+    # Monitor, below the wrappers, records the task's own rewards.
+    rewards, lengths = evaluate_policy(
+        model, env, n_episodes, callback=note, return_episode_rewards=True, warn=False
+    )
+    values: StrDict = {"results": rewards, "ep_lengths": lengths}
+    # It rounds sums, and the rewards of environments are float32.
+    if not np.allclose(rewards, own, rtol=1e-4, atol=1e-3):
+        values |= {"results": own, "task_results": rewards}
     for name, key in REPORTED.items():
         array = np.array([info.get(key, np.nan) for info in ends], np.float64)
         if key == "distance":
@@ -336,4 +313,5 @@ def _arrays(ends: list[StrDict]) -> StrDict:
     # Some environments report successes but not failures.
     if "successes" in values:
         values["successes"] = np.nan_to_num(values["successes"])
-    return values
+    order = np.argsort(rows, kind="stable")
+    return {name: np.asarray(array)[order] for name, array in values.items()}

@@ -8,12 +8,14 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 
+from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
 from sb3_quad.cli import main
 from sb3_quad.evaluation.offset_correction import Correction
 from sb3_quad.training import pipeline as pipeline_module
+from sb3_quad.training import rivals
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs
 from sb3_quad.training.trainer import train
 
@@ -192,7 +194,8 @@ def test_a_stage_that_is_done_is_not_trained_again(tmp_path, job, monkeypatch):
     """Neither after a kill at any moment, nor if a callback ended it early."""
     stops = "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes"
     early = {**ONE, "name": "early", "settings": {"callback": [{stops: {"max_episodes": 1}}]}}
-    corrected = {**ONE, "correct_offset": 1.0}
+    # What it learnt in so short a time could be worse, and then nothing is corrected.
+    corrected = {**ONE, "correct_offset": 1.0, "settings": {"learning_rate": 0.0}}
     folder = tmp_path / "logs" / "stages" / "stages_1"
 
     def corrects(model, seed, settings, scale):
@@ -313,3 +316,28 @@ def test_a_last_stage_below_the_one_before_hands_over_the_earlier_agent(
         start, *_, end = file["results"].mean(axis=1)
     assert end < start
     assert main(["train", "--resume", str(folder)]) == 1
+
+
+def test_on_a_vehicle_it_starts_from_the_best_agent_there_and_hands_over_none_below(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rivals, "EPISODES", 4)
+    short = {**TINY, "eval_env_kwargs": {"max_episode_steps": 100}}
+    two = {**ONE, "name": "two", "algo": "apg", "env": TWO["env"], "conf_file": "apg.yml"}
+    two["settings"] = {"n_envs": 8, "n_steps": 50, "n_timesteps": 400}
+    two |= {"rivals": ["any-quadcopter", "geometric"], "rival_settings": {"learning_rate": 0.9}}
+    two["settings"]["eval_env_kwargs"] = short["eval_env_kwargs"]
+    write(tmp_path, {**ONE, "settings": short}, two)
+    command = "train --conf-file stages.yml --eval-episodes 4 --no-progress --env-kwargs"
+    assert main([*command.split(), "vehicle:crazyflie"]) == 1
+    output = capsys.readouterr().out
+    (folder,) = (tmp_path / "logs" / "stages").iterdir()
+    agent = folder / "any-quadcopter.zip"
+    assert f"from {agent.relative_to(tmp_path)}" in output
+    for name in ("one", "any-quadcopter", "geometric", "two"):
+        assert f"\n{name}: survival 100.0 %, " in output
+    assert agent_settings(agent)[0].vehicle.name == "crazyflie"
+    status = yaml.safe_load((folder / "pipeline.yml").read_text())
+    assert tmp_path / "logs" / status["agent"] == agent
+    assert "any-quadcopter (handed over)" in output

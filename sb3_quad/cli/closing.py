@@ -71,8 +71,9 @@ def close_run(result: TrainingResult) -> int:
     if result.job.config.task:
         model = result.model if handed.agent == run.model else load_model(handed.agent)
         print_agent(result.job, model)
-    if handed.reward is not None:
-        print(f"mean reward as trained: {handed.reward:.2f}; a table shows the task's own")
+    if "task_results" in handed.row:
+        reward = handed.row["results"].mean()
+        print(f"mean reward as trained: {reward:.2f}; a table shows the task's own")
     if handed.is_start:
         why = handed.problem or "no evaluation is better than that of its start"
         print(f"{why}; the agent is the one it started from, {result.job.initial_policy}")

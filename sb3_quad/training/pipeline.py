@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, field_validator
 
 from sb3_quad.agents.zips import load_zip
@@ -21,6 +22,7 @@ from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, Share, validate
 from sb3_quad.base.yaml_files import write_yaml
+from sb3_quad.callbacks.best_model import RATES
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.evaluation.offset_correction import correct_offset
 from sb3_quad.training.config import (
@@ -43,7 +45,6 @@ from sb3_quad.training.options import (
 from sb3_quad.training.rivals import (
     EPISODES,
     Flown,
-    best_start,
     fly_agent,
     fly_rivals,
     with_vehicle,
@@ -80,6 +81,8 @@ class Stage(Frozen):
     rivals: list[str] = []
     """agents of the package and experts that first fly the vehicle, if one is given; an agent that
     is above that of the stage before is what the stage starts from"""
+    rival_settings: StrDict = {}
+    """changes to the settings if it starts from a rival, whose network may be larger"""
     eval_freq: int | None = None
     """timesteps between evaluations of this stage"""
     eval_episodes: PositiveInt | None = None
@@ -212,7 +215,10 @@ def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
         agent = load_agent(options["initial_policy"])
     algo = options.get("algo") or DEFAULT_ALGO
     env = options.get("env") or DEFAULT_ENV
-    return Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes, agent=agent)
+    # Nothing follows that a bad agent could spoil, and a sweep compares any.
+    return Stage(
+        name=algo, algo=algo, env=env, conf_file=file, settings=changes, agent=agent, require={}
+    )
 
 
 def run_pipeline(
@@ -262,7 +268,7 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         # The evaluations of a stage may differ from those of the pipeline.
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**own, **job, "config": config}, where)
-        if "require" in stage.model_fields_set and made.eval_episodes == 0:
+        if stage.require and "require" in stage.model_fields_set and made.eval_episodes == 0:
             raise ConfigError(f"{where}: require: needs evaluations; give --eval-episodes")
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
@@ -321,7 +327,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                 flown: list[Flown] = []
                 if handed is not None and stage.rivals and with_vehicle(job):
                     flown = _fly_all(stages[number - 1].name, stage, job, folder, report)
-                    job = best_start(flown)
+                    job = _best(flown).job or job
                 state = state_of(runs, number, job.config.n_timesteps)
                 if state == "done":
                     run = runs[number]
@@ -340,7 +346,14 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                     break
                 handed = _agent(stage, job, run, report)
                 if flown:
-                    handed = _or_rival(handed, stage.name, job, flown, report)
+                    after = job.model_copy(update={"initial_policy": str(handed.agent)})
+                    flown.insert(0, fly_agent(stage.name, after))
+                    report(str(flown[0]))
+                    best = _best(flown)
+                    if best.job is not after:
+                        agent = Path(str(best.job.initial_policy))
+                        problem = f"{best.label} flies this vehicle better"
+                        handed = HandOver(agent, {}, problem=problem)
                 results[stage.name] = StageResult(
                     str(run.path), str(handed.agent), run.timesteps, seconds
                 )
@@ -381,24 +394,17 @@ def _fly_all(
     tasks = " and ".join(map(str, (job.flight_settings.task, *job.config.eval_tasks)))
     report(f"on this vehicle, {EPISODES} flights of {tasks} each:")
     agent = fly_agent(name, job)
-    report(agent.line)
-    return [agent, *fly_rivals(stage.rivals, job, folder, report)]
+    report(str(agent))
+    return [agent, *fly_rivals(stage.rivals, job, stage.rival_settings, folder, report)]
 
 
-def _or_rival(
-    handed: HandOver, name: str, job: TrainingJob, flown: list[Flown], report: Report
-) -> HandOver:
-    """Return what a stage hands over, or what flew the vehicle before and does so better."""
-    agent = fly_agent(name, job.model_copy(update={"initial_policy": str(handed.agent)}))
-    report(agent.line)
-    for rival in flown:
-        if rival.job is not None and rival.is_above(agent):
-            agent = rival
-            problem = f"{rival.label} flies this vehicle better"
-            handed = HandOver(Path(str(rival.job.initial_policy)), {}, None, True, problem)
-    if agent in flown:
-        report(f"{name}: {handed.problem}; it hands over {handed.agent}")
-    return handed
+def _best(flown: list[Flown]) -> Flown:
+    """Return the best agent; one that comes first has to be beaten."""
+    best, *others = flown
+    for other in others:
+        if other.job is not None and best.is_behind(other):
+            best = other
+    return best
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> HandOver:
@@ -410,7 +416,7 @@ def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Ha
     # Environments of others need not report the rate that is required by default.
     unknown = 0.0 if "require" in stage.model_fields_set else 1.0
     for name, required in stage.require.items():
-        rate = handed.rates.get(name, unknown)
+        rate = np.mean(handed.row.get(RATES[name.removesuffix("_rate")], unknown))
         if rate < required:
             raise TrainingError(
                 f"stage {stage.name!r}: {name} {rate:.3f} "

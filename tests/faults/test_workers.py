@@ -7,6 +7,7 @@ import signal
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
@@ -82,6 +83,49 @@ def hover(vehicle):
 
 def exits(vehicle):
     sys.exit(0)
+
+
+class DropsInfo(gymnasium.Wrapper):
+    """A wrapper that keeps what Monitor adds to itself."""
+
+    def step(self, action):
+        *outcome, _ = self.env.step(action)
+        return *outcome, {}
+
+
+@pytest.mark.timeout(100)
+def test_evaluations_that_would_never_end_say_why(tmp_path, capsys):
+    (tmp_path / "settings.yml").write_text(
+        "Pendulum-v1: {n_steps: 10, batch_size: 10, vec_env: dummy, "
+        "env_wrapper: test_workers.DropsInfo}"
+    )
+    command = [
+        "train",
+        "--algo",
+        "ppo",
+        "--env",
+        "Pendulum-v1",
+        "-n",
+        "20",
+        "-f",
+        str(tmp_path),
+        "--eval-freq",
+        "10",
+    ]
+    assert (
+        main(
+            [
+                *command,
+                "--conf-file",
+                str(tmp_path / "settings.yml"),
+                "--eval-episodes",
+                "1",
+                "--no-progress",
+            ]
+        )
+        == 2
+    )
+    assert "info['episode']" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_controller_that_exits_is_a_failure_and_the_others_fly(tmp_path, monkeypatch, capsys):
