@@ -325,7 +325,7 @@ def test_on_a_vehicle_it_starts_from_the_best_agent_there_and_hands_over_none_be
     monkeypatch.setattr(rivals, "EPISODES", 4)
     short = {**TINY, "eval_env_kwargs": {"max_episode_steps": 100}}
     two = {**ONE, "name": "two", "algo": "apg", "env": TWO["env"], "conf_file": "apg.yml"}
-    two["settings"] = {"n_envs": 8, "n_steps": 50, "n_timesteps": 400}
+    two["settings"] = {"n_envs": 8, "n_steps": 50, "n_timesteps": 1200}
     two |= {"rivals": ["any-quadcopter", "geometric"], "rival_settings": {"learning_rate": 0.9}}
     two["settings"]["eval_env_kwargs"] = short["eval_env_kwargs"]
     write(tmp_path, {**ONE, "settings": short}, two)
