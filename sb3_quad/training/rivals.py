@@ -55,10 +55,14 @@ class Flown(NamedTuple):
 
 
 def with_vehicle(job: TrainingJob) -> bool:
-    """Whether a job is for a vehicle that the user gave, without wrappers, which no rival knows."""
+    """Whether a job is for a vehicle that the user gave, is evaluated, and has no wrappers, which
+    no rival knows.
+    """
     config = job.config
+    if not config.task or "vehicle" not in config.env_kwargs or job.eval_episodes < 1:
+        return False
     wrapped = config.env_wrapper or config.vec_env_wrapper or config.normalize
-    return "vehicle" in config.env_kwargs and not (wrapped or config.flight_settings.vehicles)
+    return not (wrapped or config.flight_settings.vehicles)
 
 
 def fly_rivals(
