@@ -350,7 +350,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                     flown.insert(0, fly_agent(stage.name, after))
                     report(str(flown[0]))
                     best = _best(flown)
-                    if best.job is not after:
+                    if best.job is not None and best.job is not after:
                         agent = Path(str(best.job.initial_policy))
                         problem = f"{best.label} flies this vehicle better"
                         handed = HandOver(agent, {}, problem=problem)

@@ -81,13 +81,11 @@ def fly_rivals(
             if name in pretrained_names():
                 agent = load_pretrained(name)
                 settings = merged({**config.settings, **as_agent(agent, config, {})}, changes, name)
-                update = {
-                    "config": build_config(config.algo, config.env_id, settings, name),
-                    "initial_policy": str(folder / f"{name}.zip"),
-                }
-                own = job.model_copy(update=update)
+                own_config = build_config(config.algo, config.env_id, settings, name)
+                path = str(folder / f"{name}.zip")
+                own = job.model_copy(update={"config": own_config, "initial_policy": path})
                 own.flight_settings.write_into(agent)
-                save_model(agent, update["initial_policy"])
+                save_model(agent, path)
                 flown.append(fly_agent(name, own))
             else:
                 layout = config.flight_settings.rotor_layout
