@@ -25,6 +25,7 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "success_rate": ("successes", np.mean),
     "survival_rate": ("survivals", np.mean),
     "mean_reward": ("results", np.mean),
+    "task_reward": ("task_results", np.mean),
     "mean_ep_length": ("ep_lengths", np.mean),
     "final_error": ("final_errors", np.nanmedian),
 }
@@ -34,7 +35,7 @@ RATES = {"success": "successes", "survival": "survivals"}
 REPORTED = {"successes": "is_success", "survivals": "survival", "final_errors": "distance"}
 # Given the rate that decides and the mean reward of an evaluation, whether to continue.
 ShouldContinue = Callable[[float, float], bool]
-# The rate that decides, and the mean reward.
+# The rate that decides, 0 where the reward alone does, and the mean reward.
 Score = tuple[float, float]
 
 
@@ -43,19 +44,19 @@ class BestModel(EveryTimesteps):
 
     There is no evaluation at the end if a callback has ended the training earlier.
 
-    Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's
-    EvalCallback keeps the model of the highest mean reward; here a model that succeeds more often
-    is better, and reward decides between equals. An evaluation that is due at the last timestep is
-    made once, after the last update.
+    Every evaluation flies the same episodes, so that models are compared and not their luck. As in
+    SB3's EvalCallback, the best model has the highest mean reward. Rewards are counted as the
+    training sees them: if a wrapper changes them, the task's own are shown beside them and decide
+    nothing. An evaluation that is due at the last timestep is made once, after the last update.
 
     ``evaluations.npz`` is EvalCallback's with more arrays: ``seconds`` of training; ``survivals``
     and ``final_errors`` (m, NaN where the vehicle crashed or flew out of range), where environments
-    report them; and the losses of the latest update, by their names in the log such as
-    ``train/value_loss``.
+    report them; ``task_results``, where a wrapper changes rewards; and the losses of the latest
+    update, by their names in the log such as ``train/value_loss``.
 
     Logged at each evaluation are ``eval/mean_reward`` and ``eval/mean_ep_length``, and where they
-    are reported ``eval/success_rate``, ``eval/survival_rate`` and the median ``eval/final_error``;
-    for ``others`` they are under ``eval_<name>/``.
+    are reported ``eval/success_rate``, ``eval/survival_rate``, the median ``eval/final_error`` and
+    ``eval/task_reward``; for ``others`` they are under ``eval_<name>/``.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad.envs import QuadcopterVecEnv
@@ -88,7 +89,10 @@ class BestModel(EveryTimesteps):
         ``evaluations_<name>.npz`` next to ``evaluations``.
     :param should_continue: called after each evaluation with the rate and the mean reward that
         decide; False ends the training.
-    :param by: ``success`` or ``survival``: the rate that decides which model is best.
+    :param by: what decides which model is best: ``reward``; or ``success`` or ``survival``, a rate
+        that comes before the reward.
+    :param with_start: whether it also evaluates the model before the first rollout, which then may
+        be the best: for a training that starts from an agent.
     :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations``
         that cannot be read or flew another number of episodes.
     :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's
@@ -106,11 +110,12 @@ class BestModel(EveryTimesteps):
         report: Report = lambda line: None,
         others: Mapping[str, GymEnv] | None = None,
         should_continue: ShouldContinue = lambda success, reward: True,
-        by: str = "success",
+        by: str = "reward",
+        with_start: bool = False,
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
-        refuse_unknown("share", [by], RATES)
+        refuse_unknown("by", [by], ["reward", *RATES])
         if n_episodes < 1:
             raise ConfigError(f"BestModel: n_episodes is {n_episodes}, must be at least 1")
         self._n_episodes = n_episodes
@@ -118,7 +123,8 @@ class BestModel(EveryTimesteps):
         self._best_model = best_model
         self._report = report
         self._should_continue = should_continue
-        self._by = RATES[by]
+        self._by = RATES.get(by, "")
+        self._with_start = with_start
         path = Path(evaluations)
         self._own = _Evaluations(_vectorised(env), path)
         # By the prefix of their part of a report line.
@@ -137,6 +143,11 @@ class BestModel(EveryTimesteps):
             share_statistics(self.model.get_vec_normalize_env(), evaluations.env)
             refuse_other_wrappers(self.model, evaluations.env)
             evaluations.read(self._n_episodes)
+        is_new = self._with_start and self.num_timesteps == 0
+        if is_new:
+            # A kill may have left the row of the start without its model.
+            for evaluations in self._evaluations.values():
+                evaluations.rows = [row for row in evaluations.rows if row["timesteps"] > 0]
         # A resumed training continues the clock and knows the best model so far.
         self._start = time.perf_counter()
         for row in self._own.rows:
@@ -144,6 +155,8 @@ class BestModel(EveryTimesteps):
         if self._own.rows:
             self._start -= self._own.rows[-1].get("seconds", 0.0)
         self._last = last_timestep(self.model)
+        if is_new:
+            self.evaluate()
 
     def _on_event(self) -> bool:
         if self.num_timesteps < self._last:
@@ -171,7 +184,7 @@ class BestModel(EveryTimesteps):
         texts = []
         for prefix, evaluations in self._evaluations.items():
             share_statistics(self.model.get_vec_normalize_env(), evaluations.env)
-            flown = _fly(self.model, evaluations.env, self._n_episodes, self._seed)
+            flown = fly_episodes(self.model, evaluations.env, self._n_episodes, self._seed)
             evaluations.append({**values, **flown})
             text = prefix
             for name, (array, statistic) in LOGGED.items():
@@ -182,7 +195,10 @@ class BestModel(EveryTimesteps):
             for name, array in RATES.items():
                 if array in flown:
                     text += f"{name} {100 * np.mean(flown[array]):.1f} %, "
-            texts.append(f"{text}mean reward {np.mean(flown['results']):.2f}")
+            text += f"mean reward {np.mean(flown['results']):.2f}"
+            if "task_results" in flown:
+                text += f" (the task's own: {np.mean(flown['task_results']):.2f})"
+            texts.append(text)
         line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: {'; '.join(texts)}"
         if getattr(self.model, "policy_is_idle", False):
             line += " (critic warm-up: the policy does not learn yet)"
@@ -194,7 +210,8 @@ class BestModel(EveryTimesteps):
         self._report(line)
         # As EvalCallback does; a later evaluation in the same rollout would replace these values.
         self.logger.dump(self.num_timesteps)
-        self.stopped = not self._should_continue(*latest)
+        # The start is no result of the training.
+        self.stopped = self.num_timesteps > 0 and not self._should_continue(*latest)
 
 
 @dataclass
@@ -248,23 +265,30 @@ def _vectorised(env: GymEnv) -> VecEnv:
 
 
 def score(row: StrDict, by: str) -> Score:
-    """Return the score of an evaluation; without successes, the reward decides.
+    """Return the score of an evaluation; without the rate, the reward decides.
 
-    :param by: the array of the rate.
+    :param by: the array of the rate; empty: none.
     """
     return float(np.nan_to_num(np.mean(row.get(by, 0.0)))), float(np.mean(row["results"]))
 
 
-def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
+def fly_episodes(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
     """Return the arrays of an evaluation that the environments report, (n_episodes,) each.
+
+    They are in the order of the rows, so that the same episodes of two models stand side by side,
+    whichever ends first.
 
     :raises TrainingError: a wrapper drops ``info["episode"]`` of SB3's Monitor.
     """
+    rows = []
+    own = []
     ends = []
 
     def note(local_variables: StrDict, global_variables: StrDict) -> None:
         if not local_variables["done"]:
             return
+        rows.append(local_variables["i"])
+        own.append(local_variables["current_rewards"][rows[-1]])
         ends.append(local_variables["info"])
         # evaluate_policy would count no episode and never end.
         if local_variables.get("is_monitor_wrapped") and "episode" not in ends[-1]:
@@ -273,10 +297,14 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
             )
 
     env.seed(seed)
+    # Monitor, below the wrappers, records the task's own rewards.
     rewards, lengths = evaluate_policy(
         model, env, n_episodes, callback=note, return_episode_rewards=True, warn=False
     )
     values: StrDict = {"results": rewards, "ep_lengths": lengths}
+    # It rounds sums, and the rewards of environments are float32.
+    if not np.allclose(rewards, own, rtol=1e-4, atol=1e-3):
+        values |= {"results": own, "task_results": rewards}
     for name, key in REPORTED.items():
         array = np.array([info.get(key, np.nan) for info in ends], np.float64)
         if key == "distance":
@@ -287,4 +315,5 @@ def _fly(model: Any, env: VecEnv, n_episodes: int, seed: int) -> StrDict:
     # Some environments report successes but not failures.
     if "successes" in values:
         values["successes"] = np.nan_to_num(values["successes"])
-    return values
+    order = np.argsort(rows, kind="stable")
+    return {name: np.asarray(array)[order] for name, array in values.items()}

@@ -9,13 +9,15 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.results_plotter import load_results
+from stable_baselines3.common.vec_env import VecEnvWrapper
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.callbacks import best_model, every
-from sb3_quad.callbacks.best_model import BestModel
+from sb3_quad.callbacks.best_model import BestModel, fly_episodes
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
 from sb3_quad.callbacks.snapshot import random_state, set_random_state
 from sb3_quad.envs import QuadcopterVecEnv
@@ -85,7 +87,7 @@ def test_evaluations_are_regular_and_recorded(tmp_path):
         )
         assert (np.diff(file["seconds"]) >= 0).all()
         means = file["results"].mean(axis=1), file["successes"].mean(axis=1)
-    assert best.best == max(zip(means[1].tolist(), means[0].tolist(), strict=True))
+    assert best.best == (0.0, max(means[0]))
     assert len(lines) == 5
     assert (tmp_path / "best_model.zip").is_file()
 
@@ -128,8 +130,15 @@ def test_the_final_error_is_the_median_of_the_flights_that_survive(tmp_path):
     assert f"survival {100 * flown.survival.mean():.1f} %, mean reward" in lines[0]
 
 
-def test_success_comes_before_reward(tmp_path, monkeypatch):
-    best = make_best(tmp_path)
+@pytest.mark.parametrize(
+    ("by", "better"),
+    [
+        ("success", [(0.5, 10.0), (1.0, -5.0), (1.0, -4.0)]),
+        ("reward", [(0.0, 10.0), (0.0, 99.0)]),
+    ],
+)
+def test_reward_decides_or_a_rate_that_comes_before_it(tmp_path, monkeypatch, by, better):
+    best = make_best(tmp_path, by=by)
     model = make_model()
     model.set_logger(configure(None, []))
     best.init_callback(model)
@@ -137,15 +146,56 @@ def test_success_comes_before_reward(tmp_path, monkeypatch):
     kept = []
     monkeypatch.setattr(best_model, "save_model", lambda model, path: kept.append(best.best))
     for success, reward in [(0.5, 10.0), (1.0, -5.0), (0.5, 99.0), (1.0, -5.0), (1.0, -4.0)]:
-
-        def evaluate(model, env, n, callback, success=success, reward=reward, **kwargs):
-            for value in np.arange(4) < 4 * success:
-                callback({"done": True, "info": {"is_success": value}}, {})
-            return [reward] * 4, [10] * 4
-
-        monkeypatch.setattr(best_model, "evaluate_policy", evaluate)
+        flown = {"results": np.full(4, reward), "successes": np.arange(4) < 4 * success}
+        monkeypatch.setattr(best_model, "fly_episodes", lambda *given, flown=flown: flown)
         best.evaluate()
-    assert kept == [(0.5, 10.0), (1.0, -5.0), (1.0, -4.0)]
+    assert kept == better
+
+
+def test_the_start_is_evaluated_and_kept_until_a_model_is_better(tmp_path):
+    lines = []
+    best = make_best(tmp_path, with_start=True, report=lines.append)
+    model = make_model(learning_rate=0.0)
+    model.learn(80, callback=best)
+    assert [line.endswith("(best so far)") for line in lines] == [True, False]
+    assert PPO.load(tmp_path / "best_model.zip").num_timesteps == 0
+    # A training that was killed before its first rollout begins again.
+    again = make_best(tmp_path, with_start=True)
+    make_model().learn(80, callback=again)
+    with np.load(tmp_path / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [80, 0, 80]
+
+
+class Own(VecEnvWrapper):
+    """A reward of the user's own, ten for each step."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, np.full_like(rewards, 10.0), dones, infos
+
+
+def test_the_reward_that_is_trained_decides_and_the_tasks_own_stands_beside_it(tmp_path):
+    lines = []
+    env = Own(make_vec_env(Walk, 2))
+    files = tmp_path / "best_model.zip", tmp_path / "evaluations.npz"
+    best = BestModel(env, 1000, 4, 5, *files, lines.append)
+    model = make_model()
+    model.learn(80, callback=best)
+    own, _ = evaluate_policy(model, env, 4)
+    with np.load(files[1]) as file:
+        assert file["results"].tolist() == [[100.0] * 4]
+        assert file["task_results"].mean() == pytest.approx(own, abs=0.5)
+    assert best.best == (0.0, 100.0)
+    assert "mean reward 100.00 (the task's own: " in lines[0]
+
+
+def test_the_same_episodes_stand_side_by_side_whichever_ends_first():
+    env = QuadcopterVecEnv(3, max_episode_steps=[20, 10, 5])
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=30, device="cpu")
+    assert fly_episodes(model, env, 6, 0)["ep_lengths"].tolist() == [20, 20, 10, 10, 5, 5]
 
 
 def test_other_environments_are_evaluated_at_the_same_times_and_decide_nothing(tmp_path):

@@ -126,7 +126,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys, monkeypatc
     assert main([*command, *flags.split(), "--hyperparams", "eval_tasks:state_recovery"]) == 0
     output = capsys.readouterr().out
     run = Path("logs", "dagger", f"{ENV}_1")
-    for part in ("agent", "expert", "success", f"{ENV}.zip, the last one", str(run)):
+    for part in ("agent", "expert", "success", f"the last one is {run / ENV}.zip", str(run)):
         assert part in output
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
@@ -290,6 +290,25 @@ def test_every_zip_of_a_run_says_how_it_flies_and_its_successor_flies_as_it(
     assert loaded == [str(run.best_model)]
     (successor,) = Path("logs", "ppo").glob(f"{ENV}_*/{ENV}.zip")
     assert agent_settings(successor)[0].observation_std == std
+
+
+def test_a_run_that_ends_below_its_start_hands_the_start_over(tmp_path, capsys):
+    """It says so, the zip that its commands name is the start, and the exit code is 1."""
+    command = f"train --algo apg --env QuadStateRecovery-v0 -i itm-recovery -f {tmp_path}"
+    command += " --n-envs 8 -n 1600 --eval-episodes 8 --eval-freq 800 --no-progress"
+    command += " --eval-env-kwargs max_episode_steps:300 --hyperparams learning_rate:0.5"
+    assert main([*command.split(), "n_steps:100"]) == 1
+    output = capsys.readouterr().out
+    run = tmp_path / "apg" / "QuadStateRecovery-v0_1"
+    assert "the agent is the one it started from, " in output and "itm-recovery.zip" in output
+    assert all(
+        str(run / "best_model.zip") in line for line in output.split("next:\n")[1].splitlines()
+    )
+    start = sb3_quad.load_pretrained("itm-recovery").policy.action_net.weight
+    assert torch.equal(PPO.load(run / "best_model.zip").policy.action_net.weight, start)
+    assert not torch.equal(
+        PPO.load(run / "QuadStateRecovery-v0.zip").policy.action_net.weight, start
+    )
 
 
 def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys):

@@ -8,12 +8,14 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 
+from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
 from sb3_quad.cli import main
 from sb3_quad.evaluation.offset_correction import Correction
 from sb3_quad.training import pipeline as pipeline_module
+from sb3_quad.training import rivals
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs
 from sb3_quad.training.trainer import train
 
@@ -25,12 +27,19 @@ TINY = {
     "env_kwargs": {"max_episode_steps": 12},
     "policy_kwargs": {"net_arch": [8, 8]},
 }
-ONE = {"name": "one", "algo": "dagger", "env": "QuadTargetTracking-v0", "pass_on": "last"}
+ONE = {
+    "name": "one",
+    "algo": "dagger",
+    "env": "QuadTargetTracking-v0",
+    "pass_on": "last",
+    "require": {},  # agents that have hardly learnt crash
+}
 TWO = {
     "name": "two",
     "algo": "ppo_bc",
     "env": "QuadStateRecovery-v0",
     "pass_on": "last",
+    "require": {},
     "settings": {"n_epochs": 1, "learning_rate": 0.0},
 }
 
@@ -88,8 +97,13 @@ def test_each_stage_starts_from_the_corrected_agent_of_the_one_before(tmp_path, 
     assert runs == [entry.run for entry in result.stages.values()]
 
 
-def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
-    stages = tiny(tmp_path, {**ONE, "require": {"success_rate": 1.0}}, TWO)
+@pytest.mark.parametrize("require", [{"success_rate": 1.0}, None])
+def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job, require):
+    """By default, half of the flights have to survive."""
+    one = {**ONE, "require": require, "settings": {"eval_env_kwargs": {"max_episode_steps": 1500}}}
+    if require is None:
+        del one["require"]
+    stages = tiny(tmp_path, one, TWO)
     with pytest.raises(TrainingError, match="'one'"):
         run_pipeline(stages, job, "stages", quiet)
     assert not (tmp_path / "logs" / "ppo_bc").exists()
@@ -180,7 +194,8 @@ def test_a_stage_that_is_done_is_not_trained_again(tmp_path, job, monkeypatch):
     """Neither after a kill at any moment, nor if a callback ended it early."""
     stops = "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes"
     early = {**ONE, "name": "early", "settings": {"callback": [{stops: {"max_episodes": 1}}]}}
-    corrected = {**ONE, "correct_offset": 1.0}
+    # What it learnt in so short a time could be worse, and then nothing is corrected.
+    corrected = {**ONE, "correct_offset": 1.0, "settings": {"learning_rate": 0.0}}
     folder = tmp_path / "logs" / "stages" / "stages_1"
 
     def corrects(model, seed, settings, scale):
@@ -272,3 +287,57 @@ def test_flags_of_evaluations_hold_for_all_stages(tmp_path):
     asks = load_pipeline(write(tmp_path, {**own, "require": {"success_rate": 0.9}}))
     with pytest.raises(ConfigError, match="require"):
         stage_jobs(asks, {"eval_episodes": 0})
+
+
+def test_a_last_stage_below_the_one_before_hands_over_the_earlier_agent(
+    tmp_path, monkeypatch, capsys
+):
+    """Table, commands, files and the exit code say so, also when the pipeline is resumed."""
+    monkeypatch.chdir(tmp_path)
+    short = {**TINY, "eval_env_kwargs": {"max_episode_steps": 60}}
+    ruined = {**short, "learning_rate": 1.0, "n_epochs": 1, "critic_warmup": 0}
+    one = {**ONE, "env": TWO["env"], "settings": {**short, "n_timesteps": 2560}}
+    write(tmp_path, one, {**TWO, "pass_on": "best", "settings": ruined})
+    command = ["train", "--conf-file", "stages.yml", "--eval-episodes", "16", "--no-progress"]
+    assert main(command) == 1
+    output = capsys.readouterr().out
+    earlier = f"logs/dagger/{TWO['env']}_1/{TWO['env']}.zip"
+    (folder,) = (tmp_path / "logs" / "stages").iterdir()
+    status = yaml.safe_load((folder / "pipeline.yml").read_text())
+    assert f"logs/{status['agent']}" == earlier
+    assert "one (handed over)" in output and "two: mean reward" in output
+    assert all(earlier in line for line in output.split("next:\n")[1].splitlines())
+    # The run of the last stage has the earlier agent, too.
+    last = tmp_path / "logs" / "ppo_bc" / f"{TWO['env']}_1"
+    one, two = policy(earlier), policy(last / "best_model.zip")
+    assert all(np.array_equal(one[key], two[key]) for key in one if key != "log_std")
+    with np.load(last / "evaluations.npz") as file:
+        assert file["timesteps"][0] == 0
+        start, *_, end = file["results"].mean(axis=1)
+    assert end < start
+    assert main(["train", "--resume", str(folder)]) == 1
+
+
+def test_on_a_vehicle_it_starts_from_the_best_agent_there_and_hands_over_none_below(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rivals, "EPISODES", 4)
+    short = {**TINY, "eval_env_kwargs": {"max_episode_steps": 100}}
+    two = {**ONE, "name": "two", "algo": "apg", "env": TWO["env"], "conf_file": "apg.yml"}
+    two["settings"] = {"n_envs": 8, "n_steps": 50, "n_timesteps": 1200}
+    two |= {"rivals": ["any-quadcopter", "geometric"], "rival_settings": {"learning_rate": 0.9}}
+    two["settings"]["eval_env_kwargs"] = short["eval_env_kwargs"]
+    write(tmp_path, {**ONE, "settings": short}, two)
+    command = "train --conf-file stages.yml --eval-episodes 4 --no-progress --env-kwargs"
+    assert main([*command.split(), "vehicle:crazyflie"]) == 1
+    output = capsys.readouterr().out
+    (folder,) = (tmp_path / "logs" / "stages").iterdir()
+    agent = folder / "any-quadcopter.zip"
+    assert f"from {agent.relative_to(tmp_path)}" in output
+    for name in ("one", "any-quadcopter", "geometric", "two"):
+        assert f"\n{name}: survival 100.0 %, " in output
+    assert agent_settings(agent)[0].vehicle.name == "crazyflie"
+    status = yaml.safe_load((folder / "pipeline.yml").read_text())
+    assert tmp_path / "logs" / status["agent"] == agent
+    assert "any-quadcopter (handed over)" in output

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 from sb3_quad.base.errors import ConfigError
@@ -21,6 +22,15 @@ def test_runs_are_numbered_and_never_reused(tmp_path):
     (tmp_path / "dagger" / f"{ENV}_notes").mkdir()
     assert claim_run(tmp_path, "dagger", ENV).path.name == f"{ENV}_8"
     assert claim_run(tmp_path, "ppo", ENV).path.name == f"{ENV}_1"
+
+
+def test_a_run_whose_start_alone_was_evaluated_has_not_begun(tmp_path):
+    run = claim_run(tmp_path, "apg", ENV)
+    assert run.not_begun
+    run.best_model.touch()
+    for timesteps, expected in (([0], True), ([0, 400], False)):
+        np.savez(run.evaluations, timesteps=timesteps)
+        assert run.not_begun == expected
 
 
 def test_the_latest_run_is_the_latest_with_an_agent(tmp_path):

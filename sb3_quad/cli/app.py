@@ -38,7 +38,8 @@ EPILOG = """examples:
 exit codes:
   0    done
   1    some controllers of an evaluation or runs of a sweep failed (each has a
-       line on stderr), or a vehicle cannot hover
+       line on stderr), a vehicle cannot hover, or a training ended below the
+       agent that it started from, which it hands over
   2    bad input, a training that cannot continue, or any other error; one line
        on stderr says what (--traceback after the command shows where)
   129  the terminal was closed (SIGHUP), after saving

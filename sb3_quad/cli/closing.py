@@ -4,10 +4,11 @@ The tables are of fresh episodes, the same for all.
 """
 
 import shlex
+from pathlib import Path
 from typing import Any
 
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.agents.zips import saved_data
+from sb3_quad.agents.zips import load_model, saved_data
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli.output import console
@@ -16,6 +17,7 @@ from sb3_quad.envs.simulation.settings import KEY
 from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.training.config import TrainingJob
+from sb3_quad.training.hand_over import hand_over
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
 from sb3_quad.training.trainer import TrainingResult
@@ -59,29 +61,46 @@ def print_agent(job: TrainingJob, model: Any) -> None:
 
 
 def close_run(result: TrainingResult) -> int:
-    """Print the table of a single run's agent and where everything is. Returns the exit code."""
+    """Print the table of a single run's agent and where everything is. Returns the exit code: 1 if
+    the run ended below the agent that it started from.
+    """
     if result.exit_code != 0:
         return result.exit_code
+    run = result.run
+    handed = hand_over(run, result.job.config.best_by)
     if result.job.config.task:
-        print_agent(result.job, result.model)
-        run = result.run
-        if run.result != run.model:
-            print(f"agent: {run.model}, the last one; the commands below name {run.result.name}")
+        model = result.model if handed.agent == run.model else load_model(handed.agent)
+        print_agent(result.job, model)
+    if "task_results" in handed.row:
+        reward = handed.row["results"].mean()
+        print(f"mean reward as trained: {reward:.2f}; a table shows the task's own")
+    if handed.is_start:
+        why = handed.problem or "no evaluation is better than that of its start"
+        print(f"{why}; the agent is the one it started from, {result.job.initial_policy}")
+    if handed.agent != run.model:
+        print(f"agent: {handed.agent}, the best of its evaluations; the last one is {run.model}")
     # A complete run without evaluations does not know how long it took.
     if result.seconds:
         print(f"trained in {result.seconds:.1f} s")
-    print("saved in", result.run.path)
-    _print_next(result.run)
-    return 0
+    print("saved in", run.path)
+    _print_next(run, run.result)
+    return 1 if handed.problem else 0
 
 
 def close_pipeline(result: PipelineResult) -> int:
     """Print tables of all stages' agents or why there are none, and where everything is. Returns
-    the exit code.
+    the exit code: 1 if the last stage ended below an agent of before.
     """
-    if result.exit_code != 0:
+    if not result.agent:
         return result.exit_code
-    agents = {name: stage.agent for name, stage in result.stages.items()}
+    # A stage that ended below its start has no agent of its own.
+    labels: dict[str, str] = {}
+    for name, stage in result.stages.items():
+        is_rival = Path(stage.agent).parent == result.folder
+        labels.setdefault(stage.agent, Path(stage.agent).stem if is_rival else name)
+    if result.problem:
+        labels[result.agent] += " (handed over)"
+    agents = {label: agent for agent, label in labels.items()}
     # Training writes this into all agents that fly without wrappers.
     flown = {name: agent for name, agent in agents.items() if KEY in saved_data(agent)}
     if flown:
@@ -91,9 +110,11 @@ def close_pipeline(result: PipelineResult) -> int:
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print("saved in", result.folder)
-    *_, last = result.stages.values()
-    _print_next(open_run(last.run))
-    return 0
+    *_, (name, last) = result.stages.items()
+    if result.problem:
+        print(f"{name}: {result.problem}; the agent is {labels[result.agent]}, {result.agent}")
+    _print_next(open_run(last.run), Path(result.agent))
+    return result.exit_code
 
 
 def _print_stages(job: TrainingJob, agents: dict[str, str]) -> None:
@@ -112,18 +133,18 @@ def _print_stages(job: TrainingJob, agents: dict[str, str]) -> None:
         print("no tables:", error)
 
 
-def _print_next(run: RunFolder) -> None:
-    """Print the commands that show, measure and export the agent of a run.
+def _print_next(run: RunFolder, agent: Path) -> None:
+    """Print the commands that show, measure and export an agent, by the name of a run.
 
     Environments of other packages have no such commands, nor agents behind wrappers.
     """
-    if run.name not in ENVIRONMENTS or KEY not in saved_data(run.result):
+    if run.name not in ENVIRONMENTS or KEY not in saved_data(agent):
         return
     # An agent of many vehicles has none that export could take by itself.
-    settings, _ = agent_settings(run.result)
+    settings, _ = agent_settings(agent)
     print(
         NEXT.format(
-            agent=shlex.quote(str(run.result)),
+            agent=shlex.quote(str(agent)),
             label=shlex.quote(f"{run.path.parent.name}_{run.path.name}"),
             env=run.name,
             vehicle=" --vehicle itm" if settings.vehicles else "",

@@ -92,8 +92,8 @@ class TrainingConfig(Frozen):
     """override env_kwargs in the evaluation's environments"""
     eval_tasks: Annotated[list[str], BeforeValidator(as_list)] = []
     """more tasks to evaluate on; the job's own task decides which model is best"""
-    best_by: Literal["success", "survival"] = "success"
-    """the rate that decides which model is best"""
+    best_by: Literal["reward", "success", "survival"] = "reward"
+    """what decides which model is best; a rate comes before the reward"""
     policy: str = "MlpPolicy"
     policy_kwargs: Keywords = {}
     """mapping, or a string such as 'dict(net_arch=[64, 64])'"""

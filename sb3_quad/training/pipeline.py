@@ -4,6 +4,7 @@ The two stages of the thesis (4.2) form one. A pipeline's file lists its stages 
 ``zoo_configs/two_stage.yml`` does; :class:`Stage` describes the keys.
 """
 
+import os
 import shlex
 from collections.abc import Sequence
 from functools import partial
@@ -21,8 +22,8 @@ from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.types import Report, StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, Share, validate
 from sb3_quad.base.yaml_files import write_yaml
+from sb3_quad.callbacks.best_model import RATES
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.evaluation.offset_correction import correct_offset
 from sb3_quad.training.config import (
     SETTINGS,
@@ -34,11 +35,19 @@ from sb3_quad.training.config import (
     merged,
     with_absolute_paths,
 )
+from sb3_quad.training.hand_over import HandOver, hand_over
 from sb3_quad.training.options import (
     DEFAULT_ALGO,
     DEFAULT_ENV,
     DEFAULT_PIPELINE,
     KEPT_BY_STAGES,
+)
+from sb3_quad.training.rivals import (
+    EPISODES,
+    Flown,
+    fly_agent,
+    fly_rivals,
+    with_vehicle,
 )
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run, refuse_elsewhere
 from sb3_quad.training.trainer import resume, train
@@ -63,11 +72,17 @@ class Stage(Frozen):
     seed_offset: NonNegativeInt = 0
     """added to the seed, so that stages on the same task fly different episodes"""
     pass_on: Literal["best", "last"] = "best"
-    """best: the agent of the best evaluation, by best_by of its settings"""
+    """best: the agent of the best evaluation, by best_by of its settings, be it the one that the
+    stage starts from; last: the last one, unless it is below that one"""
     correct_offset: PositiveFloat | None = None
     """offset correction after the stage: α of Eq. 4.10, such as 0.7; 1: only the offset"""
-    require: dict[Literal["success_rate"], Share] = {}
-    """the least that its best evaluation must reach; otherwise the pipeline stops"""
+    require: dict[Literal["success_rate", "survival_rate"], Share] = {"survival_rate": 0.5}
+    """the least that the evaluation of its agent must reach; otherwise the pipeline stops"""
+    rivals: list[str] = []
+    """agents of the package and experts that first fly the vehicle, if one is given; an agent that
+    is above that of the stage before is what the stage starts from"""
+    rival_settings: StrDict = {}
+    """changes to the settings if it starts from a rival, whose network may be larger"""
     eval_freq: int | None = None
     """timesteps between evaluations of this stage"""
     eval_episodes: PositiveInt | None = None
@@ -114,12 +129,14 @@ class Status(Pipeline):
     """options of every job"""
     runs: list[str]
     """the run folders of the stages that have begun, in the log folder"""
+    agent: str = ""
+    """the zip that is handed over at the end, by its path from the log folder"""
 
 
 class StageResult(NamedTuple):
     """A finished stage.
 
-    :param run: its run folder.
+    :param run: its run folder. The agent is in another one if the stage ended below its start.
     :param agent: the zip that is passed on.
     :param seconds: time of training; if it was resumed, since then; 0 if it was done before.
     """
@@ -133,14 +150,19 @@ class StageResult(NamedTuple):
 class PipelineResult(NamedTuple):
     """How a pipeline ended.
 
-    :param stages: the finished stages by name. After an interruption, some are missing and
-        ``exit_code`` is not 0.
+    :param stages: the finished stages by name. After an interruption, some are missing.
     :param job: the job of the first stage.
+    :param agent: the zip that is handed over; empty after an interruption.
+    :param problem: why it is not that of the last stage; empty if it is.
+    :param exit_code: 1 if there is a problem; otherwise as of a
+        :class:`~sb3_quad.training.trainer.TrainingResult`.
     """
 
     folder: Path
     stages: dict[str, StageResult]
     job: TrainingJob
+    agent: str = ""
+    problem: str = ""
     exit_code: int = 0
 
 
@@ -193,7 +215,10 @@ def plan_training(options: StrMapping, changes: StrDict) -> Pipeline | Stage:
         agent = load_agent(options["initial_policy"])
     algo = options.get("algo") or DEFAULT_ALGO
     env = options.get("env") or DEFAULT_ENV
-    return Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes, agent=agent)
+    # Nothing follows that a bad agent could spoil, and a sweep compares any.
+    return Stage(
+        name=algo, algo=algo, env=env, conf_file=file, settings=changes, agent=agent, require={}
+    )
 
 
 def run_pipeline(
@@ -243,7 +268,7 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
         # The evaluations of a stage may differ from those of the pipeline.
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**own, **job, "config": config}, where)
-        if stage.require and made.eval_episodes == 0:
+        if stage.require and "require" in stage.model_fields_set and made.eval_episodes == 0:
             raise ConfigError(f"{where}: require: needs evaluations; give --eval-episodes")
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
@@ -287,19 +312,24 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
         refuse_links(log_folder / name)
         runs.append(open_run(log_folder / name))
     results: dict[str, StageResult] = {}
-    agent = None
+    handed: HandOver | None = None
 
     def note(number: int, run: RunFolder) -> None:
         """Record a stage's run folder before its training begins."""
         runs[number:] = [run]
         names = [run.path.absolute().relative_to(log_folder).as_posix() for run in runs]
-        write_yaml(folder / STATUS_FILE, {**content, "runs": names})
+        content["runs"] = names
+        write_yaml(folder / STATUS_FILE, content)
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
         try:
             for number, (stage, job) in enumerate(zip(stages, jobs, strict=True)):
-                if agent is not None:
-                    job = job.model_copy(update={"initial_policy": str(agent)})
+                if handed is not None:
+                    job = job.model_copy(update={"initial_policy": str(handed.agent)})
+                flown: list[Flown] = []
+                if handed is not None and stage.rivals and with_vehicle(job):
+                    flown = _fly_all(stages[number - 1].name, stage, job, folder, report)
+                    job = _best(flown).job or job
                 state = state_of(runs, number, job.config.n_timesteps)
                 if state == "done":
                     run = runs[number]
@@ -316,14 +346,30 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                 # ``signals`` also has the signal that ended a training.
                 if signals.received:
                     break
-                agent = _agent(stage, job, run, report)
-                results[stage.name] = StageResult(str(run.path), str(agent), run.timesteps, seconds)
+                handed = _agent(stage, job, run, report)
+                if flown:
+                    after = job.model_copy(update={"initial_policy": str(handed.agent)})
+                    flown.insert(0, fly_agent(stage.name, after))
+                    report(str(flown[0]))
+                    best = _best(flown)
+                    if best.job is not None and best.job is not after:
+                        agent = Path(str(best.job.initial_policy))
+                        problem = f"{best.label} flies this vehicle better"
+                        handed = HandOver(agent, {}, problem=problem)
+                results[stage.name] = StageResult(
+                    str(run.path), str(handed.agent), run.timesteps, seconds
+                )
         except KeyboardInterrupt:
             if not signals.received:
                 raise
     if signals.received:
         report(f"to resume the whole pipeline: --resume {shlex.quote(str(folder))}")
-    return PipelineResult(folder, results, jobs[0], signals.exit_code)
+        return PipelineResult(folder, results, jobs[0], exit_code=signals.exit_code)
+    assert handed is not None
+    content["agent"] = os.path.relpath(handed.agent, log_folder)
+    write_yaml(folder / STATUS_FILE, content)
+    exit_code = 1 if handed.problem else 0
+    return PipelineResult(folder, results, jobs[0], str(handed.agent), handed.problem, exit_code)
 
 
 def state_of(runs: Sequence[RunFolder], number: int, n_timesteps: int) -> State:
@@ -343,28 +389,51 @@ def state_of(runs: Sequence[RunFolder], number: int, n_timesteps: int) -> State:
     return "begun" if run.not_begun or run.resume_state.is_file() else "new"
 
 
-def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Path:
-    """Return the zip that a stage passes on, after its offset correction, if any.
+def _fly_all(
+    name: str, stage: Stage, job: TrainingJob, folder: Path, report: Report
+) -> list[Flown]:
+    """Fly the agent that a stage would start from and its rivals; the agent comes first."""
+    tasks = " and ".join(map(str, (job.flight_settings.task, *job.config.eval_tasks)))
+    report(f"on this vehicle, {EPISODES} flights of {tasks} each:")
+    agent = fly_agent(name, job)
+    report(str(agent))
+    return [agent, *fly_rivals(stage.rivals, job, stage.rival_settings, folder, report)]
+
+
+def _best(flown: list[Flown]) -> Flown:
+    """Return the best agent; one that comes first has to be beaten."""
+    best, *others = flown
+    for other in others:
+        if other.job is not None and best.is_behind(other):
+            best = other
+    return best
+
+
+def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> HandOver:
+    """Return what a stage hands over, after its offset correction, if any.
 
     :raises TrainingError: it misses the requirement of the stage.
     """
-    if stage.correct_offset and run.corrected_model.is_file():
-        return run.corrected_model
-    if run.evaluations.is_file():
-        rates = np.nan_to_num(read_curve(run.path).values("success"))
-        success = rates.max() if stage.pass_on == "best" else rates[-1]
-        required = stage.require.get("success_rate", 0.0)
-        if success < required:
+    handed = hand_over(run, job.config.best_by, stage.pass_on)
+    # Environments of others need not report the rate that is required by default.
+    unknown = 0.0 if "require" in stage.model_fields_set else 1.0
+    for name, required in stage.require.items():
+        rate = np.mean(handed.row.get(RATES[name.removesuffix("_rate")], unknown))
+        if rate < required:
             raise TrainingError(
-                f"stage {stage.name!r}: success {success:.3f} "
+                f"stage {stage.name!r}: {name} {rate:.3f} "
                 f"misses what it requires, {required}; its run is {run.path}"
             )
-    agent = run.model
-    if stage.pass_on == "best" and run.best_model.is_file():
-        agent = run.best_model
+    if handed.is_start:
+        kept = Path(str(job.initial_policy))
+        why = handed.problem or "none of its evaluations is better"
+        report(f"{stage.name}: {why}; it hands over the agent that it started from, {kept}")
+        return handed._replace(agent=kept)
     if not stage.correct_offset:
-        return agent
-    model = load_zip(job.config.algorithm, agent, device=job.device)
+        return handed
+    if run.corrected_model.is_file():
+        return handed._replace(agent=run.corrected_model)
+    model = load_zip(job.config.algorithm, handed.agent, device=job.device)
     report("correcting the agent's offset, which may take minutes")
     change = correct_offset(
         model, seed_for("correction", job.seed), job.flight_settings, stage.correct_offset
@@ -374,4 +443,4 @@ def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> Pa
         f"corrected: steady offset {change.before:.3f} m, now {change.after:.3f} m: "
         f"{run.corrected_model}"
     )
-    return run.corrected_model
+    return handed._replace(agent=run.corrected_model)

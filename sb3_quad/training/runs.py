@@ -12,7 +12,7 @@ from sb3_quad.agents.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.agents.zips import saved_data
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import make_folder, refuse_outside, write_text
+from sb3_quad.base.files import make_folder, read_arrays, refuse_outside, write_text
 from sb3_quad.base.process import trusted
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml, write_yaml
@@ -33,7 +33,7 @@ class RunFolder:
         self.name = name
         # The model at the end, or where the run was interrupted.
         self.model = path / f"{name}.zip"
-        # The best model of the evaluations: by success, then by mean reward.
+        # The best model of the evaluations, which may be the one that the run started from.
         self.best_model = path / BEST
         # The model after the offset correction, if a pipeline does one.
         self.corrected_model = path / CORRECTED
@@ -59,8 +59,16 @@ class RunFolder:
 
     @property
     def not_begun(self) -> bool:
-        """Whether the run ended before its first rollout, without a snapshot or a model."""
-        return not self.resume_state.is_file() and not any(self.path.glob("*.zip"))
+        """Whether the run ended before its first rollout, without a snapshot or a model of its own.
+
+        The best model may be there already: the one that it starts from.
+        """
+        if self.resume_state.is_file():
+            return False
+        zips = [*self.path.glob("*.zip")]
+        if zips == [self.best_model] and self.evaluations.is_file():
+            return not read_arrays(self.evaluations)["timesteps"].any()
+        return not zips
 
     @property
     def timesteps(self) -> int:

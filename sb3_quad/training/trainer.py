@@ -293,6 +293,7 @@ class _Training:
                 others,
                 self.should_continue,
                 job.config.best_by,
+                with_start=bool(job.agent or job.initial_policy),
             )
             self.callbacks.append(self.best)
         if job.save_freq > 0:

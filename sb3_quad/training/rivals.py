@@ -1,0 +1,114 @@
+"""What else flies the vehicle at hand: agents of the package and experts.
+
+Before a stage they fly it on the same episodes as the agent of the stage before, so that training
+starts from what is best there, and hands over nothing that is worse.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_quad.agents.pretrained import load_pretrained, pretrained_names
+from sb3_quad.agents.resolve import resolve_expert
+from sb3_quad.agents.zips import load_model
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import save_model
+from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.types import Report, StrDict
+from sb3_quad.evaluation.flights import Flights, episode_seeds, fly_settings
+from sb3_quad.training.config import TrainingJob, as_agent, build_config, merged
+from sb3_quad.training.hand_over import is_below
+
+EPISODES = 60  # of each task
+TOLERANCE = 0.1  # m, of the settling time
+LOST = 0.02  # One that loses this share of the flights more is behind, whatever the others earn.
+
+
+class Flown(NamedTuple):
+    """How one of them flew: the flights of all tasks in a row.
+
+    :param job: a job that starts from it, an agent.
+    """
+
+    label: str
+    flights: Flights
+    job: TrainingJob | None = None
+
+    def is_behind(self, other: "Flown") -> bool:
+        """Whether it loses more flights, or earns less on the same episodes beyond chance."""
+        lost = other.flights.survival.mean() - self.flights.survival.mean()
+        return bool(
+            lost >= LOST or (lost >= 0.0 and is_below(self.flights.reward, other.flights.reward))
+        )
+
+    def __str__(self) -> str:
+        flights = self.flights
+        times = flights.settling_time[TOLERANCE]
+        settled = times[np.isfinite(times)]
+        return (
+            f"{self.label}: survival {100 * flights.survival.mean():.1f} %, "
+            f"settling time {settled.sum() / max(settled.size, 1):.2f} s, "
+            f"final error {np.median(flights.final_error):.3f} m, "
+            f"mean reward {flights.reward.mean():.2f}"
+        )
+
+
+def with_vehicle(job: TrainingJob) -> bool:
+    """Whether a job is for a vehicle that the user gave, is evaluated, and has no wrappers, which
+    no rival knows.
+    """
+    config = job.config
+    if not config.task or "vehicle" not in config.env_kwargs or job.eval_episodes < 1:
+        return False
+    wrapped = config.env_wrapper or config.vec_env_wrapper or config.normalize
+    return not (wrapped or config.flight_settings.vehicles)
+
+
+def fly_rivals(
+    names: list[str], job: TrainingJob, changes: StrDict, folder: Path, report: Report
+) -> list[Flown]:
+    """Fly each of the rivals on the vehicle of a job, and report a line on it.
+
+    An agent goes to ``<folder>/<name>.zip``, which says that it flies this vehicle.
+
+    :param changes: to the settings of the job, if it starts from an agent among them.
+    """
+    config = job.config
+    flown = []
+    for name in names:
+        try:
+            if name in pretrained_names():
+                agent = load_pretrained(name)
+                settings = merged({**config.settings, **as_agent(agent, config, {})}, changes, name)
+                own_config = build_config(config.algo, config.env_id, settings, name)
+                path = str(folder / f"{name}.zip")
+                own = job.model_copy(update={"config": own_config, "initial_policy": path})
+                own.flight_settings.write_into(agent)
+                save_model(agent, path)
+                flown.append(fly_agent(name, own))
+            else:
+                layout = config.flight_settings.rotor_layout
+                expert = resolve_expert(name, config.env_kwargs["vehicle"], layout=layout)
+                flown.append(Flown(name, _fly(expert, job)))
+        except ConfigError as error:
+            # Its rotors may be in other places.
+            report(f"{name}: cannot fly this vehicle ({error})")
+        else:
+            report(str(flown[-1]))
+    return flown
+
+
+def fly_agent(label: str, job: TrainingJob) -> Flown:
+    """Fly the agent that a job starts from."""
+    return Flown(label, _fly(load_model(str(job.initial_policy)), job), job)
+
+
+def _fly(pilot: Any, job: TrainingJob) -> Flights:
+    seeds = episode_seeds(seed_for("evaluation", job.seed), EPISODES)
+    own = job.flight_settings
+    parts = []
+    for task in (own.task, *job.config.eval_tasks):
+        settings = own.with_changes(task=task, max_episode_steps=own.longest_episode)
+        parts.append(fly_settings(pilot, settings, seeds, tolerances=[TOLERANCE]))
+    return Flights.concatenate(parts)

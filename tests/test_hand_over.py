@@ -1,0 +1,61 @@
+"""What a run hands over, by its evaluations."""
+
+import numpy as np
+import pytest
+
+from sb3_quad.training.config import TrainingJob, load_config
+from sb3_quad.training.hand_over import hand_over
+from sb3_quad.training.rivals import with_vehicle
+from sb3_quad.training.runs import RunFolder
+
+GOOD, BETTER, RUINED = (mean + np.linspace(-0.5, 0.5, 8) for mean in (-1.0, -0.8, -20.0))
+# Better in one flight and worse in another
+LUCK = GOOD + np.array([3.0, -3.1, 0, 0, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("first", "results", "wanted", "agent", "is_start", "is_problem"),
+    [
+        (0, [GOOD, RUINED, BETTER], "best", "best_model.zip", False, False),
+        (0, [GOOD, BETTER, RUINED], "best", "best_model.zip", False, False),
+        (0, [GOOD, RUINED], "best", "best_model.zip", True, True),
+        (0, [GOOD, RUINED], "last", "best_model.zip", True, True),
+        (0, [GOOD, LUCK], "best", "best_model.zip", True, False),
+        (0, [GOOD, LUCK], "last", "Env.zip", False, False),
+        # Without an agent to start from
+        (400, [GOOD, RUINED], "best", "best_model.zip", False, False),
+        (400, [GOOD, RUINED], "last", "Env.zip", False, False),
+    ],
+)
+def test_a_run_hands_over_its_best_agent_and_none_below_its_start(
+    tmp_path, first, results, wanted, agent, is_start, is_problem
+):
+    run = RunFolder(tmp_path, "Env")
+    timesteps = first + 400 * np.arange(len(results))
+    survivals = np.array(results) > -10
+    np.savez(run.evaluations, timesteps=timesteps, results=results, survivals=survivals)
+    handed = hand_over(run, "reward", wanted)
+    assert (handed.agent.name, handed.is_start, bool(handed.problem)) == (
+        agent,
+        is_start,
+        is_problem,
+    )
+    is_last = agent == "Env.zip"
+    assert np.all(handed.row["results"] == (results[-1] if is_last else max(results, key=np.mean)))
+
+
+def test_without_evaluations_the_last_agent_is_handed_over(tmp_path):
+    assert hand_over(RunFolder(tmp_path, "Env"), "reward").agent.name == "Env.zip"
+
+
+@pytest.mark.parametrize(
+    ("changes", "flies"),
+    [
+        ({"vehicle": "crazyflie"}, True),
+        ({}, False),
+        ({"vehicle": "crazyflie", "vehicles": {"distribution": "raptor"}}, False),
+    ],
+)
+def test_rivals_fly_where_a_vehicle_is_given(changes, flies):
+    config = load_config("apg", "QuadStateRecovery-v0", None, {"env_kwargs": changes})
+    assert with_vehicle(TrainingJob(config=config)) == flies
