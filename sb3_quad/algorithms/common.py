@@ -8,7 +8,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
@@ -199,19 +198,6 @@ class ExpertMixin(BaseAlgorithm):
             warn_if_worse(type(self).__name__, first, np.array([*self._last_episodes.values()]))
         return self
 
-    def _setup_learn(self, *arguments: Any, **keywords: Any) -> tuple[int, BaseCallback]:
-        self._first_episodes = {}
-        self._last_episodes = {}
-        return super()._setup_learn(*arguments, **keywords)
-
-    def _update_info_buffer(self, infos: list[StrDict], dones: BoolArray | None = None) -> None:
-        super()._update_info_buffer(infos, dones)
-        for row in np.flatnonzero([] if dones is None else dones).tolist():
-            episode = infos[row].get("episode")
-            if episode is not None and self._shows_in_returns():
-                self._last_episodes[row] = (episode["r"], episode["l"])
-                self._first_episodes.setdefault(row, self._last_episodes[row])
-
     def _shows_in_returns(self) -> bool:
         """Return whether the returns of the present rollout say how well the agent flies."""
         return True
@@ -237,6 +223,8 @@ class ExpertMixin(BaseAlgorithm):
             self._labeller.look(observations, dones)
 
     def _setup_learn(self, *arguments: Any, **keywords: Any) -> Any:
+        self._first_episodes = {}
+        self._last_episodes = {}
         before, planned = self._last_obs, getattr(self, "_total_timesteps", 0)
         results = super()._setup_learn(*arguments, **keywords)
         if self._last_obs is not before:
@@ -260,6 +248,11 @@ class ExpertMixin(BaseAlgorithm):
                 )
 
     def _update_info_buffer(self, infos: Any, dones: Any = None) -> None:
+        for row in np.flatnonzero([] if dones is None else dones).tolist():
+            episode = infos[row].get("episode")
+            if episode is not None and self._shows_in_returns():
+                self._last_episodes[row] = (episode["r"], episode["l"])
+                self._first_episodes.setdefault(row, self._last_episodes[row])
         # The batch tells which infos are not empty.
         known = getattr(infos, "known", None)
         if known is not None and dones is not None:
