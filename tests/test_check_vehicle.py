@@ -10,9 +10,11 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_quad.agents.agent_settings import env_kwargs, unlike_trained
 from sb3_quad.cli import main
 from sb3_quad.cli.commands.check_vehicle import warnings
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, load_vehicle
 from sb3_quad.evaluation.flights import fly
@@ -132,3 +134,20 @@ def test_bad_files_leave_with_2(tmp_path, capsys):
         assert main(["check-vehicle", path]) == 2
         error = capsys.readouterr().err
         assert key in error and path in error and error.count("\n") == 1
+
+
+def test_agents_say_which_ranges_a_vehicle_leaves(tmp_path, capsys):
+    own = FlightSettings(vehicles={"distribution": "any"}, randomize={"delay": [0, 4]})
+    inside = [ITM, *sample_vehicles("any", 20, seed=0)]
+    assert not any(unlike_trained("it", own, vehicle) for vehicle in inside)
+
+    strong = ITM.model_copy(update={"thrust_limits": (0.1, 14.0), "delay": 6})
+    said = unlike_trained("it", own, strong)
+    assert "thrust to weight 14 (1.5 to 12), delay in control steps 6 (0 to 4)" in said
+    keywords = env_kwargs("any-quadcopter", vehicle=strong)
+    with pytest.warns(UserWarning, match=r"thrust to weight 14 \("):
+        fly("any-quadcopter", n_episodes=1, max_episode_steps=1, **keywords)
+    file = tmp_path / "strong.yaml"
+    file.write_text(yaml.safe_dump(strong.model_dump(mode="json")))
+    assert main(["check-vehicle", str(file), "-n", "0"]) == 0
+    assert "unusual: any-quadcopter: itm is outside" in capsys.readouterr().out

@@ -33,6 +33,7 @@ from sb3_quad.envs.simulation.state import P, first_rows
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.envs.vehicles.distributions")
+EDGE = 1e-3
 Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
@@ -97,6 +98,22 @@ class VehicleDistribution(Frozen):
         }
         return flyable(base, changes, "vehicles")
 
+    def outside(self, vehicle: Vehicle) -> list[str]:
+        """Return which quantities of a vehicle are outside of these ranges, such as ``thrust to
+        weight 14 (1.5 to 12)``.
+        """
+        values = {
+            "mass": vehicle.mass,
+            "thrust_to_weight": vehicle.thrust_limits[1],
+            "torque_to_inertia": vehicle.arm_length * vehicle.thrust_range[1] / vehicle.inertia[0],
+            "motor_time_constant": 1.0 / vehicle.motor_gain_up,
+            "moment_thrust_ratio": vehicle.moment_thrust_ratio,
+        }
+        texts = []
+        for name, value in values.items():
+            texts += beyond(name, value, getattr(self, name))
+        return texts
+
     def __str__(self) -> str:
         """Such as ``sampled quadcopters (SI units; mass 0.02 to 5, thrust to weight 1.5 to 5)``."""
         texts = []
@@ -110,6 +127,14 @@ class VehicleDistribution(Frozen):
         ``DISTRIBUTION_NUMBERS``.
         """
         return numbers_of(self, DISTRIBUTION_NUMBERS)
+
+
+def beyond(name: str, value: float, limits: Range[float]) -> list[str]:
+    """Return a text such as ``delay 6 (0 to 4)`` if a value is outside of its range, else none."""
+    # Rounding must not matter to a vehicle at the edge.
+    if limits.low * (1.0 - EDGE) <= value <= limits.high * (1.0 + EDGE):
+        return []
+    return [f"{name.replace('_', ' ')} {value:.3g} ({limits.low:g} to {limits.high:g})"]
 
 
 DISTRIBUTION_NUMBERS = dict.fromkeys(VehicleDistribution.model_fields, RANGE) | {

@@ -20,7 +20,7 @@ from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.envs.simulation.settings import KEY, FlightSettings
 from sb3_quad.envs.simulation.tasks import Task
-from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
+from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS, beyond
 from sb3_quad.envs.vehicles.layout import Turn, find_turn
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle
 
@@ -55,14 +55,20 @@ def agent_settings(zip_file: StrPath, model: Any = None) -> tuple[FlightSettings
 
 
 def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
-    """Return a warning if an agent was trained on another vehicle than ``flown``; otherwise an
-    empty text.
+    """Return a warning if an agent was trained on another vehicle than ``flown``, or on many whose
+    ranges do not include it; otherwise an empty text.
 
     :param own: the agent's settings.
     """
+    if own.vehicles is not None:
+        outside = own.vehicles.outside(flown)
+        if own.randomize is not None and own.randomize.delay is not None:
+            outside += beyond("delay in control steps", flown.delay, own.randomize.delay)
+        if not outside:
+            return ""
+        return f"{label}: {flown.name} is outside of the ranges that it knows: {', '.join(outside)}"
     trained = first_vehicle(own.vehicle)
-    # An agent that was trained on many vehicles knows no particular one.
-    if own.vehicles is not None or trained.flies_as(flown):
+    if trained.flies_as(flown):
         return ""
     flies = name_beside(trained, flown)
     return f"{label}: was trained on the vehicle {trained.name} and flies {flies}"

@@ -52,6 +52,8 @@ FLAGS: Flags = {
 
 def run(options: Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if the vehicle cannot hover."""
+    from sb3_quad.agents.agent_settings import agent_settings, unlike_trained
+    from sb3_quad.agents.pretrained import pretrained_names, pretrained_path
     from sb3_quad.base.seeds import seed_for
     from sb3_quad.cli.output import console
     from sb3_quad.envs.vehicles.vehicle import load_vehicle
@@ -75,6 +77,11 @@ def run(options: Namespace) -> int:
     console().print(Table(("", ""), _parameters(vehicle), vehicle.name, align="left"))
     for warning in warnings(vehicle):
         print("unusual:", warning)
+    for name in pretrained_names():
+        own, _ = agent_settings(pretrained_path(name))
+        # Other agents know one vehicle.
+        if own.vehicles is not None and (notice := unlike_trained(name, own, vehicle)):
+            print("unusual:", notice)
     if options.flights is not None:
         from sb3_quad.evaluation.real_flights import error_table, read_logs
 
