@@ -19,6 +19,7 @@ from sb3_quad.evaluation import statistics
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly, fly_settings
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.hooks import Hook
+from sb3_quad.evaluation.hover import HOVERED
 from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
@@ -239,7 +240,7 @@ def test_metrics_and_tables_say_how_many_arrived():
         final_offset=np.array([[0.1, 0, 0], [0.2, 0, 0], [np.nan] * 3, [0.3, 0, 0]]),
         recovery_time=np.array([1.0, 2.0, np.nan, 3.0]),
         cross_track_error=np.array([0.2, 0.4, 9.0, 0.6]),
-        **dict.fromkeys(FOLLOWED, np.full(n, np.nan)),
+        **dict.fromkeys((*FOLLOWED, *HOVERED), np.full(n, np.nan)),
         waypoint_times=np.zeros((n, 0)),
         start=np.zeros((n, 13)),
         target=np.zeros((n, 3)),

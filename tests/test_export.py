@@ -321,13 +321,20 @@ def test_an_onnx_model_takes_a_state_and_gives_the_next(extended):
     ].startswith("88-64")
 
 
-def test_an_agent_that_does_not_say_its_vehicle_needs_one(tmp_path):
-    """Behind such a wrapper an algorithm writes no settings."""
+def test_an_agent_behind_a_wrapper_is_not_exported_without_it(tmp_path):
     path = tmp_path / "agent.zip"
     env = gymnasium.make("QuadTargetTracking-v0", vehicle="crazyflie")
     wrapped = gymnasium.wrappers.NormalizeObservation(env)
     model = DAgger("MlpPolicy", wrapped, expert="pid", n_steps=8, gradient_steps=1, device="cpu")
     model.learn(8).save(path)
+    for vehicle in (None, "crazyflie"):
+        with pytest.raises(ConfigError, match="NormalizeObservation"):
+            export_policy(path, "onnx", vehicle=vehicle, n_observations=100)
+
+
+def test_an_agent_that_does_not_say_its_vehicle_needs_one(tmp_path):
+    path = tmp_path / "agent.zip"
+    PPO("MlpPolicy", gymnasium.make("QuadTargetTracking-v0", vehicle="crazyflie")).save(path)
     with pytest.raises(ConfigError, match="does not say how its agent flies; if no wrapper"):
         export_policy(path, "onnx", n_observations=100)
     exported = export_policy(path, "onnx", vehicle="crazyflie", n_observations=100)
