@@ -61,8 +61,6 @@ _MAKERS = ("gymnasium", "stable_baselines3")
 _METHODS = {"step", "reset", "step_async", "step_wait", "action", "observation"}
 # The only one of them that a subclass of these is meant to have.
 _MEANT = {"ObservationWrapper": {"observation"}, "ActionWrapper": {"action"}}
-# The mark of a VecTransposeImage that SB3 has added by itself.
-TURNED = "turned_by_sb3"
 # Control steps of a trial.
 N_STEPS = 100
 

@@ -13,11 +13,15 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecEnvWrapper,
+    VecTransposeImage,
+    unwrap_vec_normalize,
+)
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_quad.algorithms.chain import (
-    TURNED,
     Chain,
     chain_of,
     describe,
@@ -56,8 +60,8 @@ class Labeller:
     """Labels the states of a vector environment with an expert's actions.
 
     With ``VecNormalize``, experts see the raw observations. An SB3 model normalises them as in its
-    own training. A function sees pictures as the user's environment makes them; SB3 moves the
-    channels to the front. An expert that acts within other limits than the environment's, such as
+    own training. A function sees pictures as the user's environment makes them, before
+    VecTransposeImage, which SB3 adds. An expert that acts within other limits than the environment's, such as
     those below a ``RescaleAction``, is labelled in the environment's.
 
     :param expert: the expert. A name is resolved for the vehicle of row 0.
@@ -114,7 +118,7 @@ class Labeller:
         if env.has_attr(FLIGHT_SETTINGS) and hasattr(source, FLIGHT_SETTINGS):
             plugin("observation")(name, source, env.get_attr(FLIGHT_SETTINGS, [0])[0])
         self._raw: Any = None if self._true_state else unwrap_vec_normalize(env)
-        self._turned = getattr(env, TURNED, False) and not self._is_model
+        self._turned = isinstance(env, VecTransposeImage) and not self._is_model
 
     @property
     def _is_model(self) -> bool:
