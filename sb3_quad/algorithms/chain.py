@@ -37,8 +37,8 @@ WRAPPERS = "wrappers"
 """The attribute by which a model's zips say behind which wrappers it was trained: those that change
 what it sees or does, or may do so. A zip without it does not say.
 """
-# The letters of what a wrapper changes: observations; actions; or in a way that labels allow for,
-# the scale of actions or how often each is repeated. Nothing else matters to an agent in flight.
+# What a wrapper changes, by letters: observations; actions; or, as labels allow for, the scale of
+# actions or how often each is repeated. Nothing else matters to an agent in flight.
 _NAMES = {
     "": "Wrapper VecEnvWrapper RewardWrapper OrderEnforcing PassiveEnvChecker TimeLimit Autoreset"
     " RecordEpisodeStatistics RecordVideo HumanRendering RenderCollection AddWhiteNoise"
@@ -59,8 +59,6 @@ _ANY = "oa"
 _MAKERS = ("gymnasium", "stable_baselines3")
 # A wrapper that has its own version of one of these does something that its base does not.
 _METHODS = {"step", "reset", "step_async", "step_wait", "action", "observation"}
-# The only one of them that a subclass of these is meant to have.
-_MEANT = {"ObservationWrapper": {"observation"}, "ActionWrapper": {"action"}}
 # Control steps of a trial.
 N_STEPS = 100
 
@@ -141,32 +139,26 @@ def _describe(env: VecEnv) -> Chain:
 
 def _changes(wrapper: Any) -> str:
     """Return the letters for a wrapper."""
-    own: set[str] = set()
     for kind in type(wrapper).__mro__:
         maker = kind.__module__.partition(".")[0]
         if maker == "sb3_quad":
             return ""
         if maker in _MAKERS:
-            own -= _MEANT.get(kind.__name__, set())
-            return _ANY if own else _KNOWN.get(kind.__name__, _ANY)
-        own |= _METHODS & vars(kind).keys()
+            return _KNOWN.get(kind.__name__, _ANY)
+        if _METHODS & vars(kind).keys():
+            break
     return _ANY
 
 
-def chain_of(model: Any) -> list[str] | None:
-    """Return the record of the wrappers that a model was trained behind; None: it does not say."""
+def chain_of(model: Any) -> Any:
+    """Return the record of the wrappers that a model was trained behind; None: it does not say.
+
+    A stranger's may be anything.
+    """
     env = model.get_env() if isinstance(model, BaseAlgorithm) else None
     if env is not None:
         return describe(env).record
-    if hasattr(model, WRAPPERS):
-        return read_record(getattr(model, WRAPPERS))
-    return [] if hasattr(model, FLIGHT_SETTINGS) else None
-
-
-def read_record(record: Any) -> list[str]:
-    """Return the record in a zip, which may be a stranger's."""
-    texts = [*map(str, record if isinstance(record, list) else [record])]
-    return [text if text.isprintable() else "unknown" for text in texts]
+    return getattr(model, WRAPPERS, [] if hasattr(model, FLIGHT_SETTINGS) else None)
 
 
 def note_chain(model: Any, env: VecEnv | None) -> Any:
@@ -184,19 +176,18 @@ def note_chain(model: Any, env: VecEnv | None) -> Any:
     return env.get_attr(FLIGHT_SETTINGS, [0])[0]
 
 
-def refuse_wrapped(name: str, model: Any, here: list[str]) -> None:
+def refuse_wrapped(name: str, record: Any, here: list[str]) -> None:
     """Check that an agent flies behind the wrappers that it was trained behind.
 
     :param name: what the message calls it.
-    :param model: its model, or the record in its zip.
-    :param here: the record of where it is to fly.
+    :param record: that of its model or zip.
+    :param here: that of where it is to fly.
     :raises ConfigError: it was trained behind others, and the message names them.
     """
-    theirs = model if isinstance(model, list) else chain_of(model)
-    if theirs and theirs != here:
+    if record and record != here:
         raise ConfigError(
             f"{name}: was trained with wrappers that change what it sees or does, or may do so"
-            f" ({', '.join(theirs)}), without which it flies otherwise; use it in an environment"
+            f" ({record!r}), without which it flies otherwise; use it in an environment"
             " that has them, such as by evaluate_policy, or train without them"
         )
 

@@ -242,16 +242,15 @@ class ExpertMixin(BaseAlgorithm):
         return results
 
     def _update_info_buffer(self, infos: Any, dones: Any = None) -> None:
-        for row in np.flatnonzero([] if dones is None else dones).tolist():
-            episode = infos[row].get("episode")
-            if episode is not None and self._shows_in_returns():
-                self._last_episodes[row] = (episode["r"], episode["l"])
-                self._first_episodes.setdefault(row, self._last_episodes[row])
-        # The batch tells which infos are not empty.
-        known = getattr(infos, "known", None)
-        if known is not None and dones is not None:
-            rows = known()
+        # SB3 would look into the infos of all rows, of which only those that ended tell an episode.
+        if dones is not None:
+            rows = np.flatnonzero(dones)
             infos, dones = [infos[row] for row in rows], dones[rows]
+            for row, info in zip(rows.tolist(), infos, strict=True):
+                episode = info.get("episode")
+                if episode is not None and self._shows_in_returns():
+                    self._last_episodes[row] = (episode["r"], episode["l"])
+                    self._first_episodes.setdefault(row, self._last_episodes[row])
         super()._update_info_buffer(infos, dones)
 
     def _refuse_dict_observations(self) -> None:
@@ -350,8 +349,9 @@ def copy_policy(teacher: Any, model: BaseAlgorithm, name: str = "") -> None:
     if record and hasattr(teacher, FLIGHT_SETTINGS):
         plugin("observation")(name, teacher, record)
     here = chain_of(model) or []
-    refuse_wrapped(name, teacher, here)
-    if here and chain_of(teacher) == []:
+    learnt = chain_of(teacher)
+    refuse_wrapped(name, learnt, here)
+    if here and learnt == []:
         print_once(f"warning: {name}: was trained without {', '.join(here)}")
     theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()

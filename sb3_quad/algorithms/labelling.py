@@ -60,9 +60,9 @@ class Labeller:
     """Labels the states of a vector environment with an expert's actions.
 
     With ``VecNormalize``, experts see the raw observations. An SB3 model normalises them as in its
-    own training. A function sees pictures as the user's environment makes them, before
-    VecTransposeImage, which SB3 adds. An expert that acts within other limits than the environment's, such as
-    those below a ``RescaleAction``, is labelled in the environment's.
+    own training. A function sees pictures as they are before VecTransposeImage, which SB3 adds. An
+    expert that acts within other limits than the environment's, such as those below a
+    ``RescaleAction``, is labelled in the environment's.
 
     :param expert: the expert. A name is resolved for the vehicle of row 0.
     :param check: whether to refuse an expert whose labels the environment's wrappers would falsify.
