@@ -214,8 +214,7 @@ class Labeller:
         """The mean return of 16 episodes of the expert, of at most 1,500 steps each, in a batch as
         this one without its wrappers; the reward is the task's.
 
-        None: a function, an expert that fails there, an environment that is no batch, or one with
-        a vehicle for each row.
+        None: a function, an expert that fails there, or an environment that is no batch.
         """
         base: Any = self.env.unwrapped
         is_function = self._true_state is None and not self._is_model
