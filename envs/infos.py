@@ -29,7 +29,3 @@ class Infos(list[Any]):
     def copy(self) -> list[StrDict]:
         """Return a plain list of these dictionaries."""
         return [*self]
-
-    def known(self) -> list[int]:
-        """Return the rows that have ended, or that somebody has looked at; others are empty."""
-        return [row for row, info in enumerate(super().__iter__()) if info is not None]

@@ -8,7 +8,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import refuse_settings, saved_data
-from sb3_quad.algorithms.chain import WRAPPERS, read_record, refuse_wrapped
+from sb3_quad.algorithms.chain import WRAPPERS, refuse_wrapped
 from sb3_quad.algorithms.labelling import name_beside
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping
@@ -38,7 +38,7 @@ def agent_settings(zip_file: StrPath, model: Any = None) -> tuple[FlightSettings
     """
     # Zips of this package contain the settings.
     data = saved_data(zip_file) if model is None else vars(model)
-    refuse_wrapped(str(zip_file), read_record(data.get(WRAPPERS, [])), [])
+    refuse_wrapped(str(zip_file), data.get(WRAPPERS), [])
     if KEY in data:
         return settings_of_record(data[KEY], f"{zip_file}: {KEY}"), Path(zip_file)
 

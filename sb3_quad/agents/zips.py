@@ -8,7 +8,6 @@ of a stranger.
 import base64
 import io
 import json
-import re
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -47,7 +46,6 @@ _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs",
 # SB3 and this package never save these, and loading them would import the modules that they name.
 _NEVER_READ = ("env", "expert", "_labeller")
 WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
-_STATISTICS = re.compile("vec_?normalize", re.IGNORECASE)
 # The variables that SB3 saves besides policies and optimisers.
 _VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 # The largest zip, in bytes.
@@ -116,8 +114,8 @@ def load_zip(algorithm: Any, source: StrPath | io.BytesIO, where: str = "", **kw
 
     If the user has declared files :func:`trusted`, SB3 reads everything.
 
-    :param algorithm: its class; None: the stock algorithm for ``predict`` only. Schedules, noise
-        and the like, which may be functions, are then left out.
+    :param algorithm: its class; None: the stock algorithm for ``predict`` only. Schedules and
+        noise, which may be functions, are then missing.
     :param where: what messages call the zip; empty: its path.
     :raises ConfigError: a missing or damaged file, or one that may run code.
     """
@@ -230,7 +228,7 @@ def _check_size(data: StrDict, most: int) -> None:
 
     :param data: the attributes of its model.
     :param most: the most parameters that its file can hold.
-    :raises ValueError: there are too many, or too many layers, each of which takes time.
+    :raises ValueError: there are too many, or too many layers, since each takes time.
     """
     given = data["policy_kwargs"]
     if len(str(given)) > 10_000 or given.get("n_critics", 2) > 100:
@@ -247,27 +245,26 @@ def _check_size(data: StrDict, most: int) -> None:
 
 
 def _statistics_beside(path: StrPath, model: BaseAlgorithm) -> VecNormalize | None:
-    """Return the statistics that lie beside a zip.
+    """Return the statistics in a file near a zip.
 
     rl_zoo3 keeps ``vecnormalize.pkl`` in a folder next to the zip, SB3's pages and the Hub
     ``vec_normalize.pkl`` in the zip's own folder, and SB3's CheckpointCallback
-    ``rl_model_vecnormalize_600_steps.pkl`` beside ``rl_model_600_steps.zip``. None: the agent was
+    ``rl_model_vecnormalize_600_steps.pkl`` for ``rl_model_600_steps.zip``. None: the agent was
     trained without statistics.
 
-    :raises ConfigError: a file that cannot be read or does not fit; several, none of which is of
-        the same step; or no file although the run had statistics.
+    :raises ConfigError: a file that cannot be read or does not fit; several, or one of another
+        step; or no file although the run had statistics.
     """
     zip_file = Path(path)
     files = sorted(zip_file.parent.glob("*/vecnormalize.pkl"))
-    files += [file for file in zip_file.parent.glob("*.pkl") if _STATISTICS.search(file.stem)]
+    files += [file for file in zip_file.parent.glob("*.pkl") if "normalize" in file.stem.lower()]
     prefix, _, step = zip_file.stem.removesuffix("_steps").rpartition("_")
     same = zip_file.with_name(f"{prefix}_vecnormalize_{step}_steps.pkl")
     if same in files:
         files = [same]
-    others = [file for file in files if file.stem.endswith("_steps") and file != same]
-    if len(files) > 1 or others:
+    elif len(files) > 1 or any(file.stem.endswith("_steps") for file in files):
         raise ConfigError(
-            f"{path}: which statistics are its own? Leave one vec_normalize.pkl beside it, of"
+            f"{path}: which statistics are its own? Leave one vec_normalize.pkl there, of"
             f" {', '.join(file.name for file in files)}"
         )
     for file in files:

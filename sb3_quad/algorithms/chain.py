@@ -8,6 +8,7 @@ gives. A copy is only possible of an environment of this package that lives in t
 
 import copy
 import random
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -26,7 +27,6 @@ from stable_baselines3.common.vec_env import (
     VecEnv,
     VecEnvWrapper,
     VecNormalize,
-    VecTransposeImage,
 )
 
 from sb3_quad.base.errors import ConfigError
@@ -35,77 +35,58 @@ from sb3_quad.base.types import AnyArray, Float32Array
 
 WRAPPERS = "wrappers"
 """The attribute by which a model's zips say behind which wrappers it was trained: those that change
-what it sees or does. A zip without it does not say.
+what it sees or does, or may do so. A zip without it does not say.
 """
-# What a wrapper changes, by a letter. Rewards, the length of episodes and pictures are no matter.
-WORDS = {
-    "o": "observations",
-    "s": "scale of actions",
-    "a": "actions",
-    "r": "steps for each action",
-    "?": "unknown",
-}
+# What a wrapper changes, by letters: observations; actions; or, as labels allow for, the scale of
+# actions or how often each is repeated. Nothing else matters to an agent in flight.
 _NAMES = {
     "": "Wrapper VecEnvWrapper RewardWrapper OrderEnforcing PassiveEnvChecker TimeLimit Autoreset"
     " RecordEpisodeStatistics RecordVideo HumanRendering RenderCollection AddWhiteNoise"
     " ObstructView ClipReward NormalizeReward TransformReward Monitor VecMonitor VecCheckNan"
-    " VecVideoRecorder VecNormalize ClipRewardEnv",
+    " VecVideoRecorder VecNormalize VecTransposeImage ClipRewardEnv",
     "o": "ObservationWrapper TransformObservation FilterObservation FlattenObservation"
     " GrayscaleObservation ReshapeObservation RescaleObservation DtypeObservation"
     " ResizeObservation NormalizeObservation TimeAwareObservation FrameStackObservation"
     " DelayObservation DiscretizeObservation AddRenderObservation VecExtractDictObs VecFrameStack"
     " WarpFrame",
-    "s": "RescaleAction",
+    "s": "RescaleAction RepeatAction",
     "a": "ClipAction StickyAction StickyActionEnv DiscretizeAction",
-    "r": "RepeatAction",
-    "or": "MaxAndSkipObservation MaxAndSkipEnv AtariPreprocessing",
+    "os": "MaxAndSkipObservation MaxAndSkipEnv AtariPreprocessing",
 }
-_KNOWN = {name: changes for changes, names in _NAMES.items() for name in names.split()}
+_KNOWN = {name: letters for letters, names in _NAMES.items() for name in names.split()}
+# A wrapper that is not known may do both.
+_ANY = "oa"
 _MAKERS = ("gymnasium", "stable_baselines3")
 # A wrapper that has its own version of one of these does something that its base does not.
 _METHODS = {"step", "reset", "step_async", "step_wait", "action", "observation"}
-# The only one of them that a subclass of these is meant to have.
-_MEANT = {"ObservationWrapper": {"observation"}, "ActionWrapper": {"action"}}
-# The mark of a VecTransposeImage that SB3 has added by itself.
-TURNED = "turned_by_sb3"
-# Control steps of a trial, and the rows that it flies in all of them together.
-N_STEPS = 200
-_ROWS_OF_BODIES = 800
+# Control steps of a trial.
+N_STEPS = 100
 
 
 @dataclass(frozen=True)
 class Chain:
-    """The wrappers that change what an agent sees or does, or may change it.
+    """The wrappers between an agent and the simulator.
 
-    :ivar links: the letters of what a wrapper changes (``WORDS``), by its name, from the outermost
-        inwards. VecNormalize is not among them: a model has its statistics. Nor is
-        VecTransposeImage, which SB3 adds to environments of pictures.
-    :ivar outside: the wrappers around a VecNormalize that change observations, or may change them.
-    :ivar names: all wrappers.
+    :ivar links: what each wrapper changes, by its name, from the outermost inwards: "o" for
+        observations, "a" for actions, "s" for their scale or repetition, "oa" if unknown.
+    :ivar outside: the wrappers around a VecNormalize that change something, or may do so.
     """
 
     links: dict[str, str]
     outside: tuple[str, ...] = ()
-    names: frozenset[str] = frozenset()
 
     @property
-    def changes(self) -> str:
+    def changes(self) -> set[str]:
         """The letters of all wrappers."""
-        return "".join(self.links.values())
+        return {*"".join(self.links.values())}
 
     @property
     def record(self) -> list[str]:
-        """Each wrapper with what it changes, as zips hold it."""
-        return [
-            f"{name} ({', '.join(WORDS[letter] for letter in letters)})"
-            for name, letters in self.links.items()
-        ]
-
-    def __str__(self) -> str:
-        return ", ".join(self.record)
+        """The names of the wrappers that change something, or may do so, as zips hold them."""
+        return [name for name, letters in self.links.items() if letters]
 
     def refuse_inner_statistics(self) -> None:
-        """:raises ConfigError: a wrapper around VecNormalize that may change observations."""
+        """:raises ConfigError: a wrapper around VecNormalize that may change something."""
         if self.outside:
             raise ConfigError(
                 f"{', '.join(self.outside)}: is around VecNormalize, by which raw observations are"
@@ -132,40 +113,12 @@ def describe(env: VecEnv) -> Chain:
 
 
 def _describe(env: VecEnv) -> Chain:
-    outer, inner = _around_statistics(env)
-    links = {type(wrapper).__name__: _changes(wrapper) for wrapper in outer} | _links(inner)
-    outside = [type(wrapper).__name__ for wrapper in outer if {*_changes(wrapper)} & {*"o?"}]
-    if "?" in links.values() and not outer:
-        known = {*"".join(links.values())}
-        found = try_out(env, at_random)
-        for name, letters in links.items():
-            # Whether it changes what others change as well cannot be told.
-            if letters == "?" and found is not None and not known & {*"oar"}:
-                links[name] = "".join(sorted(found[0] - known))
-    changing = {name: letters for name, letters in links.items() if letters}
-    return Chain(changing, tuple(outside), frozenset(links))
-
-
-def _around_statistics(env: VecEnv) -> tuple[list[VecEnvWrapper], VecEnv]:
-    """Return the wrappers around VecNormalize and what it wraps; without it, none and ``env``.
-
-    Pictures are transposed outside of it.
-    """
-    outer: list[VecEnvWrapper] = []
+    links: dict[str, str] = {}
+    outside: list[str] = []
     at: Any = env
     while isinstance(at, VecEnvWrapper):
         if isinstance(at, VecNormalize) and at.norm_obs:
-            return [wrapper for wrapper in outer if _changes(wrapper)], at.venv
-        outer.append(at)
-        at = at.venv
-    return [], env
-
-
-def _links(env: VecEnv) -> dict[str, str]:
-    """Return what each wrapper changes, by its name."""
-    links = {}
-    at: Any = env
-    while isinstance(at, VecEnvWrapper):
+            outside = [name for name, letters in links.items() if letters]
         links[type(at).__name__] = _changes(at)
         at = at.venv
     for row in getattr(at, "envs", ()):
@@ -174,42 +127,38 @@ def _links(env: VecEnv) -> dict[str, str]:
             row = row.env
     if isinstance(at, SubprocVecEnv):
         # "<Outer<Inner<Env<id>>>>", or "<Outer<Inner<Env instance>>>"
-        names = at.env_method("__str__", indices=[0])[0].strip("<>").split("<")
-        for name in names[: -1 if names[-1].endswith(" instance") else -2]:
-            links[name] = _KNOWN.get(name, "?")
-    return links
+        text = at.env_method("__str__", indices=[0])[0]
+        links |= {name: _KNOWN.get(name, _ANY) for name in re.findall(r"(\w+)(?=<\w+[< ])", text)}
+    if _ANY in links.values() and not outside:
+        flown = try_out(env, at_random)
+        # Another wrapper may make the same change. Only a known scale explains what is found.
+        changes = _ANY if flown is None else "".join(flown[0] - ({*links.values()} & {"s"}))
+        links = {name: changes if letters == _ANY else letters for name, letters in links.items()}
+    return Chain(links, tuple(outside))
 
 
 def _changes(wrapper: Any) -> str:
-    """Return the letters of what a wrapper changes."""
-    if isinstance(wrapper, VecTransposeImage):
-        return ""
-    own: set[str] = set()
+    """Return the letters for a wrapper."""
     for kind in type(wrapper).__mro__:
         maker = kind.__module__.partition(".")[0]
         if maker == "sb3_quad":
             return ""
         if maker in _MAKERS:
-            own -= _MEANT.get(kind.__name__, set())
-            return "?" if own else _KNOWN.get(kind.__name__, "?")
-        own |= _METHODS & vars(kind).keys()
-    return "?"
+            return _KNOWN.get(kind.__name__, _ANY)
+        if _METHODS & vars(kind).keys():
+            break
+    return _ANY
 
 
-def chain_of(model: Any) -> list[str] | None:
-    """Return the record of the wrappers that a model was trained behind; None: it does not say."""
+def chain_of(model: Any) -> Any:
+    """Return the record of the wrappers that a model was trained behind; None: it does not say.
+
+    A stranger's may be anything.
+    """
     env = model.get_env() if isinstance(model, BaseAlgorithm) else None
     if env is not None:
         return describe(env).record
-    if hasattr(model, WRAPPERS):
-        return read_record(getattr(model, WRAPPERS))
-    return [] if hasattr(model, FLIGHT_SETTINGS) else None
-
-
-def read_record(record: Any) -> list[str]:
-    """Return the record in a zip, which may be a stranger's."""
-    texts = [*map(str, record if isinstance(record, list) else [record])]
-    return [text if text.isprintable() else WORDS["?"] for text in texts]
+    return getattr(model, WRAPPERS, [] if hasattr(model, FLIGHT_SETTINGS) else None)
 
 
 def note_chain(model: Any, env: VecEnv | None) -> Any:
@@ -220,26 +169,25 @@ def note_chain(model: Any, env: VecEnv | None) -> Any:
     """
     if env is None:
         return None
-    chain = describe(env)
-    setattr(model, WRAPPERS, chain.record)
-    if chain.links or not env.has_attr(FLIGHT_SETTINGS):
+    record = describe(env).record
+    setattr(model, WRAPPERS, record)
+    if record or not env.has_attr(FLIGHT_SETTINGS):
         return None
     return env.get_attr(FLIGHT_SETTINGS, [0])[0]
 
 
-def refuse_wrapped(name: str, model: Any, here: list[str]) -> None:
+def refuse_wrapped(name: str, record: Any, here: list[str]) -> None:
     """Check that an agent flies behind the wrappers that it was trained behind.
 
     :param name: what the message calls it.
-    :param model: its model, or the record in its zip.
-    :param here: the record of where it is to fly.
-    :raises ConfigError: it was trained behind other wrappers, one of which it names.
+    :param record: that of its model or zip.
+    :param here: that of where it is to fly.
+    :raises ConfigError: it was trained behind others, and the message names them.
     """
-    theirs = model if isinstance(model, list) else chain_of(model)
-    if theirs and theirs != here:
+    if record and record != here:
         raise ConfigError(
             f"{name}: was trained with wrappers that change what it sees or does, or may do so"
-            f" ({', '.join(theirs)}), without which it flies otherwise; use it in an environment"
+            f" ({record!r}), without which it flies otherwise; use it in an environment"
             " that has them, such as by evaluate_policy, or train without them"
         )
 
@@ -250,162 +198,15 @@ def refuse_other_wrappers(model: Any, env: VecEnv) -> None:
     :raises ConfigError: one side has a wrapper that changes something, and the other has not.
     """
     ours, theirs = describe(model.get_env()), describe(env)
-    for has, lacks, where in ((ours, theirs, "evaluation"), (theirs, ours, "training")):
-        missing = has.links.keys() - lacks.names
-        if missing:
-            raise ConfigError(
-                f"{', '.join(sorted(missing))}: the environment of the {where} lacks this wrapper,"
-                " which changes what an agent sees or does"
-            )
+    missing = {*ours.record, *theirs.record} - (ours.links.keys() & theirs.links.keys())
+    if missing:
+        raise ConfigError(
+            f"{', '.join(sorted(missing))}: only one of the environments of training and evaluation"
+            " has this wrapper, which changes what an agent sees or does"
+        )
 
 
 # A trial
-
-
-class _Vectorised(VecEnvWrapper):
-    """Notes what reaches the batch, and what leaves it."""
-
-    def __init__(self, venv: VecEnv) -> None:
-        super().__init__(venv)
-        self.heard: list[AnyArray] = []
-        self.rewards: list[float] = []
-
-    def reset(self) -> Any:
-        observation: Any = self.venv.reset()
-        self.seen = observation.copy()
-        return observation
-
-    def step_async(self, actions: AnyArray) -> None:
-        self.heard.append(np.array(actions))
-        self.venv.step_async(actions)
-
-    def step_wait(self) -> Any:
-        results: Any = self.venv.step_wait()
-        self.seen = results[0].copy()
-        self.rewards.append(float(results[1].mean()))
-        return results
-
-
-class _Single(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """The same for a row."""
-
-    def __init__(self, env: Any) -> None:
-        super().__init__(env)
-        self.heard: list[AnyArray] = []
-        self.rewards: list[float] = []
-
-    def reset(self, **keywords: Any) -> Any:
-        results = self.env.reset(**keywords)
-        self.seen = np.array(results[0])
-        return results
-
-    def step(self, action: Any) -> Any:
-        self.heard.append(np.array(action))
-        results = self.env.step(action)
-        self.seen = np.array(results[0])
-        self.rewards.append(float(results[1]))
-        return results
-
-
-class Trial:
-    """A copy of an environment below its VecNormalize, to be flown in its place.
-
-    :ivar env: the copy. It has the wrappers that may change something, unless ``bare``.
-    """
-
-    def __init__(self, env: VecEnv, bare: bool = False) -> None:
-        self._memo: dict[int, Any] = {}
-        self._bare = bare
-        _, at = _around_statistics(env)
-        wrappers = []
-        while isinstance(at, VecEnvWrapper):
-            wrappers.append(at)
-            at = at.venv
-        self.taps: list[Any]
-        if isinstance(at, DummyVecEnv):
-            rows = [self._row(row) for row in at.envs]
-            made: VecEnv = DummyVecEnv([lambda row=row: row for row in rows])  # type: ignore[misc]
-        else:
-            made = _Vectorised(copy.deepcopy(at))
-            self.taps = [made]
-        self.n_steps = N_STEPS
-        if isinstance(at, DummyVecEnv):
-            self.taps = [self._memo[id(row.unwrapped)] for row in at.envs]
-            self.n_steps = min(max(_ROWS_OF_BODIES // at.num_envs, 50), N_STEPS)
-        self._memo[id(at)] = made
-        for wrapper in reversed(wrappers):
-            made = self._put(wrapper, wrapper.venv, made)
-        self.env = made
-
-    def _row(self, row: Any) -> Any:
-        """Return a copy of a row's environment."""
-        if isinstance(row, gymnasium.Wrapper):
-            return self._put(row, row.env, self._row(row.env))
-        self._memo[id(row)] = _Single(copy.deepcopy(row))
-        return self._memo[id(row)]
-
-    def _put(self, wrapper: Any, below: Any, made: Any) -> Any:
-        """Return a copy of a wrapper around the copy of what it wraps, or the latter alone if the
-        wrapper changes nothing.
-        """
-        self._memo[id(below)] = made
-        if self._bare or not _changes(wrapper):
-            return made
-        # SB3's wrappers cannot be copied as a whole, nor what they note of their class.
-        twin = object.__new__(type(wrapper))
-        self._memo[id(wrapper)] = twin
-        for name, value in vars(wrapper).items():
-            is_of_class = name == "class_attributes"
-            vars(twin)[name] = value if is_of_class else copy.deepcopy(value, self._memo)
-        return twin
-
-    def fly(self, act: Callable[[Any], AnyArray]) -> set[str]:
-        """Fly, and return the letters of what the wrappers change.
-
-        :param act: returns the actions for observations.
-        """
-        inner: Any = self.taps[0].action_space
-        outer: Any = self.env.action_space
-        low, high = limits_of(outer)
-        least, most = limits_of(inner)
-        found: set[str] = set() if np.array_equal((low, high), (least, most)) else {"s"}
-        is_batch = isinstance(self.taps[0], _Vectorised)
-        observation: Any = self.env.reset()
-        for _ in range(self.n_steps):
-            actions = np.asarray(act(observation))
-            flat = actions.reshape(self.env.num_envs, -1)
-            expected = least + (flat - low) / (high - low) * (most - least)
-            for tap in self.taps:
-                tap.heard.clear()
-            observation = self.env.step(actions)[0]
-            rows = zip(
-                self.taps,
-                [expected] if is_batch else expected,
-                [observation] if is_batch else observation,
-                strict=True,
-            )
-            for tap, wanted, shown in rows:
-                found |= _differences(tap, wanted, shown, inner)
-        return found
-
-    def reward(self) -> float:
-        """Return the mean sum of the simulator's rewards in the steps of a trial."""
-        return float(np.mean([sum(tap.rewards[: self.n_steps]) for tap in self.taps]))
-
-
-def _differences(tap: Any, wanted: AnyArray, shown: Any, space: spaces.Box) -> set[str]:
-    """Return the letters of what differs between both ends of the chain in a step."""
-    found: set[str] = set()
-    if len(tap.heard) != 1:
-        found.add("r")
-    for actions in tap.heard:
-        reached = actions.reshape(wanted.shape) if actions.size == wanted.size else np.nan
-        reached = np.clip(reached, space.low.flat[0], space.high.flat[0])
-        if not np.allclose(reached, wanted, atol=1e-4):
-            found.add("a")
-    if not np.array_equal(tap.seen, shown):
-        found.add("o")
-    return found
 
 
 def try_out(
@@ -413,23 +214,96 @@ def try_out(
 ) -> tuple[set[str], float] | None:
     """Fly a copy of an environment, which stays as it is, like all random numbers.
 
-    :param pilot: returns what acts in the copy.
+    :param pilot: returns a function from observations to actions, for the copy.
     :param bare: without its wrappers.
-    :return: the letters of what the wrappers change, and the return in the simulator's rewards.
-        None: no copy can be made, or it fails.
+    :return: the letters of all that the wrappers change, and the return. None: no copy can be made,
+        or it fails.
     """
-    at: Any = env.unwrapped
-    if isinstance(at, SubprocVecEnv) or not at.has_attr(FLIGHT_SETTINGS):
+    base: Any = env.unwrapped
+    if isinstance(base, SubprocVecEnv) or not base.has_attr(FLIGHT_SETTINGS):
         return None
-    if "human" in at.get_attr("render_mode"):
+    if "human" in base.get_attr("render_mode"):
         return None
     # A user's wrapper may raise anything.
-    with untouched(), suppress(Exception):
-        trial = Trial(env, bare)
-        with closing(trial.env):
-            found = trial.fly(pilot(trial.env))
-        return found, trial.reward()
+    with untouched(), suppress(Exception), closing(_copy(env, {}, bare)) as twin:
+        return _fly(twin, pilot(twin))
     return None
+
+
+def _copy(env: Any, copies: dict[int, Any], bare: bool) -> Any:
+    """Return a copy of an environment without the wrappers that change nothing.
+
+    :param copies: those of its parts, by their id, as of ``copy.deepcopy``.
+    """
+    is_batch = isinstance(env, VecEnvWrapper)
+    if is_batch or isinstance(env, gymnasium.Wrapper):
+        made = _copy(env.venv if is_batch else env.env, copies, bare)
+        if not bare and _changes(env):
+            # SB3's wrappers cannot be copied as a whole, nor what they note of their class.
+            made = object.__new__(type(env))
+            copies[id(env)] = made
+            for name, value in vars(env).items():
+                is_of_class = name == "class_attributes"
+                vars(made)[name] = value if is_of_class else copy.deepcopy(value, copies)
+    elif isinstance(env, DummyVecEnv):
+        rows = [_copy(row, copies, bare) for row in env.envs]
+        made = DummyVecEnv([lambda row=row: row for row in rows])  # type: ignore[misc]
+    else:
+        made = copy.deepcopy(env)
+    copies[id(env)] = made
+    return made
+
+
+def _fly(env: Any, act: Callable[[Any], AnyArray]) -> tuple[set[str], float]:
+    """Fly, and return the letters of all that the wrappers change, and the return."""
+    below = env.unwrapped
+    simulators = [row.unwrapped for row in getattr(below, "envs", ())] or [below]
+    received: list[AnyArray] = []
+    observed: dict[int, AnyArray] = {}
+    for number, simulator in enumerate(simulators):
+        _listen(simulator, number, received, observed)
+    low, high = limits_of(env.action_space)
+    least, most = limits_of(simulators[0].action_space)
+    changes = set() if np.array_equal((low, high), (least, most)) else {"s"}
+    total = 0.0
+    observation = env.reset()
+    for _ in range(N_STEPS):
+        received.clear()
+        actions = act(observation)
+        observation, rewards, *_ = env.step(actions)
+        total += float(rewards.mean())
+        wanted = least + (actions.reshape(-1, low.size) - low) / (high - low) * (most - least)
+        # Each row may receive an action several times.
+        times = len(received) // len(simulators)
+        wanted = wanted.reshape(len(simulators), -1).repeat(times, axis=0)
+        got = np.reshape(received, (len(received), -1)).clip(least.min(), most.max())
+        if times != 1:
+            changes.add("s")
+        if got.shape != wanted.shape or not np.allclose(got, wanted, atol=1e-4):
+            changes.add("a")
+        if not np.array_equal(np.ravel([*observed.values()]), np.ravel(observation)):
+            changes.add("o")
+    return changes, total
+
+
+def _listen(
+    simulator: Any, number: int, received: list[AnyArray], observed: dict[int, AnyArray]
+) -> None:
+    """Note all actions that a batch or a row gets, and the last observation that it gives."""
+
+    def noting(method: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(*arguments: Any, **keywords: Any) -> Any:
+            received.extend(map(np.array, arguments))
+            results = method(*arguments, **keywords)
+            if results is not None:
+                observed[number] = np.array(results[0] if isinstance(results, tuple) else results)
+            return results
+
+        return noted
+
+    steps = ("step_async", "step_wait") if isinstance(simulator, VecEnv) else ("step",)
+    for name in ("reset", *steps):
+        setattr(simulator, name, noting(getattr(simulator, name)))
 
 
 def at_random(env: VecEnv) -> Callable[[Any], AnyArray]:

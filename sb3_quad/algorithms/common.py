@@ -11,10 +11,10 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_quad.algorithms.chain import TURNED, chain_of, describe, note_chain, refuse_wrapped
+from sb3_quad.algorithms.chain import chain_of, describe, note_chain, refuse_wrapped
 from sb3_quad.algorithms.labelling import ExpertLike, Labeller, labeller_for
 from sb3_quad.algorithms.networks import Terms, network_of
 from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
@@ -229,43 +229,29 @@ class ExpertMixin(BaseAlgorithm):
         results = super()._setup_learn(*arguments, **keywords)
         if self._last_obs is not before:
             self._look(self._last_obs, self._last_episode_starts)
-        # A training that goes on after an interruption keeps its plan.
-        if self.num_timesteps > 0 and self._total_timesteps > planned:
-            self._warn_of_schedules()
-        return results
-
-    def _warn_of_schedules(self) -> None:
-        """Warn of schedules that have ended before and end again with this call."""
         schedules = {"learning_rate": self.lr_schedule, "bc_coef": getattr(self, "bc_coef", None)}
         for name, schedule in schedules.items():
-            if schedule is not None and schedule(1.0) != schedule(0.0):
-                begin = schedule(1.0 - self.num_timesteps / self._total_timesteps)
+            # A training that continues after an interruption keeps its plan.
+            continues = self.num_timesteps > 0 and self._total_timesteps > planned
+            if continues and schedule is not None and schedule(1.0) != schedule(0.0):
                 warnings.warn(
-                    f"{name}: its schedule ends with each call of learn; this one goes from"
-                    f" {begin:.3g} to {schedule(0.0):.3g}. Give one call all timesteps, or"
-                    f" {name} a number",
-                    stacklevel=4,
+                    f"{name}: its schedule ends with each call of learn; give one call all"
+                    f" timesteps, or {name} a number",
+                    stacklevel=3,
                 )
+        return results
 
     def _update_info_buffer(self, infos: Any, dones: Any = None) -> None:
-        for row in np.flatnonzero([] if dones is None else dones).tolist():
-            episode = infos[row].get("episode")
-            if episode is not None and self._shows_in_returns():
-                self._last_episodes[row] = (episode["r"], episode["l"])
-                self._first_episodes.setdefault(row, self._last_episodes[row])
-        # The batch tells which infos are not empty.
-        known = getattr(infos, "known", None)
-        if known is not None and dones is not None:
-            rows = known()
+        # SB3 would look into the infos of all rows, of which only those that ended tell an episode.
+        if dones is not None:
+            rows = np.flatnonzero(dones)
             infos, dones = [infos[row] for row in rows], dones[rows]
+            for row, info in zip(rows.tolist(), infos, strict=True):
+                episode = info.get("episode")
+                if episode is not None and self._shows_in_returns():
+                    self._last_episodes[row] = (episode["r"], episode["l"])
+                    self._first_episodes.setdefault(row, self._last_episodes[row])
         super()._update_info_buffer(infos, dones)
-
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        if isinstance(wrapped, VecTransposeImage) and wrapped is not env:
-            setattr(wrapped, TURNED, True)
-        return wrapped
 
     def _refuse_dict_observations(self) -> None:
         space = self.observation_space
@@ -363,8 +349,9 @@ def copy_policy(teacher: Any, model: BaseAlgorithm, name: str = "") -> None:
     if record and hasattr(teacher, FLIGHT_SETTINGS):
         plugin("observation")(name, teacher, record)
     here = chain_of(model) or []
-    refuse_wrapped(name, teacher, here)
-    if here and chain_of(teacher) == []:
+    learnt = chain_of(teacher)
+    refuse_wrapped(name, learnt, here)
+    if here and learnt == []:
         print_once(f"warning: {name}: was trained without {', '.join(here)}")
     theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()

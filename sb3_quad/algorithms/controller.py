@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_quad.algorithms.chain import limits_of, refuse_wrapped
+from sb3_quad.algorithms.chain import chain_of, limits_of, refuse_wrapped
 from sb3_quad.algorithms.statistics import statistics_of
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.plugins import FLIGHT_SETTINGS
@@ -82,7 +82,7 @@ class Controller:
             )
         self._check_spaces(action_space, observation_space)
         if wrappers is not None and self._true_state is None:
-            refuse_wrapped(self.name, source, [*wrappers])
+            refuse_wrapped(self.name, chain_of(source), [*wrappers])
         # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
         self._limits = limits_of(action_space)

@@ -6,16 +6,22 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecEnvWrapper,
+    VecTransposeImage,
+    unwrap_vec_normalize,
+)
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_quad.algorithms.chain import (
-    TURNED,
     Chain,
     chain_of,
     describe,
@@ -54,9 +60,9 @@ class Labeller:
     """Labels the states of a vector environment with an expert's actions.
 
     With ``VecNormalize``, experts see the raw observations. An SB3 model normalises them as in its
-    own training. A function sees pictures as the user's environment makes them; SB3 moves the
-    channels to the front. An expert that acts within other limits than the environment's, such as
-    those below a ``RescaleAction``, is labelled in the environment's.
+    own training. A function sees pictures as they are before VecTransposeImage, which SB3 adds. An
+    expert that acts within other limits than the environment's, such as those below a
+    ``RescaleAction``, is labelled in the environment's.
 
     :param expert: the expert. A name is resolved for the vehicle of row 0.
     :param check: whether to refuse an expert whose labels the environment's wrappers would falsify.
@@ -112,7 +118,7 @@ class Labeller:
         if env.has_attr(FLIGHT_SETTINGS) and hasattr(source, FLIGHT_SETTINGS):
             plugin("observation")(name, source, env.get_attr(FLIGHT_SETTINGS, [0])[0])
         self._raw: Any = None if self._true_state else unwrap_vec_normalize(env)
-        self._turned = getattr(env, TURNED, False) and not self._is_model
+        self._turned = isinstance(env, VecTransposeImage) and not self._is_model
 
     @property
     def _is_model(self) -> bool:
@@ -124,7 +130,7 @@ class Labeller:
         chain.refuse_inner_statistics()
         name = self._controller.name
         source = self._controller.source
-        changes = {*chain.changes}
+        changes = chain.changes
         if self._true_state is None and not self._is_model:
             # A function sees what the wrappers give, and returns what they take.
             if "NormalizeObservation" in chain.links:
@@ -132,14 +138,14 @@ class Labeller:
                     f"{name}: NormalizeObservation would change what it sees while its statistics"
                     " go on; use VecNormalize, behind which it sees raw observations"
                 )
-        elif self._is_model and changes & {*"o?"} and chain_of(source) != chain.record:
+        elif self._is_model and "o" in changes and chain_of(source) != chain.record:
             raise ExpertError(
-                f"{name}: was not trained behind {chain}, or does not say so; normalise by"
-                f" VecNormalize instead, or give {GO_ON} if it was"
+                f"{name}: was not trained behind {', '.join(chain.record)}, or does not say so;"
+                f" normalise by VecNormalize instead, or give {GO_ON} if it was"
             )
-        elif changes & {*"sa?"}:
+        elif "a" in changes:
             self._refuse_actions(chain)
-        elif not np.allclose(self._own_limits, self._limits):
+        elif "s" not in changes and not np.allclose(self._own_limits, self._limits):
             raise ExpertError(
                 f"{name}: its actions are of {source.action_space}, the environment's of"
                 f" {self.env.action_space}; no wrapper such as RescaleAction converts one into the"
@@ -149,19 +155,15 @@ class Labeller:
     def _refuse_actions(self, chain: Chain) -> None:
         """:raises ExpertError: wrappers that give the simulator other actions than the expert's."""
         name = self._controller.name
-        flown = try_out(self.env, self._pilot)
-        changes = {*chain.changes} if flown is None else flown[0] | {*chain.changes} - {"?"}
-        if not changes & {*"a?"}:
-            return
-        returns = "no copy of it can be flown to find that out"
-        if flown is not None:
-            alone = try_out(self.env, self._pilot, bare=True)
-            returns = f"in a trial flight its own labels return {flown[1]:.2f} there"
-            if alone is not None:
-                returns += f", and {alone[1]:.2f} without it"
+        flights = [try_out(self.env, self._pilot, bare) for bare in (False, True)]
+        returns = [f"{flight[1]:.2f}" for flight in flights if flight]
+        if len(returns) == 2:
+            tried = "in a trial, its labels return {} there, and {} without".format(*returns)
+        else:
+            tried = "no copy of it can be flown to find that out"
         raise ExpertError(
-            f"{name}: its actions may not reach the simulator through {chain}: {returns}; scale"
-            f" actions by RescaleAction, or give {GO_ON}"
+            f"{name}: its actions may not reach the simulator through"
+            f" {', '.join(chain.record)}: {tried}; scale actions by RescaleAction, or give {GO_ON}"
         )
 
     def _pilot(self, env: VecEnv) -> Callable[[Any], AnyArray]:
@@ -219,22 +221,13 @@ class Labeller:
         if is_function or not hasattr(base, FLIGHT_SETTINGS):
             return None
         settings = dict(getattr(base, FLIGHT_SETTINGS))
-        # Settings may hold a list, with a value for each row.
-        n = 16
-        if isinstance(settings["max_episode_steps"], int):
-            settings["max_episode_steps"] = min(settings["max_episode_steps"], 1500)
-        if any(isinstance(settings[key], list) for key in ("max_episode_steps", "vehicle")):
-            n = self.env.num_envs
+        # Settings may hold a value for each row.
+        settings["max_episode_steps"] = int(min(np.max(settings["max_episode_steps"]), 1500))
         with untouched(), suppress(SB3QuadError):
-            env = type(base)(n, seed=0, **settings)
+            env = type(base)(16, seed=0, **settings)
             act = self._pilot(env)
-            observation = env.reset()
-            total, flying = np.zeros(n), np.ones(n, np.bool_)
-            while flying.any():
-                observation, rewards, dones, _ = env.step(act(observation))
-                total += np.where(flying, rewards, 0.0)
-                flying &= ~dones
-            return float(total.mean())
+            agent: Any = SimpleNamespace(predict=lambda seen, **keywords: (act(seen), None))
+            return float(np.mean(evaluate_policy(agent, env, 16, warn=False)[0]))
         return None
 
 
