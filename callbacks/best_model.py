@@ -13,8 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_quad.algorithms.chain import refuse_other_wrappers
-from sb3_quad.algorithms.statistics import share_statistics
+from sb3_quad.algorithms.chain import refuse_other_wrappers, share_statistics
 from sb3_quad.base.errors import ConfigError, TrainingError, refuse_unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.base.types import Report, StrDict, StrPath

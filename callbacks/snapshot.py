@@ -21,7 +21,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.agents.zips import load_zip
-from sb3_quad.algorithms.statistics import STATISTICS, share_statistics
+from sb3_quad.algorithms.chain import STATISTICS, share_statistics
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
 from sb3_quad.base.files import read_arrays, write_arrays, write_bytes
 from sb3_quad.base.process import StopSignals

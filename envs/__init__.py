@@ -11,7 +11,11 @@ if TYPE_CHECKING:
     from sb3_quad.envs.simulation.tasks import TASKS, Task
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
 
+# 15 s of control steps of 0.01 s (thesis 4.2.3)
+MAX_EPISODE_STEPS = 1500
+
 __all__ = [
+    "MAX_EPISODE_STEPS",
     "TASKS",
     "BatchVecEnv",
     "QuadcopterEnv",

@@ -5,7 +5,7 @@ It names modules by their paths, so that nothing heavy is imported before it is 
 
 import gymnasium
 
-from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
+from sb3_quad.envs import MAX_EPISODE_STEPS
 
 ENVIRONMENTS = {
     "QuadTargetTracking-v0": "target_tracking",

@@ -313,7 +313,7 @@ def test_a_recorded_flight_holds_what_was_seen_and_done(tmp_path):
 def test_torch_flies_with_one_thread_unless_it_was_given_another_number(
     threads, in_flight, monkeypatch
 ):
-    monkeypatch.setattr("sb3_quad.algorithms.threads.available_cpus", lambda: 8)
+    monkeypatch.setattr("sb3_quad.algorithms.networks.available_cpus", lambda: 8)
     torch.set_num_threads(threads)
     seen = []
 

@@ -13,7 +13,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.plugins import FLIGHT_SETTINGS
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
+from sb3_quad.envs import MAX_EPISODE_STEPS
 from sb3_quad.envs.simulation.frames import ObservationSettings
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.references import Reference

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.agents.pickles import read_pickle
 from sb3_quad.agents.pretrained import pretrained_names
-from sb3_quad.algorithms.statistics import STATISTICS
+from sb3_quad.algorithms.chain import STATISTICS
 from sb3_quad.base.errors import ConfigError, did_you_mean, raised_as
 from sb3_quad.base.files import read_bytes
 from sb3_quad.base.process import trusted

@@ -14,15 +14,20 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_quad.algorithms.chain import chain_of, describe, note_chain, refuse_wrapped
+from sb3_quad.algorithms.chain import (
+    STATISTICS,
+    chain_of,
+    describe,
+    note_chain,
+    refuse_wrapped,
+    share_statistics,
+    statistics_of,
+)
 from sb3_quad.algorithms.labelling import ExpertLike, Labeller, labeller_for
-from sb3_quad.algorithms.networks import Terms, network_of
-from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
-from sb3_quad.algorithms.threads import one_thread
+from sb3_quad.algorithms.networks import Terms, network_of, one_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
-from sb3_quad.base.process import print_once
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.base.validate import Share, Weight, check_arguments
 
@@ -352,7 +357,7 @@ def copy_policy(teacher: Any, model: BaseAlgorithm, name: str = "") -> None:
     learnt = chain_of(teacher)
     refuse_wrapped(name, learnt, here)
     if here and learnt == []:
-        print_once(f"warning: {name}: was trained without {', '.join(here)}")
+        warnings.warn(f"{name}: was trained without {', '.join(here)}", stacklevel=2)
     theirs = dict(teacher.policy.state_dict())
     ours = model.policy.state_dict()
     if teacher.action_space != model.action_space:

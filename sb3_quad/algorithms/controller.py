@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_quad.algorithms.chain import chain_of, limits_of, refuse_wrapped
-from sb3_quad.algorithms.statistics import statistics_of
+from sb3_quad.algorithms.chain import chain_of, limits_of, refuse_wrapped, statistics_of
 from sb3_quad.base.errors import ControllerError, ExpertError, SB3QuadError, raised_as
 from sb3_quad.base.plugins import FLIGHT_SETTINGS
 from sb3_quad.base.types import BoolArray, Float32Array

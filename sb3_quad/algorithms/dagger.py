@@ -26,7 +26,7 @@ from sb3_quad.algorithms.buffers import (
     ExpertRolloutBuffer,
     sample_rows,
 )
-from sb3_quad.algorithms.chain import limits_of
+from sb3_quad.algorithms.chain import limits_of, statistics_of
 from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
@@ -45,7 +45,6 @@ from sb3_quad.algorithms.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.algorithms.networks import network_of
-from sb3_quad.algorithms.statistics import statistics_of
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Count, Natural, Share, Weight, check

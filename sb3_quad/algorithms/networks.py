@@ -4,7 +4,8 @@ PyTorch is the definition. An accelerator may compute the same faster: see
 :mod:`sb3_quad.base.plugins`. In shapes, ``b`` is the mini-batch and ``a`` the action dimension.
 """
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_quad.algorithms.buffers import Batch
 from sb3_quad.algorithms.losses import Loss
-from sb3_quad.algorithms.threads import one_thread_by_default
 from sb3_quad.base.plugins import plugin
+from sb3_quad.base.process import available_cpus
 from sb3_quad.base.types import AnyArray, Float32Array, FloatArray
 
 Terms = dict[str, float]
@@ -104,3 +105,27 @@ def network_of(policy: Any) -> Network:
     """Return the fastest implementation of a policy."""
     accelerated: Network | None = plugin("accelerate")(policy)
     return accelerated or Network(policy)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Give PyTorch one thread for the duration of the block.
+
+    Its threads wait for one another at every operation: over networks of 64 to 256 units that is
+    hardly faster than one, and beside another process it takes several times as long.
+    """
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(threads)
+
+
+def one_thread_by_default() -> AbstractContextManager[None]:
+    """Like :func:`one_thread`, but leave a number that ``torch.set_num_threads`` was given.
+
+    By itself PyTorch takes a thread for each CPU, or for each core, which may be half as many.
+    """
+    cpus = available_cpus()
+    return one_thread() if th.get_num_threads() in (cpus, cpus // 2) else nullcontext()

@@ -22,7 +22,7 @@ from sb3_quad.agents.agent_settings import (
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.controller import Controller
 from sb3_quad.algorithms.labelling import warn_of_vehicle
-from sb3_quad.algorithms.threads import one_thread_by_default
+from sb3_quad.algorithms.networks import one_thread_by_default
 from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
@@ -34,8 +34,8 @@ from sb3_quad.base.types import (
     StrDict,
     StrPath,
 )
+from sb3_quad.envs import MAX_EPISODE_STEPS
 from sb3_quad.envs.batch_env import quadcopter_spaces
-from sb3_quad.envs.simulation import MAX_EPISODE_STEPS
 from sb3_quad.envs.simulation.batch import MAX_ROWS
 from sb3_quad.envs.simulation.checks import per_row, whole_number
 from sb3_quad.envs.simulation.settings import FlightSettings

@@ -17,7 +17,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.agents.agent_settings import settings_of_model
-from sb3_quad.algorithms.statistics import statistics_of
+from sb3_quad.algorithms.chain import statistics_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import FloatArray

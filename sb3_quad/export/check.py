@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_quad.algorithms.statistics import statistics_of
+from sb3_quad.algorithms.chain import statistics_of
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.envs.simulation.batch import QuadcopterBatch

@@ -26,9 +26,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.agents.transfer import transfer_policy
-from sb3_quad.algorithms.chain import note_chain
+from sb3_quad.algorithms.chain import STATISTICS, note_chain, share_statistics, statistics_of
 from sb3_quad.algorithms.labelling import Labeller
-from sb3_quad.algorithms.statistics import STATISTICS, share_statistics, statistics_of
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import (
     locked,
