@@ -44,6 +44,7 @@ from sb3_quad.training.options import (
 )
 from sb3_quad.training.rivals import (
     EPISODES,
+    HEAD_START,
     Flown,
     fly_agent,
     fly_rivals,
@@ -329,7 +330,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                 flown: list[Flown] = []
                 if handed is not None and stage.rivals and with_vehicle(job):
                     flown = _fly_all(stages[number - 1].name, stage, job, folder, report)
-                    job = _best(flown).job or job
+                    job = _best(flown, HEAD_START).job or job
                 state = state_of(runs, number, job.config.n_timesteps)
                 if state == "done":
                     run = runs[number]
@@ -400,11 +401,11 @@ def _fly_all(
     return [agent, *fly_rivals(stage.rivals, job, stage.rival_settings, folder, report)]
 
 
-def _best(flown: list[Flown]) -> Flown:
-    """Return the best agent; one that comes first has to be beaten."""
+def _best(flown: list[Flown], margin: float = 0.0) -> Flown:
+    """Return the best agent; one that comes first has to be beaten, see :meth:`Flown.is_behind`."""
     best, *others = flown
     for other in others:
-        if other.job is not None and best.is_behind(other):
+        if other.job is not None and best.is_behind(other, margin):
             best = other
     return best
 

@@ -23,6 +23,9 @@ from sb3_quad.training.hand_over import is_below
 EPISODES = 60  # of each task
 TOLERANCE = 0.1  # m, of the settling time
 LOST = 0.02  # One that loses this share of the flights more is behind, whatever the others earn.
+# Training goes on from the agent of the stage before, whose network is smaller and learns faster,
+# unless it earns this share less than another one.
+HEAD_START = 0.2
 
 
 class Flown(NamedTuple):
@@ -35,12 +38,15 @@ class Flown(NamedTuple):
     flights: Flights
     job: TrainingJob | None = None
 
-    def is_behind(self, other: "Flown") -> bool:
-        """Whether it loses more flights, or earns less on the same episodes beyond chance."""
+    def is_behind(self, other: "Flown", margin: float = 0.0) -> bool:
+        """Whether it loses more flights, or earns less on the same episodes beyond chance.
+
+        :param margin: the share of the other's mean reward that it may earn less.
+        """
         lost = other.flights.survival.mean() - self.flights.survival.mean()
-        return bool(
-            lost >= LOST or (lost >= 0.0 and is_below(self.flights.reward, other.flights.reward))
-        )
+        rewards = other.flights.reward
+        least = rewards - margin * abs(rewards.mean())
+        return bool(lost >= LOST or (lost >= 0.0 and is_below(self.flights.reward, least)))
 
     def __str__(self) -> str:
         flights = self.flights
