@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 MAX_EPISODE_STEPS = 1500
 
 __all__ = [
-    "MAX_EPISODE_STEPS",
     "TASKS",
     "BatchVecEnv",
     "QuadcopterEnv",

@@ -93,6 +93,7 @@ def test_a_page_runs_with_trainings_of_one_rollout(page, short_trainings):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # two trainings, also on a slow machine
 def test_the_readme_shows_the_rows_that_its_code_prints(capsys):
     """Its numbers are another seed's or another machine's."""
     run("README.md")

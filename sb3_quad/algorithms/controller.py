@@ -41,7 +41,7 @@ class Controller:
         ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
     :param wrappers: the record of the wrappers that it flies behind, of
-        :func:`~sb3_quad.algorithms.chain.describe`. None: any will do.
+        ``sb3_quad.algorithms.chain.describe``. None: any will do.
     :raises ControllerError: the source is none of the above, or its spaces do not fit
         (``ExpertError`` for an expert).
     :raises ConfigError: a model that was trained behind other wrappers.
