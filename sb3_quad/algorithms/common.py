@@ -234,10 +234,10 @@ class ExpertMixin(BaseAlgorithm):
         results = super()._setup_learn(*arguments, **keywords)
         if self._last_obs is not before:
             self._look(self._last_obs, self._last_episode_starts)
+        # A training that continues after an interruption keeps its plan.
+        continues = self.num_timesteps > 0 and self._total_timesteps > planned
         schedules = {"learning_rate": self.lr_schedule, "bc_coef": getattr(self, "bc_coef", None)}
         for name, schedule in schedules.items():
-            # A training that continues after an interruption keeps its plan.
-            continues = self.num_timesteps > 0 and self._total_timesteps > planned
             if continues and schedule is not None and schedule(1.0) != schedule(0.0):
                 warnings.warn(
                     f"{name}: its schedule ends with each call of learn; give one call all"

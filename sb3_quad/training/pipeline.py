@@ -43,9 +43,9 @@ from sb3_quad.training.options import (
     KEPT_BY_STAGES,
 )
 from sb3_quad.training.rivals import (
-    EPISODES,
     HEAD_START,
     Flown,
+    best_of,
     fly_agent,
     fly_rivals,
     with_vehicle,
@@ -329,8 +329,11 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                     job = job.model_copy(update={"initial_policy": str(handed.agent)})
                 flown: list[Flown] = []
                 if handed is not None and stage.rivals and with_vehicle(job):
-                    flown = _fly_all(stages[number - 1].name, stage, job, folder, report)
-                    job = _best(flown, HEAD_START).job or job
+                    before = fly_agent(stages[number - 1].name, job)
+                    flown = fly_rivals(
+                        before, job, stage.rivals, stage.rival_settings, folder, report
+                    )
+                    job = best_of(flown, HEAD_START).job or job
                 state = state_of(runs, number, job.config.n_timesteps)
                 if state == "done":
                     run = runs[number]
@@ -352,7 +355,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                     after = job.model_copy(update={"initial_policy": str(handed.agent)})
                     flown.insert(0, fly_agent(stage.name, after))
                     report(str(flown[0]))
-                    best = _best(flown)
+                    best = best_of(flown)
                     if best.job is not None and best.job is not after:
                         agent = Path(str(best.job.initial_policy))
                         problem = f"{best.label} flies this vehicle better"
@@ -388,26 +391,6 @@ def state_of(runs: Sequence[RunFolder], number: int, n_timesteps: int) -> State:
         return "done"
     # A run that has a model and no snapshot cannot be resumed, so it begins again.
     return "begun" if run.not_begun or run.resume_state.is_file() else "new"
-
-
-def _fly_all(
-    name: str, stage: Stage, job: TrainingJob, folder: Path, report: Report
-) -> list[Flown]:
-    """Fly the agent that a stage would start from and its rivals; the agent comes first."""
-    tasks = " and ".join(map(str, (job.flight_settings.task, *job.config.eval_tasks)))
-    report(f"on this vehicle, {EPISODES} flights of {tasks} each:")
-    agent = fly_agent(name, job)
-    report(str(agent))
-    return [agent, *fly_rivals(stage.rivals, job, stage.rival_settings, folder, report)]
-
-
-def _best(flown: list[Flown], margin: float = 0.0) -> Flown:
-    """Return the best agent; one that comes first has to be beaten, see :meth:`Flown.is_behind`."""
-    best, *others = flown
-    for other in others:
-        if other.job is not None and best.is_behind(other, margin):
-            best = other
-    return best
 
 
 def _agent(stage: Stage, job: TrainingJob, run: RunFolder, report: Report) -> HandOver:

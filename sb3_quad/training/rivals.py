@@ -72,27 +72,31 @@ def with_vehicle(job: TrainingJob) -> bool:
 
 
 def fly_rivals(
-    names: list[str], job: TrainingJob, changes: StrDict, folder: Path, report: Report
+    agent: Flown, job: TrainingJob, names: list[str], changes: StrDict, folder: Path, report: Report
 ) -> list[Flown]:
-    """Fly each of the rivals on the vehicle of a job, and report a line on it.
+    """Fly the rivals of an agent on the vehicle of a job, and report a line on each of them all.
 
-    An agent goes to ``<folder>/<name>.zip``, which says that it flies this vehicle.
+    An agent among them goes to ``<folder>/<name>.zip``, which says that it flies this vehicle.
 
-    :param changes: to the settings of the job, if it starts from an agent among them.
+    :param agent: what the job would start from; it comes first in the result.
+    :param changes: to the settings of the job, if it starts from a rival.
     """
     config = job.config
-    flown = []
+    tasks = " and ".join(map(str, (job.flight_settings.task, *config.eval_tasks)))
+    report(f"on this vehicle, {EPISODES} flights of {tasks} each:")
+    report(str(agent))
+    flown = [agent]
     for name in names:
         try:
             if name in pretrained_names():
-                agent = load_pretrained(name)
-                settings = merged({**config.settings, **as_agent(agent, config, {})}, changes, name)
+                rival = load_pretrained(name)
+                settings = merged({**config.settings, **as_agent(rival, config, {})}, changes, name)
                 own_config = build_config(config.algo, config.env_id, settings, name)
                 path = str(folder / f"{name}.zip")
                 own = job.model_copy(update={"config": own_config, "initial_policy": path})
-                own.flight_settings.write_into(agent)
-                save_model(agent, path)
-                flown.append(fly_agent(name, own))
+                own.flight_settings.write_into(rival)
+                save_model(rival, path)
+                flown.append(Flown(name, _fly(rival, own), own))
             else:
                 layout = config.flight_settings.rotor_layout
                 expert = resolve_expert(name, config.env_kwargs["vehicle"], layout=layout)
@@ -103,6 +107,15 @@ def fly_rivals(
         else:
             report(str(flown[-1]))
     return flown
+
+
+def best_of(flown: list[Flown], margin: float = 0.0) -> Flown:
+    """Return the best agent; one that comes first has to be beaten, see :meth:`Flown.is_behind`."""
+    best, *others = flown
+    for other in others:
+        if other.job is not None and best.is_behind(other, margin):
+            best = other
+    return best
 
 
 def fly_agent(label: str, job: TrainingJob) -> Flown:
