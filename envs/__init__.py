@@ -6,7 +6,6 @@ from sb3_quad.base.imports import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.envs.batch_vec_env import BatchVecEnv
-    from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
     from sb3_quad.envs.simulation.tasks import TASKS, Task
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
@@ -18,7 +17,6 @@ __all__ = [
     "TASKS",
     "BatchVecEnv",
     "QuadcopterEnv",
-    "QuadcopterGymVectorEnv",
     "QuadcopterVecEnv",
     "Task",
 ]
@@ -28,7 +26,6 @@ _LAZY = {
     "BatchVecEnv": "sb3_quad.envs.batch_vec_env",
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
-    "QuadcopterGymVectorEnv": "sb3_quad.envs.gym_vector",
     "TASKS": "sb3_quad.envs.simulation.tasks",
     "Task": "sb3_quad.envs.simulation.tasks",
 }

@@ -23,7 +23,6 @@ def register_environments() -> None:
             gymnasium.register(
                 id=env_id,
                 entry_point="sb3_quad.envs.quadcopter_env:QuadcopterEnv",
-                vector_entry_point="sb3_quad.envs.gym_vector:QuadcopterGymVectorEnv",
                 max_episode_steps=MAX_EPISODE_STEPS,
                 kwargs={"task": task},
             )

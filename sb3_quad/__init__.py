@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from sb3_quad.callbacks.best_model import BestModel
     from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
     from sb3_quad.envs.flight_cost import FlownStates, flight_cost
-    from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
     from sb3_quad.envs.simulation.randomization import Randomization
     from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
@@ -45,7 +44,6 @@ __all__ = [
     "PIDExpert",
     "ProgressLine",
     "QuadcopterEnv",
-    "QuadcopterGymVectorEnv",
     "QuadcopterVecEnv",
     "Randomization",
     "Task",
@@ -76,7 +74,6 @@ _LAZY = {
     "PPOBC": "sb3_quad.algorithms.ppo_bc",
     "ProgressLine": "sb3_quad.callbacks.every",
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
-    "QuadcopterGymVectorEnv": "sb3_quad.envs.gym_vector",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
     "Randomization": "sb3_quad.envs.simulation.randomization",
     "Task": "sb3_quad.envs.simulation.tasks",

@@ -195,7 +195,6 @@ def test_other_environments_train_too(tmp_path):
     assert result.run.best_model.is_file() and "successes" not in np.load(result.run.evaluations)
     (line,) = lines
     assert "mean reward" in line and "success" not in line
-    assert main(["plot", f"ppo={result.run.path}", "-o", str(tmp_path / "curves.svg")]) == 0
 
 
 @pytest.mark.slow
@@ -393,7 +392,7 @@ def test_neither_an_import_nor_a_command_changes_what_ctrl_c_does(ignored):
         "import signal; before = signal.getsignal(signal.SIGINT);"
         "import sb3_quad, sb3_quad.cli as cli;"
         "assert signal.getsignal(signal.SIGINT) is before;"
-        "cli.main(['plot', 'none']);"
+        "cli.main(['export', 'none']);"
         "assert signal.getsignal(signal.SIGINT) is before"
     )
     words = [sys.executable, "-c", code]

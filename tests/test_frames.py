@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sb3_quad  # noqa: F401  (registers the environments)
-from sb3_quad.envs.gym_vector import QuadcopterGymVectorEnv
 from sb3_quad.envs.simulation.observation import DEFAULT_STD
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 
@@ -119,8 +118,7 @@ def test_a_snapshot_keeps_the_frames_and_looking_changes_nothing():
 def test_the_observation_space_has_room_for_the_frames():
     keywords = {"history": [0, 1, 4], "last_action": True}
     single = gymnasium.make("QuadTargetTracking-v0", **keywords)
-    vector = QuadcopterGymVectorEnv(3, **keywords)
-    assert single.observation_space.shape == vector.single_observation_space.shape == (66,)
-    assert single.reset(seed=0)[0].shape == (66,) and vector.reset(seed=0)[0].shape == (3, 66)
+    assert single.observation_space.shape == (66,)
+    assert single.reset(seed=0)[0].shape == (66,)
     assert single.unwrapped.step(np.zeros(4))[0].shape == (66,)
     single.close()

@@ -1,4 +1,4 @@
-"""Plots of flights, of what a scenario varies, and of learning curves, in one style."""
+"""Plots of flights and of what a scenario varies, in one style."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -6,17 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.types import StrDict
 from sb3_quad.evaluation.flightlog import Track
-from sb3_quad.evaluation.learning_curves import Curve
-from sb3_quad.evaluation.tables import colours_of
 
 # Inches of a panel
 WIDTH = 5.0
@@ -84,51 +80,6 @@ def success_plot(cells: pd.DataFrame, key: str, title: str, colours: Colours) ->
     axes.set_ylim(-0.03, 1.03)
     legend(figure)
     return figure
-
-
-@styled
-def plot_curves(groups: Mapping[str, Sequence[Curve]], show: Sequence[str] = ()) -> Figure:
-    """Draw learning curves over timesteps, a panel for each of ``show`` (Figs. 4.3 and 4.4).
-
-    :param groups: the curves of an agent's seeds, by its name; their mean is drawn, with their
-        range around it.
-    :param show: what the evaluations hold: ``success``, ``survival``, ``reward`` or a loss; by
-        default success, if the runs have it, and reward.
-    :raises ConfigError: a panel that no curve has values for.
-    """
-    measures: StrDict = {}
-    for runs in groups.values():
-        for run in runs:
-            measures.update(run.measures)
-    if not show:
-        show = [name for name in ("success", "reward") if name in measures]
-    for name in show:
-        if name not in measures:
-            raise ConfigError(f"{name}: the runs hold none; they hold {', '.join(measures)}")
-    figure = Figure(figsize=(WIDTH * len(show), HEIGHT), layout="constrained")
-    panels = figure.subplots(1, len(show), squeeze=False)[0]
-    colours = colours_of([*groups])
-    for panel, name in zip(panels, show, strict=True):
-        panel.set(xlabel="timesteps in millions", ylabel=name.replace("_", " "))
-        for label, runs in groups.items():
-            seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
-            band(panel, colours[label], label + seeds, _mean_and_range(runs, name), **POINTS)
-    legend(figure)
-    return figure
-
-
-def _mean_and_range(runs: Sequence[Curve], name: str) -> pd.DataFrame:
-    """The mean, the lowest and the highest value of the runs over millions of timesteps.
-
-    A run is interpolated between its evaluations. There is no line where a run has no values.
-    """
-    lines = [pd.Series(run.values(name), run.timesteps / 1e6).dropna() for run in runs]
-    table = pd.concat(lines, axis="columns").sort_index()
-    table = table.interpolate("index", limit_area="inside").dropna()
-    # pandas cannot aggregate an empty table: a run has no values, or no two runs overlap.
-    if table.empty:
-        return pd.DataFrame(columns=["mean", "min", "max"], dtype=np.float64)
-    return table.agg(["mean", "min", "max"], axis="columns")
 
 
 def band(axes: Axes, colour: str, label: str, table: pd.DataFrame, **style: Any) -> None:

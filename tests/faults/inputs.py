@@ -58,7 +58,6 @@ BASES = {
     "enjoy": "pid --no-render -n 3",
     "evaluate": "pid --suite suite.yaml --no-report",
     "export": "itm-recovery --format onnx",
-    "plot": "a=no_run",
     "report": "no_results",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",
 }

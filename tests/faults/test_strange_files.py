@@ -22,7 +22,6 @@ from sb3_quad.envs.simulation.motions import LARGEST_TABLE, read_points
 from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.evaluate import _flown_before
-from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.training.config import SETTINGS, build_config
@@ -35,7 +34,6 @@ READERS = {
     "settings": lambda path: SETTINGS.read(Path(path)),
     "reference": lambda path: read_points(Path(path)),
     "demonstrations": AggregatedDataset(8, (2,), 1).load,
-    "evaluations": lambda path: read_curve(Path(path).parent),
     "arrays": read_arrays,
 }
 MOST_SECONDS = 20
