@@ -108,7 +108,7 @@ def test_help_has_examples_and_needs_no_torch_nor_does_a_missing_agent():
         "import sys\nfrom sb3_quad.cli.app import COMMANDS, main\n"
         "codes = [main(['--help']), *(main([name, '--help']) for name in COMMANDS)]\n"
         "codes.append(main(['train', '-i', 'missing.zip']) != 2)\n"
-        "heavy = {'torch', 'numba', 'matplotlib', 'rich', 'filelock'}\n"
+        "heavy = {'torch', 'numba', 'matplotlib', 'filelock'}\n"
         "sys.exit(any(codes) or bool(heavy & sys.modules.keys()))"
     )
     result = subprocess.run(

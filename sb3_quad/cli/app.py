@@ -10,6 +10,8 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
+import argcomplete
+
 from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, refuse_unknown
@@ -70,6 +72,9 @@ def make_parser() -> Parser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
+    # A shell that completes asks by a variable, and gets words instead of a run.
+    if "_ARGCOMPLETE" in os.environ:
+        argcomplete.autocomplete(make_parser())
     arguments = list(sys.argv[1:] if argv is None else argv)
     # A closed stream, as after `>&-`, is None. Its number must not go to a file that opens next.
     for name in ("stdout", "stderr"):

@@ -8,12 +8,12 @@ from argparse import (
     ArgumentTypeError,
     BooleanOptionalAction,
     Namespace,
-    RawDescriptionHelpFormatter,
 )
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn, TypeAlias
 
 from pydantic import BaseModel
+from rich_argparse import RawDescriptionRichHelpFormatter
 
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
@@ -36,12 +36,18 @@ ELSEWHERE = {
 """What does the part of a flag of rl_zoo3, for the error message."""
 
 
+class HelpFormatter(RawDescriptionRichHelpFormatter):
+    """Keeps the line breaks of examples, and writes in colour on a terminal."""
+
+    # Brackets in our texts are not markup.
+    help_markup = text_markup = False
+
+
 class Parser(ArgumentParser):
     """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
 
     def __init__(self, **kwargs: Any) -> None:
-        # This formatter keeps the line breaks of examples.
-        super().__init__(allow_abbrev=False, formatter_class=RawDescriptionHelpFormatter, **kwargs)
+        super().__init__(allow_abbrev=False, formatter_class=HelpFormatter, **kwargs)
 
     def error(self, message: str) -> NoReturn:
         """Raise the error instead of exiting.
