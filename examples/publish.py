@@ -12,8 +12,11 @@ read it, too. For the card the policy flies fresh episodes: 3,840 recoveries, 96
 10, 15 and 20 m, and 960 figures of eight. The run folder says how it was trained; the card calls
 anything else "not recorded". The agents of the package were made in this way.
 
-To share it on the Hugging Face Hub, put both files into a folder, the card as README.md, and run
-`hf upload USER/REPO FOLDER`.
+With --hub it writes a folder for the Hugging Face Hub instead: the zip, the card as README.md, and
+replay.mp4, the film that the Hub shows. Upload it by `hf upload ORG/my-agent my-agent`; then
+anybody flies it as `hf:ORG/my-agent`, or loads it by `huggingface_sb3.load_from_hub`.
+
+    python examples/publish.py logs/ppo_bc/QuadStateRecovery-v0_1 --name my-agent --hub
 """
 
 import argparse
@@ -24,17 +27,17 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import yaml
 from pydantic import PositiveInt
 from stable_baselines3 import PPO
 
 from sb3_quad.agents.agent_settings import agent_settings
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli import app
-from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags
+from sb3_quad.cli.parser import OVERWRITE, SWITCH, TRUST, Flags, agent
 from sb3_quad.envs.simulation.frames import ObservationSettings
 from sb3_quad.envs.simulation.settings import FlightSettings, in_words
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
@@ -71,7 +74,7 @@ SHOWN = (SUCCESS, SURVIVAL, REWARD, *TIMES, MEDIAN, QUANTILE, RMS_ERROR)
 
 FLAGS: Flags = {
     "model MODEL": (
-        agent_path,
+        agent,
         None,
         "an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC, APG) with MlpPolicy: "
         "a zip or a run folder",
@@ -84,9 +87,12 @@ FLAGS: Flags = {
         "the command that trained it (command.txt of the run)",
     ),
     "--episodes N": (PositiveInt, 960, "episodes of each task (960; recoveries: 4 times as many)"),
+    "--hub": (SWITCH, "write a folder NAME for the Hugging Face Hub, with a film"),
     **TRUST,
     **OVERWRITE,
 }
+# A flight of the film: control steps, and the panel's size.
+FILM = ("--task", "state_recovery", "-n", "400", "--size", "480x480")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -97,9 +103,14 @@ def run(options: argparse.Namespace) -> int:
             "folders are for -o"
         )
     folder = Path(options.folder)
+    card_name = f"{options.name}.md"
+    if options.hub:
+        folder /= options.name
+        card_name = "README.md"
     zip_file = folder / f"{options.name}.zip"
-    card_file = folder / f"{options.name}.md"
-    for path in (zip_file, card_file):
+    card_file = folder / card_name
+    film = folder / "replay.mp4"
+    for path in (zip_file, card_file, *[film] * options.hub):
         refuse_existing(path, options.overwrite)
     settings, source = agent_settings(options.model)
     content = slim_bytes(options.model, settings if source else None)
@@ -120,7 +131,10 @@ def run(options: argparse.Namespace) -> int:
         flown = measure(load_model(zip_stream.name), options.episodes, **how)
         rows = {name: summarise(flights) for name, flights in flown.items()}
         text = write_card(options.name, rows, options.made_by or command, facts, how)
-        card_stream.write(text.encode())
+        front = hub_metadata(rows) if options.hub else ""
+        card_stream.write((front + text).encode())
+    if options.hub and app.main(["enjoy", str(zip_file), *FILM, "-o", str(film), "--overwrite"]):
+        return 1
     print(text)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
     return 0
@@ -268,6 +282,27 @@ def write_card(
         command=command,
         facts=Table(("", ""), [*facts.items()]).markdown(),
     )
+
+
+def hub_metadata(measured: Mapping[str, Metrics]) -> str:
+    """Return the front matter by which the Hub lists an agent, with its mean rewards."""
+    results = []
+    for task, metrics in measured.items():
+        env = "QuadStateRecovery-v0" if task == RECOVERY else "QuadTargetTracking-v0"
+        reward = {"type": "mean_reward", "name": task, "value": round(metrics.reward.value, 3)}
+        results.append(
+            {
+                "task": {"type": "reinforcement-learning"},
+                "dataset": {"name": env, "type": env},
+                "metrics": [reward],
+            }
+        )
+    data = {
+        "library_name": "stable-baselines3",
+        "tags": ["reinforcement-learning", "deep-reinforcement-learning", "stable-baselines3"],
+        "model-index": [{"name": "PPO", "results": results}],
+    }
+    return f"---\n{yaml.safe_dump(data, sort_keys=False)}---\n\n"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

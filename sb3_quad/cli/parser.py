@@ -15,6 +15,7 @@ from typing import Any, NoReturn, TypeAlias
 from pydantic import BaseModel
 from rich_argparse import RawDescriptionRichHelpFormatter
 
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict
@@ -130,6 +131,14 @@ def seed(text: str) -> int:
     if number < 0:
         number = random.SystemRandom().randrange(2**31)
     return number
+
+
+def agent(text: str) -> str:
+    """Return the path of an agent's zip, see :func:`~sb3_quad.agents.pretrained.agent_path`."""
+    try:
+        return agent_path(text)
+    except ConfigError as error:
+        raise ArgumentTypeError(str(error)) from None
 
 
 KINDS = {bool: SWITCH, StrDict: PAIRS, str: str}

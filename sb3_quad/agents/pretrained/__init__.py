@@ -8,6 +8,7 @@ both.
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.agents.hub import ADDRESS, hub_agent
 from sb3_quad.base.errors import refuse_unknown
 
 if TYPE_CHECKING:
@@ -38,26 +39,35 @@ def pretrained_path(name: str) -> Path:
 
 
 def load_pretrained(name: str, **kwargs: Any) -> "PPO":
-    """Return a policy that comes with the package, as a stock PPO model.
+    """Return a policy that comes with the package, as a stock PPO model, or one of the Hub to fly.
 
     It takes the observations of an environment made with :func:`env_kwargs` of that name, and
-    returns 4 actions in [-1, 1].
+    returns 4 actions in [-1, 1]. A zip of the Hub is read as data, so that it cannot run code.
 
+    :param name: a name of the package, or ``hf:ORG/NAME`` on the Hugging Face Hub.
     :param kwargs: passed on to ``PPO.load``, such as ``env`` and ``device`` (default: "cpu").
-    :raises ConfigError: an unknown name.
+    :raises ConfigError: an unknown name, or a file of the Hub that is refused.
     """
     from stable_baselines3 import PPO
 
+    from sb3_quad.agents.zips import load_zip
+
     kwargs.setdefault("device", "cpu")
+    if name.startswith(ADDRESS):
+        model: PPO = load_zip(None, hub_agent(name), name, **kwargs)
+        return model
     return PPO.load(pretrained_path(name), **kwargs)
 
 
 def agent_path(text: str) -> str:
     """Return the path of an agent's zip.
 
-    :param text: the name of a policy that comes with the package, or a run folder. Anything else is
-        returned as it is.
+    :param text: the name of a policy that comes with the package, ``hf:ORG/NAME`` on the Hugging
+        Face Hub, or a run folder. Anything else is returned as it is.
+    :raises ConfigError: an agent of the Hub that cannot be downloaded.
     """
+    if text.startswith(ADDRESS):
+        return hub_agent(text)
     if text in pretrained_names():
         return str(pretrained_path(text))
     configs = sorted(Path(text).glob("*/config.yml"))

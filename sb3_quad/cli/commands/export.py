@@ -29,20 +29,20 @@ of a C header needs a C compiler.
 from argparse import Namespace
 from pathlib import Path
 
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import (
     OVERWRITE,
     TRUST,
     Flags,
+    agent,
 )
 
 FLAGS: Flags = {
     "model MODEL": (
-        agent_path,
+        agent,
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC or TD3): "
-        "a zip, a run folder, or a name such as itm-recovery",
+        "a zip, a run folder, hf:ORG/NAME, or a name such as itm-recovery",
     ),
     "--format": ({"required": True}, "onnx, c, crazyflie or px4"),
     "-o FILE": (
