@@ -21,7 +21,7 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files docs notebooks docs-links pictures lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files docs notebooks docs-links pictures lint format type type-demo links release-check commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
@@ -39,6 +39,7 @@ help:
 	@echo "make pictures       draw the pages' pictures anew, ARGS=\"starts.png\" some of them; docs/pictures.py has their commands"
 	@echo "make notebooks      run the notebooks whose code has changed, and keep their outputs for the site; ARGS=--rerun all"
 	@echo "make docs-links     ask each address outside of the site, where there is a network"
+	@echo "make release-check  build, install and try what a release would publish, for each Python at hand"
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
 	@echo "make type           check types of the package, the examples and the tests"
@@ -127,6 +128,9 @@ docs-links: $(DOCS_INSTALLED)
 # Films come with the extra [video], which dev has.
 pictures: $(INSTALLED)
 	$(PY) docs/pictures.py $(ARGS)
+
+release-check:
+	.ci/release_check
 
 lint: $(INSTALLED) links
 	$(PY) -m ruff check .
