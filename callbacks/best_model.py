@@ -45,7 +45,7 @@ class BestModel(EveryTimesteps):
 
     Every evaluation flies the same episodes, so that models are compared and not their luck. As in
     SB3's EvalCallback, the best model has the highest mean reward. Rewards are counted as the
-    training sees them: if a wrapper changes them, the task's own are shown beside them and decide
+    training sees them: if a wrapper changes them, the task's own are shown as well and decide
     nothing. An evaluation that is due at the last timestep is made once, after the last update.
 
     ``evaluations.npz`` is EvalCallback's with more arrays: ``seconds`` of training; ``survivals``

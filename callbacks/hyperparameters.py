@@ -1,4 +1,4 @@
-"""The settings of a training beside its metrics, in TensorBoard."""
+"""The settings of a training next to its metrics, in TensorBoard."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import HParam

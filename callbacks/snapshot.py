@@ -1,4 +1,4 @@
-"""Snapshots of a training: one file with everything that it needs to go on, replaced as a whole.
+"""Snapshots of a training: one file with everything that it needs to continue, replaced as a whole.
 
 :class:`SnapshotFile` writes it, :func:`restore` reads it.
 """

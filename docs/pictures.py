@@ -1,4 +1,4 @@
-r"""Make pictures of the pages again, each by the commands that stand beside its name.
+r"""Make pictures of the pages again, each by the commands that stand with its name.
 
 Scripts drew adaptive_times.png, cloning.png, learning_speed.png and robustness.png; commit 5e3ee3c0
 is the last that has them, in its folder of examples.

@@ -134,7 +134,7 @@ def refuse_options(env: VecEnv) -> None:
 
 
 def _checked(what: str, values: Any, shape: tuple[int, ...], dtype: Any) -> AnyArray:
-    """Return a copy of what a method has returned, as an array.
+    """Return a method's result as an array of its own.
 
     :param what: the method and what it returns, for the message.
     :raises ConfigError: another shape, or numbers that are not finite.

@@ -7,7 +7,7 @@ step by step and then carries gradients back, the last step first: see
 ``sb3_quad.algorithms.apg.Tape``. Here PyTorch differentiates each step. Your own code that returns
 a vector-Jacobian product would also do.
 
-The environment is a row of carts. A force pushes each one to its mark, where it should stop.
+The environment is a row of carts. A force moves each one to its mark, where it should stop.
 """
 
 import argparse

@@ -59,7 +59,7 @@ class LabelledReplayBuffer(ReplayBuffer):
         # SB3 seeds this generator, and draws from it here, too.
         columns = np.random.randint(self.n_envs, size=len(batch_inds))  # noqa: NPY002
         rows = (batch_inds, columns)
-        # An episode that only ran out of time goes on, as far as its value is concerned.
+        # An episode that only ran out of time continues, as far as its value is concerned.
         ended = self.dones[rows] * (1.0 - self.timeouts[rows])
         parts: Any = (
             self._normalize_obs(self.observations[rows], env),

@@ -1,4 +1,4 @@
-"""What PyBullet's window shows: vehicles and their targets over its chequered ground.
+"""The scene in PyBullet's window: vehicles and their targets over its chequered ground.
 
 What is drawn has no mass and touches nothing.
 """

@@ -247,7 +247,7 @@ class AggregatedDataset:
 def _first(flight: Any, names: Sequence[str]) -> AnyArray:
     """Return the array that has one of the names.
 
-    :raises ValueError: there is none.
+    :raises ValueError: the flight has no such array.
     """
     for name in names:
         if hasattr(flight, name):

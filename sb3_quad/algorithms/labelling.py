@@ -136,7 +136,7 @@ class Labeller:
             if "NormalizeObservation" in chain.links:
                 raise ExpertError(
                     f"{name}: NormalizeObservation would change what it sees while its statistics"
-                    " go on; use VecNormalize, behind which it sees raw observations"
+                    " continue; use VecNormalize, behind which it sees raw observations"
                 )
         elif self._is_model and "o" in changes and chain_of(source) != chain.record:
             raise ExpertError(

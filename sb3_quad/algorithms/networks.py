@@ -112,7 +112,7 @@ def one_thread() -> Iterator[None]:
     """Give PyTorch one thread for the duration of the block.
 
     Its threads wait for one another at every operation: over networks of 64 to 256 units that is
-    hardly faster than one, and beside another process it takes several times as long.
+    hardly faster than one, and while another process runs it takes several times as long.
     """
     threads = th.get_num_threads()
     th.set_num_threads(1)

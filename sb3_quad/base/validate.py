@@ -40,7 +40,7 @@ _EXPECTED = {
     "float": "a number",
     "int": "a whole number",
 }
-"""What a value must be, by the kind of pydantic's error; the first that applies."""
+"""How a value must be, by the kind of pydantic's error; the first that applies."""
 # Names of a union's alternatives in the place of an error: `int`, `list[str]`, `Vehicle`
 _ALTERNATIVE = re.compile(r"int|float|str|bool|none|literal|[A-Z]\w+|.*[\[(].*")
 # Annotations that take true and false

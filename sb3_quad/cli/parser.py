@@ -34,7 +34,7 @@ ELSEWHERE = {
     "--optimize-hyperparameters": "the command sb3-quad tune does that",
     "--trained-agent": "the flag is --initial-policy",
 }
-"""What does the part of a flag of rl_zoo3, for the error message."""
+"""Where flags of rl_zoo3 are found here, for the error message."""
 
 
 class HelpFormatter(RawDescriptionRichHelpFormatter):

@@ -87,7 +87,7 @@ def known_settings(controller: Any, model: Any) -> FlightSettings | None:
     :param model: what was loaded.
     """
     known = settings_of_model(model)
-    # Zips of rl_zoo3 have their settings beside them.
+    # Zips of rl_zoo3 have their settings in a file of their own.
     if known is None and isinstance(controller, (str, Path)):
         known = ControllerSpec("", agent_path(str(controller))).own
     return known

@@ -154,7 +154,7 @@ def _flown_before(folder: Path, results: Results, overwrite: bool) -> list[Entry
             pictures = re.findall(rf"\({FIGURES}/([\w.-]+\.png)\)", read_text(folder / REPORT))
         for name in WRITTEN:
             (folder / name).unlink(missing_ok=True)
-        # Only files of the results; users may keep other files beside them.
+        # Only files of the results; users may keep other files there.
         made = [folder / entry.flights for entry in before.entries]
         for file in (folder / FLIGHTS).glob("*/*.npz"):
             if file in made:

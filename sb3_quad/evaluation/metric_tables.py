@@ -180,7 +180,7 @@ def metric_rows(
     scenario: Scenario, measured: Sequence[Cells], published: Sequence[Published] = ()
 ) -> list[list[str]]:
     """Return the rows of a scenario for a :class:`~sb3_quad.evaluation.tables.Table`: controllers
-    first, then published columns. What no controller has is left out, whatever was published.
+    first, then published columns. Rows that no controller has are not shown.
     """
     columns = [*measured, *map(published_cells, published)]
     rows = []

@@ -1,4 +1,4 @@
-"""Plots of flights and of what a scenario varies, in one style."""
+"""Plots of flights, and of success over a varied quantity, in one style."""
 
 import io
 from collections.abc import Mapping, Sequence

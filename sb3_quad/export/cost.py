@@ -1,4 +1,4 @@
-"""What a policy's C header costs on a microcontroller: memory, instructions, time."""
+"""The cost of a policy's C header on a microcontroller: memory, instructions, time."""
 
 from typing import NamedTuple
 

@@ -210,7 +210,7 @@ def _backward(activations, scratch, layers, sums, last_layer, size):
     ``activations`` holds the block's layers. ``scratch`` holds the gradient with respect to the
     outputs, after the memory for the layers. From there on, the gradients of two layers alternate.
 
-    :param last_layer: 1: stop at the parameters of the first layer; 0: go on to the inputs.
+    :param last_layer: 1: stop at the parameters of the first layer; 0: continue to the inputs.
     :return: where the gradient of that layer begins.
     """
     widths, kinds, parameters = layers

@@ -228,8 +228,8 @@ def run_pipeline(
     """Train the stages one after the other, each from the agent that the one before passed on.
 
     Their run folders are where those of single runs are.
-    ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them; beside it are the settings of each
-    stage, ``stage_<number>.yml``.
+    ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` lists them; the same folder
+    holds the settings of each stage, ``stage_<number>.yml``.
 
     :param job: options of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq``
         and ``eval_episodes`` take precedence.

@@ -1,4 +1,4 @@
-"""What else flies the vehicle at hand: agents of the package and experts.
+"""Other controllers of the vehicle at hand: agents of the package and experts.
 
 Before a stage they fly it on the same episodes as the agent of the stage before, so that training
 starts from what is best there, and hands over nothing that is worse.
@@ -23,7 +23,7 @@ from sb3_quad.training.hand_over import is_below
 EPISODES = 60  # of each task
 TOLERANCE = 0.1  # m, of the settling time
 LOST = 0.02  # One that loses this share of the flights more is behind, whatever the others earn.
-# Training goes on from the agent of the stage before, whose network is smaller and learns faster,
+# Training continues from the agent of the stage before, whose network is smaller and learns faster,
 # unless it earns this share less than another one.
 HEAD_START = 0.2
 
