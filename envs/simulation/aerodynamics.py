@@ -16,8 +16,6 @@ angular momentum H of the rotors about the body's z axis:
 The functions compute one lane of a block whose ``air`` is loaded.
 """
 
-import math
-
 from sb3_quad.base.compiled import inlined
 from sb3_quad.envs.simulation.vectors import add, four, multiply, scaled, vector
 
@@ -34,13 +32,10 @@ def speed_sum(speeds, lane):
 
 @inlined
 def rotor_momentum(b, speeds, lane):
-    """Return H of rotor speeds, (4, LANES), N m s. A rotor turns against the yaw moment of its
-    drag.
-    """
-    spin = 0.0
-    for k in range(4):
-        spin -= math.copysign(speeds[k, lane], b.arm[2, k, lane])
-    return b.rotor_inertia[lane] * spin
+    """Return H of rotor speeds, (4, LANES), N m s."""
+    j0, j1, j2, j3 = four(b.spin, lane)
+    s0, s1, s2, s3 = four(speeds, lane)
+    return (j0 * s0 + j1 * s1) + (j2 * s2 + j3 * s3)
 
 
 @inlined
@@ -49,10 +44,10 @@ def ground_effect(radius, height):
     it, 1/m.
     """
     lowest = max(height, 0.5 * radius, _LOWEST)
-    ratio = radius / (4.0 * lowest)
-    factor = 1.0 / (1.0 - ratio * ratio)
-    slope = -2.0 * ratio * ratio * factor / lowest
-    return factor, slope if height > 0.5 * radius else 0.0
+    square = 16.0 * lowest * lowest
+    room = square - radius * radius
+    slope = -2.0 * radius * radius / (lowest * room)
+    return square / room, slope if height > 0.5 * radius else 0.0
 
 
 @inlined

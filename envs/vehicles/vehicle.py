@@ -294,7 +294,7 @@ class Vehicle(Frozen):
                 f"control_step {self.control_step}: must be a whole multiple of physics_step "
                 f"{self.physics_step}, at most {MAX_SUBSTEPS} times"
             )
-        damping = max(np.divide(self.rate_damping, self.inertia))
+        damping = self.damping_rates.max()
         if damping * self.physics_step > 1.0:
             raise ValueError(
                 f"rate_damping {list(self.rate_damping)}: divided by the inertia it is "
@@ -470,6 +470,21 @@ class Vehicle(Frozen):
     def hover_rotor_speed(self) -> float:
         """Speed of a rotor with the thrust ``hover_thrust``, rad/s."""
         return math.sqrt(self.hover_thrust / self.lift)
+
+    @property
+    def hover_speed_sum(self) -> float:
+        """Sum of the rotor speeds in hover, rad/s."""
+        return float(np.sqrt(self.hover_thrusts / self.lift).sum())
+
+    @property
+    def airspeed_turns(self) -> FloatArray:
+        """Angular acceleration of roll and pitch by 1 m/s of airspeed in hover, (2,), rad/s²."""
+        return self.hover_speed_sum * np.divide(self.airspeed_moment, self.inertia[:2])
+
+    @property
+    def damping_rates(self) -> FloatArray:
+        """``rate_damping`` by the inertia, (3,), 1/s."""
+        return np.divide(self.rate_damping, self.inertia)
 
     @property
     def hover_action(self) -> FloatArray:
