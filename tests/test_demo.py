@@ -183,7 +183,6 @@ def vehicle_called(name):
     if name in VEHICLES.names():
         return load_vehicle(name)
     changes = {
-        "breezy": BREEZY,
         "airy": AIRY,
         "battery": {**BATTERY, "thrust_coefficient": 0.0},
     }.get(name, {})
