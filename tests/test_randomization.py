@@ -309,10 +309,21 @@ def test_a_distribution_goes_with_an_agent_and_a_vehicle_replaces_it():
 
 def test_wind_carries_away_what_has_drag_and_the_privileged_expert_holds_against_it():
     windy = {"drag": 0.4, "wind": 4.0}
+    airy = {
+        **windy,
+        "rotors": [0.85, 1.15],
+        "rotor_drag": 0.2,
+        "airspeed_moment": [-1, 4],
+        "translational_lift": 0.02,
+        "rate_damping": [0, 8],
+        "rotor_inertia": 0.01,
+        "ground_effect_radius": [0, 40],
+    }
     for randomize, expert, least, most in (
         ({"wind": 4.0}, GeometricExpert(), 0.0, 1e-3),
         (windy, GeometricExpert(), 0.1, 2.0),
         (windy, privileged_geometric(), 0.0, 1e-3),
+        (airy, privileged_geometric(), 0.0, 1e-3),
     ):
         errors = fly(
             expert, "target_tracking", 48, seed=3, max_episode_steps=900, randomize=randomize
