@@ -7,6 +7,7 @@ import numpy as np
 from sb3_quad.base.compiled import called, inlined, inner
 from sb3_quad.envs.simulation.observation import GUST_WORDS
 from sb3_quad.envs.simulation.random import (
+    AIR,
     DISTURBANCE,
     EPISODE,
     EPISODE_START,
@@ -217,6 +218,7 @@ def _randomize_vehicle(i, streams, table, vehicles):
     if u[0] >= table[R.share]:
         return
     v = vehicles[:, i]
+    _randomize_air(uniforms(streams, i, AIR), table, v)
     drag = v[P.mass] * between(table, R.drag, u[13], 0.0)
     for axis in range(3):
         v[P.drag_x + axis] += drag
@@ -241,6 +243,37 @@ def _randomize_vehicle(i, streams, table, vehicles):
     if table[R.delay + 2] != FIXED:
         delay = math.floor(between(table, R.delay, u[10], 0.0))
         v[P.delay] = min(delay, table[R.delay + 1] - 1.0)
+
+
+@called
+def _randomize_air(u, table, v):
+    """Replace the terms of :mod:`.aerodynamics` of a vehicle that is not yet randomized, in place.
+
+    :param u: 13 uniforms.
+    """
+    mass = v[P.mass]
+    speeds = 4.0 * math.sqrt(v[P.hover_thrust] / v[P.thrust_coefficient])
+    _replace(v, P.translational_lift, mass, table, R.translational_lift, u[5])
+    _replace(v, P.rotor_inertia, v[P.izz], table, R.rotor_inertia, u[11])
+    _replace(v, P.ground_effect_radius, arm_length(v), table, R.ground_effect_radius, u[12])
+    for axis in range(3):
+        inertia = v[P.ixx + axis]
+        _replace(v, P.rotor_drag_x + axis, mass / speeds, table, R.rotor_drag, u[4])
+        _replace(v, P.rate_damping_x + axis, inertia, table, R.rate_damping, u[8 + axis])
+        if axis < 2:
+            k = P.airspeed_moment_roll + axis
+            _replace(v, k, inertia / speeds, table, R.airspeed_moment, u[6 + axis])
+    for rotor in range(4):
+        factor = between(table, R.rotors, u[rotor], 1.0)
+        v[P.thrust_factor_0 + rotor] *= factor
+        v[P.hover_share_0 + rotor] /= factor
+
+
+@inner
+def _replace(v, parameter, unit, table, k, u):
+    """Replace a parameter by the number for u from the range at ``table[k]``, times its unit."""
+    if table[k + 2] != FIXED:
+        v[parameter] = unit * between(table, k, u, 0.0)
 
 
 @called

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 # Rotor speed, rpm. Above it a unit must be wrong.
 FASTEST_HOVER = 95_000.0
+# Divergence of the hover by airspeed, times the time from a command to its thrust
+MOST_DIVERGENCE = 0.5
 # rpm per rad/s.
 RPM = 60.0 / (2.0 * math.pi)
 
@@ -117,8 +119,16 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
 
 def warnings(vehicle: "Vehicle") -> list[str]:
     """Return a line for each value that is possible but unlikely, mostly due to a wrong unit."""
+    from sb3_quad.experts.geometric_gains import command_lag
+
     gains = (vehicle.motor_gain_up, vehicle.motor_gain_down)
     arm = vehicle.arm_length
+    turn = max(map(abs, vehicle.airspeed_turns))
+    lag = float(command_lag(vehicle.parameters(), vehicle.control_step))
+    least, most = vehicle.thrust_limits
+    # Of what a rotor has left in hover, the part that balances the moment at 1 m/s
+    needed = vehicle.airspeed_turns * vehicle.inertia[:2] / vehicle.greatest_moments[:2]
+    needed *= (most - least) / (2.0 * min(most - 1.0, 1.0 - least))
     # The key, its values, the least and the greatest that are likely, what it is and advice.
     measured = (
         (
@@ -152,6 +162,22 @@ def warnings(vehicle: "Vehicle") -> list[str]:
             [vehicle.collision_radius / arm],
             (0.0, 2.0),
             "by the rotors' distance from the centre; is it in m?",
+        ),
+        # A hover that no one controls diverges as exp(t (g f)^(1/3)), with the angular acceleration
+        # f at 1 m/s.
+        (
+            "airspeed_moment",
+            [lag * (vehicle.gravity * turn) ** (1.0 / 3.0)],
+            (0.0, MOST_DIVERGENCE),
+            "divergence of the hover by the time from a command to its thrust; beyond, airspeed "
+            "turns the vehicle over before the experts act; is it in kg m/rad?",
+        ),
+        (
+            "airspeed_moment",
+            [max(map(abs, needed))],
+            (0.0, 1.0),
+            "moment at 1 m/s by the greatest of the rotors in hover; beyond, airspeed turns the "
+            "vehicle over; is it in kg m/rad?",
         ),
     )
     lines = []
