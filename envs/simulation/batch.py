@@ -13,6 +13,11 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.validate import validate
 from sb3_quad.envs.simulation.checks import per_row, repeated, whole_number
+from sb3_quad.envs.simulation.estimator import (
+    ESTIMATE_SIZE,
+    EstimatorError,
+    estimated,
+)
 from sb3_quad.envs.simulation.frames import PositionIntegral
 from sb3_quad.envs.simulation.kernel import (
     BATCH_ARGUMENTS,
@@ -29,11 +34,12 @@ from sb3_quad.envs.simulation.observation import (
     DEFAULT_STD,
     OBSERVATION_SIZE,
 )
-from sb3_quad.envs.simulation.random import new_streams
+from sb3_quad.envs.simulation.random import STEP, new_streams
 from sb3_quad.envs.simulation.randomization import Randomization
+from sb3_quad.envs.simulation.recordings import NO_STARTS, WIND_COLUMNS, WRENCH_COLUMNS
 from sb3_quad.envs.simulation.references import NO_TRACKS
 from sb3_quad.envs.simulation.sampling import GUST_SIZE, GUST_VALUE
-from sb3_quad.envs.simulation.settings import FlightSettings, levels
+from sb3_quad.envs.simulation.settings import FlightSettings, estimator_of, levels
 from sb3_quad.envs.simulation.state import (
     FORCE_WORLD,
     REFERENCE,
@@ -71,6 +77,8 @@ _KEPT = (
     "gust",
     "wind",
     "wind_gust",
+    "begins",
+    "estimate",
     "frames",
     "integral",
     "course",
@@ -121,6 +129,11 @@ class QuadcopterBatch:
         self.gust = np.zeros((GUST_SIZE, n * bool(self.randomize.gusts)))
         self.wind = np.zeros((3, n))
         self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
+
+        self._set_recordings(settings, control_step)
+        self.estimator = estimator_of(settings.noise)
+        self.estimate = np.zeros((ESTIMATE_SIZE, n * (self.estimator is not None)))
+        self.estimator_numbers = (self.estimator or EstimatorError()).numbers(control_step)
 
         # Commands wait in a queue that is as long as the longest delay of any episode.
         delays = [vehicle.delay for vehicle in vehicles]
@@ -202,6 +215,20 @@ class QuadcopterBatch:
         if self.randomize.wind or self.randomize.wind_gusts:
             self.warn_without_drag("randomize")
         return vehicles
+
+    def _set_recordings(self, settings: FlightSettings, control_step: float) -> None:
+        """Read what is replayed. Tables without rows mean that nothing is."""
+        self.wrench_record, self.wrench_starts = np.zeros((0, WRENCH_SIZE)), NO_STARTS
+        self.wind_record, self.wind_starts = np.zeros((0, 3)), NO_STARTS
+        if settings.wrench is not None:
+            self.wrench_record, self.wrench_starts = settings.wrench.table(
+                WRENCH_COLUMNS, WRENCH_SIZE, control_step
+            )
+        if settings.wind is not None:
+            self.wind_record, self.wind_starts = settings.wind.table(WIND_COLUMNS, 3, control_step)
+            self.warn_without_drag("wind")
+        is_replayed = settings.wrench is not None or settings.wind is not None
+        self.begins = np.zeros((2, self.n * is_replayed), np.int64)
 
     def _refuse_starts_on_the_ground(self) -> None:
         lowest = self.task_parameters[:, T.start_position + 2].min()
@@ -308,7 +335,7 @@ class QuadcopterBatch:
             wrenches,
             self.state,
             self.queue,
-            self.wrench,
+            self.total_wrench(),
             self.vehicles,
             self.physics_step,
         )
@@ -352,6 +379,16 @@ class QuadcopterBatch:
             wrench[FORCE_WORLD] += drag_forces(self.state, vehicles, self.total_wind())
         return QuadcopterState(self.state, vehicles, wrench)
 
+    def estimated_state(self) -> QuadcopterState:
+        """Return the state that the vehicles themselves would know: with the errors of
+        ``noise.estimator`` a copy, else the true one.
+        """
+        state = self.true_state()
+        if not self.estimate.size:
+            return state
+        array = estimated(state.array, self.estimate)
+        return QuadcopterState(array, state.vehicles, state.wrench)
+
     @property
     def has_drag(self) -> bool:
         """Whether some vehicle has drag."""
@@ -375,21 +412,30 @@ class QuadcopterBatch:
 
     def total_wrench(self) -> FloatArray:
         """Return the external wrench of this control step, (WRENCH_SIZE, n): the one that was set
-        or sampled, and gusts; without drag.
+        or sampled, gusts, and the recorded one; without drag.
         """
-        if self.randomize.gusts is None:
-            return self.wrench
-        total = self.wrench.copy()
-        total[FORCE_WORLD] += self.gust[GUST_VALUE]
+        total = self.wrench
+        if len(self.wrench_record):
+            total = total + self._recorded(self.wrench_record, self.begins[0])
+        if self.randomize.gusts is not None:
+            total = total.copy()
+            total[FORCE_WORLD] += self.gust[GUST_VALUE]
         return total
 
     def total_wind(self) -> FloatArray:
         """Return the velocity of the air in this control step, (3, n), world frame, m/s: the one
-        that was set or sampled, and gusts.
+        that was set or sampled, gusts, and the recorded one.
         """
-        if self.randomize.wind_gusts is None:
-            return self.wind
-        return self.wind + self.wind_gust[GUST_VALUE]
+        total = self.wind
+        if len(self.wind_record):
+            total = total + self._recorded(self.wind_record, self.begins[1])
+        if self.randomize.wind_gusts is not None:
+            total = total + self.wind_gust[GUST_VALUE]
+        return total
+
+    def _recorded(self, record: FloatArray, begins: IntArray) -> FloatArray:
+        """Return what a recording adds in this control step, (size, n)."""
+        return record[(begins + self.streams[STEP]) % len(record)].T
 
     @property
     def state(self) -> FloatArray:
@@ -446,9 +492,11 @@ class QuadcopterBatch:
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a
-        ``Noise``; 0 switches it off.
+        ``Noise``; 0 switches it off. The estimator's errors stay.
         """
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
+        if estimator_of(noise) not in (None, self.estimator):
+            raise ConfigError("set_noise: estimator: give it to the environment when you make it")
         relative, additive = levels(noise)
         chosen = self.rows(indices)
         self.scaling_of_rows[-2, chosen] = per_row("noise", relative, chosen.size)

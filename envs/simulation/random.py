@@ -29,6 +29,7 @@ KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND, REFERENCE = (
     np.arange(8, dtype=np.uint32)
 )
+ESTIMATOR, RECORDING = np.arange(8, 10, dtype=np.uint32)
 ROUNDS = 10
 BLOCKS = 8  # as many as any purpose takes
 _MASK = uint64(0xFFFFFFFF)
@@ -118,7 +119,7 @@ def _to_uniform(high, low):
 
 
 @called
-def random_words(b):
+def random_words(b, purpose):
     """Write ``b.word``: random words of every lane, a multiple of 4, from its key and counter."""
     word = b.word
     for block in range(word.shape[0] // 4):
@@ -129,7 +130,7 @@ def random_words(b):
                 word[4 * block + 1, lane],
                 word[4 * block + 2, lane],
                 word[4 * block + 3, lane],
-            ) = _words(b.stream, lane, block, OBSERVATION_NOISE)
+            ) = _words(b.stream, lane, block, purpose)
 
 
 @inner
