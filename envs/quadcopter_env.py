@@ -175,8 +175,9 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     If you give a `rotor_layout`, the body axes and rotors of `vehicle` are turned to it, so that an
     agent of one vehicle can fly another. `noise={"relative": 0.05, "additive": 0.02}` adds noise in
-    units of std; its `estimator` adds the errors of a state estimator. `history=None` means the current frame alone. To sample vehicles from a named
-    distribution, give `vehicles={"distribution": "raptor"}`. A `reference` is the name of a curve,
+    units of std, and its field `estimator` the errors of a state estimator. `history=None` means
+    the current frame alone. To sample vehicles from a named distribution, give
+    `vehicles={"distribution": "raptor"}`. A `reference` is the name of a curve,
     fields of `Reference`, the path of a CSV file or a function of time; it begins at the episode's
     target. Render mode `"human"` opens a
     real-time window, one per process; `"rgb_array"` makes pictures and needs no display.
@@ -208,8 +209,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     give others. If `randomize` samples them or a wind, the next episode replaces yours. Wind acts
     on vehicles with `drag`.
 
-    `true_state()`, `estimated_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`, `observation_std`,
-    `task`, `task_kwargs` and `vehicle` return the current values.
+    `true_state()`, `estimated_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`,
+    `observation_std`, `task`, `task_kwargs` and `vehicle` return the current values.
 
     ## Version History
 

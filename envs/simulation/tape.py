@@ -217,9 +217,9 @@ class FlightTape:
 
 @compiled
 def step_vjp(
-    control, leads, step, lengths, states, actions, queue, streams, estimates, wrench, wind, vehicles,
-    scaling, moves, for_px4, ages, integrals, integral_numbers, grad_observation, grad_frames, grad_integral,
-    gradient, grad_actions, physics_step, substeps,
+    control, leads, step, lengths, states, actions, queue, streams, estimates, wrench, wind,
+    vehicles, scaling, moves, for_px4, ages, integrals, integral_numbers, grad_observation,
+    grad_frames, grad_integral, gradient, grad_actions, physics_step, substeps,
 ):  # fmt: skip
     """Vector-Jacobian product of a control step and the observation after it, see FlightTape.
 

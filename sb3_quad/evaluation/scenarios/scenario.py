@@ -57,9 +57,10 @@ class Scenario(Frozen):
     episodes.
 
     ``task``, ``task_kwargs``, ``vehicle``, ``noise``, ``vehicles``, ``randomize``, ``reference``,
-    ``wrench`` and ``wind`` are those of :class:`~sb3_quad.envs.simulation.settings.FlightSettings`. ``start``, ``target``,
-    ``waypoints`` and ``wrenches`` are events, which come on top of what the task samples. Units m,
-    s, rad, N, N m, kg.
+    ``wrench`` and ``wind`` are those of
+    :class:`~sb3_quad.envs.simulation.settings.FlightSettings`. ``start``, ``target``, ``waypoints``
+    and ``wrenches`` are events, which come on top of what the task samples. Units m, s, rad, N,
+    N m, kg.
     """
 
     name: str = Field(pattern=NAME)
