@@ -36,7 +36,12 @@ from sb3_quad.envs.simulation.observation import (
 )
 from sb3_quad.envs.simulation.random import STEP, new_streams
 from sb3_quad.envs.simulation.randomization import Randomization
-from sb3_quad.envs.simulation.recordings import NO_STARTS, WIND_COLUMNS, WRENCH_COLUMNS
+from sb3_quad.envs.simulation.recordings import (
+    WIND_COLUMNS,
+    WRENCH_COLUMNS,
+    WRENCH_ROWS,
+    starts_of,
+)
 from sb3_quad.envs.simulation.references import NO_TRACKS
 from sb3_quad.envs.simulation.sampling import GUST_SIZE, GUST_VALUE
 from sb3_quad.envs.simulation.settings import FlightSettings, estimator_of, levels
@@ -77,7 +82,7 @@ _KEPT = (
     "gust",
     "wind",
     "wind_gust",
-    "begins",
+    "chances",
     "estimate",
     "frames",
     "integral",
@@ -216,19 +221,19 @@ class QuadcopterBatch:
             self.warn_without_drag("randomize")
         return vehicles
 
-    def _set_recordings(self, settings: FlightSettings, control_step: float) -> None:
-        """Read what is replayed. Tables without rows mean that nothing is."""
-        self.wrench_record, self.wrench_starts = np.zeros((0, WRENCH_SIZE)), NO_STARTS
-        self.wind_record, self.wind_starts = np.zeros((0, 3)), NO_STARTS
+    def _set_recordings(self, settings: FlightSettings, dt: float) -> None:
+        """Read the logs that are replayed, for control steps of ``dt``, s."""
+        self.chances = np.zeros(self.n * bool(settings.wrench or settings.wind))
+        self.wrench_record, self.wind_record = np.zeros((0, WRENCH_SIZE)), np.zeros((0, 3))
         if settings.wrench is not None:
-            self.wrench_record, self.wrench_starts = settings.wrench.table(
-                WRENCH_COLUMNS, WRENCH_SIZE, control_step
-            )
+            table = settings.wrench.table(WRENCH_COLUMNS, dt)
+            self.wrench_record = np.zeros((len(table), WRENCH_SIZE))
+            self.wrench_record[:, WRENCH_ROWS[: table.shape[1]]] = table
         if settings.wind is not None:
-            self.wind_record, self.wind_starts = settings.wind.table(WIND_COLUMNS, 3, control_step)
+            self.wind_record = settings.wind.table(WIND_COLUMNS, dt)
             self.warn_without_drag("wind")
-        is_replayed = settings.wrench is not None or settings.wind is not None
-        self.begins = np.zeros((2, self.n * is_replayed), np.int64)
+        self.wrench_starts = starts_of(settings.wrench, dt, self.wrench_record)
+        self.wind_starts = starts_of(settings.wind, dt, self.wind_record)
 
     def _refuse_starts_on_the_ground(self) -> None:
         lowest = self.task_parameters[:, T.start_position + 2].min()
@@ -416,7 +421,7 @@ class QuadcopterBatch:
         """
         total = self.wrench
         if len(self.wrench_record):
-            total = total + self._recorded(self.wrench_record, self.begins[0])
+            total = total + self._recorded(self.wrench_record, self.wrench_starts)
         if self.randomize.gusts is not None:
             total = total.copy()
             total[FORCE_WORLD] += self.gust[GUST_VALUE]
@@ -428,13 +433,14 @@ class QuadcopterBatch:
         """
         total = self.wind
         if len(self.wind_record):
-            total = total + self._recorded(self.wind_record, self.begins[1])
+            total = total + self._recorded(self.wind_record, self.wind_starts)
         if self.randomize.wind_gusts is not None:
             total = total + self.wind_gust[GUST_VALUE]
         return total
 
-    def _recorded(self, record: FloatArray, begins: IntArray) -> FloatArray:
+    def _recorded(self, record: FloatArray, starts: IntArray) -> FloatArray:
         """Return what a recording adds in this control step, (size, n)."""
+        begins = starts[(self.chances * len(starts)).astype(np.int64)]
         return record[(begins + self.streams[STEP]) % len(record)].T
 
     @property

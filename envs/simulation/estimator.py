@@ -29,24 +29,19 @@ from sb3_quad.envs.simulation.randomization import (
     between,
     numbers_of,
 )
-from sb3_quad.envs.simulation.state import (
-    BODY_RATES,
-    POSITION,
-    QUATERNION,
-    VELOCITY,
-    first_rows,
-)
-from sb3_quad.envs.simulation.vectors import add, four, store, vector, vector_at
+from sb3_quad.envs.simulation.state import QUATERNION, X, first_rows
+from sb3_quad.envs.simulation.vectors import dot, four, scaled, store, vector_at
 
-NONE = Magnitude(low=0.0, high=0.0)
-ERRORS = {"position": 3, "attitude": 3, "velocity": 3, "body_rates": 3}
-ESTIMATE = {**ERRORS, "std": len(ERRORS)}
+EXACT = Magnitude(low=0.0, high=0.0)
+ERRORS = {"position": 3, "velocity": 3, "body_rates": 3, "attitude": 3}
+ESTIMATE = {**ERRORS, "std": 4}
 ESTIMATE_SIZE = sum(ESTIMATE.values())
 E = first_rows(ESTIMATE)
+# Rows of the state to which the errors before that of the attitude are added
+_ADDED = (*range(X.quaternion), *range(X.velocity, X.rotor_speeds))
 # The numbers that compiled code reads: e^(-dt / time constant), share, and a range for each error
 _NUMBERS = {"time_constant": 1, "share": 1, **dict.fromkeys(ERRORS, RANGE)}
 N = first_rows(_NUMBERS)
-ESTIMATOR_NUMBERS = sum(_NUMBERS.values())
 # The uniforms of an episode that share no random word with the normals of its first step
 _FIRST_UNIFORM = 10
 
@@ -60,13 +55,13 @@ class EstimatorError(Frozen):
     integral and the frames in them. Rewards, crashes and metrics are those of the true state.
     """
 
-    position: Magnitude = NONE
+    position: Magnitude = EXACT
     """world axes, m"""
-    velocity: Magnitude = NONE
+    velocity: Magnitude = EXACT
     """world axes, m/s"""
-    attitude: Magnitude = NONE
+    attitude: Magnitude = EXACT
     """components of the rotation vector from the true to the estimated body axes, degrees"""
-    body_rates: Magnitude = NONE
+    body_rates: Magnitude = EXACT
     """body axes, rad/s"""
     time_constant: PositiveFloat = Field(default=0.5, le=1e6)
     """time after which an error has faded to 1/e, s"""
@@ -120,14 +115,9 @@ def perceive(b, count, advances, numbers, estimate):
 @called
 def displace(b, estimate):
     """Add errors to the states in a block."""
-    for lane in range(LANES):
-        i = b.row[lane]
-        for part, first in (
-            (b.position, E.position),
-            (b.velocity, E.velocity),
-            (b.body_rates, E.body_rates),
-        ):
-            store(part, lane, add(vector(part, lane), vector_at(estimate, first, i)))
+    for k, row in enumerate(_ADDED):
+        for lane in range(LANES):
+            b.state[row, lane] += estimate[k, b.row[lane]]
     turn_attitudes(b, b.quaternion, estimate, 1.0)
 
 
@@ -139,26 +129,23 @@ def turn_attitudes(b, quaternion, estimate, sign):
         estimated attitude to that with respect to the true one.
     """
     for lane in range(LANES):
-        x, y, z = vector_at(estimate, E.attitude, b.row[lane])
-        turned = quaternion_product(four(quaternion, lane), turn_by(sign * x, sign * y, sign * z))
+        error = scaled(sign, vector_at(estimate, E.attitude, b.row[lane]))
+        turned = quaternion_product(four(quaternion, lane), turn_by(error))
         quaternion[0, lane] = turned[0]
         store(quaternion[1:], lane, turned[1:])
 
 
 @inlined
-def turn_by(x, y, z):
+def turn_by(error):
     """Return the unit quaternion of a rotation vector, rad."""
-    half = np.sqrt(x * x + y * y + z * z) / 2.0
-    sinc = np.sinc(half / np.pi) / 2.0
-    return np.cos(half), sinc * x, sinc * y, sinc * z
+    half = np.sqrt(dot(error, error)) / 2.0
+    return np.cos(half), *scaled(np.sinc(half / np.pi) / 2.0, error)
 
 
 def estimated(state: FloatArray, estimate: FloatArray) -> FloatArray:
     """Return the estimates of n true states, (STATE_SIZE, n)."""
     array = state.copy()
-    array[POSITION] += estimate[E.position : E.attitude]
-    array[VELOCITY] += estimate[E.velocity : E.body_rates]
-    array[BODY_RATES] += estimate[E.body_rates : E.std]
-    turn = turn_by.py_func(*estimate[E.attitude : E.velocity])
+    array[[*_ADDED]] += estimate[: E.attitude]
+    turn = turn_by.py_func(estimate[E.attitude : E.std])
     array[QUATERNION] = quaternion_product.py_func(state[QUATERNION], turn)
     return array

@@ -39,8 +39,8 @@ from sb3_quad.envs.simulation.physics import (
     total_thrust,
     turn_rotors,
 )
-from sb3_quad.envs.simulation.random import STEP, gust_words
-from sb3_quad.envs.simulation.recordings import add_recording, begin_recordings
+from sb3_quad.envs.simulation.random import RECORDING, STEP, gust_words, uniforms
+from sb3_quad.envs.simulation.recordings import add_recording
 from sb3_quad.envs.simulation.reward import score, score_calm, succeeds
 from sb3_quad.envs.simulation.sampling import (
     add_gusts,
@@ -164,7 +164,7 @@ _SIZE = BLOCK.itemsize
 def step(
     control, leads, mode, actions, observations, rewards, dones,
     state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers,
-    gust, wind, wind_gust, begins, wrench_record, wrench_starts, wind_record, wind_starts,
+    gust, wind, wind_gust, wrench_record, wrench_starts, wind_record, wind_starts, chances,
     estimator_numbers, estimate, frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations, last_actions,
@@ -191,9 +191,8 @@ def step(
     :param randomize_numbers: :meth:`.Randomization.numbers`.
     :param gust: (GUST_SIZE, 0 or n), gusts of force; ``wind_gust``, likewise, gusts of wind.
     :param wind: (3, n), velocity of the air without gusts, world frame, m/s.
-    :param begins: int64 (2, 0 or n), see :mod:`.recordings`; ``wrench_record`` (0 or rows,
-        WRENCH_SIZE) and ``wind_record`` (0 or rows, 3), of which episodes begin at one of the rows
-        ``wrench_starts`` and ``wind_starts``, int64 (starts,).
+    :param wrench_record: (0 or rows, WRENCH_SIZE), with ``wrench_starts``; ``wind_record`` (0 or
+        rows, 3), with ``wind_starts``; ``chances`` (0 or n,); see :mod:`.recordings`.
     :param estimator_numbers: :meth:`.EstimatorError.numbers`; ``estimate`` (ESTIMATE_SIZE, 0 or n).
     :param frames: float32 (n, depth, frame size); depth 0 if an observation is the present features
         only.
@@ -267,8 +266,10 @@ def step(
                 load_rows(wind, first, b.wind)
                 add_gusts(b.force_world, gust, first, count)
                 add_gusts(b.wind, wind_gust, first, count)
-                add_recording(b.wrench, wrench_record, begins[0], streams, first, count)
-                add_recording(b.wind, wind_record, begins[1], streams, first, count)
+                add_recording(
+                    b.wrench, wrench_record, wrench_starts, chances, streams, first, count
+                )
+                add_recording(b.wind, wind_record, wind_starts, chances, streams, first, count)
                 _load_commands(b, first, count, actions, queue)
                 fly(b, physics_step, substeps)
                 save_rows(b.state[: X.target], first, count, state)
@@ -330,7 +331,8 @@ def step(
                     i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles,
                     wrench, gust, wind, wind_gust,
                 )  # fmt: skip
-                begin_recordings(i, streams, wrench_starts, wind_starts, begins)
+                if chances.size > 0:
+                    chances[i] = uniforms(streams, i, RECORDING)[0]
                 begin_estimate(i, streams, estimator_numbers, estimate)
                 start_episode(
                     i, state, queue, streams, task_index, vehicles, task_parameters, task_weights,

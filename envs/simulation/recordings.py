@@ -1,7 +1,8 @@
 """Recorded worlds: the force, torque or wind of a log acts again, row by row.
 
-In flight, a table has a row for each control step. ``begins``, int64 (2, n), says at which row of
-the wrench's table, and of the wind's, each vehicle's episode began; (2, 0) if nothing is replayed.
+In flight, ``record`` (rows, size) has a row for each control step; without rows nothing acts. An
+episode begins at one of its rows ``starts`` int64 (starts,), which ``chances`` (n,) choose,
+uniform numbers on (0, 1).
 """
 
 from pathlib import Path
@@ -10,24 +11,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from sb3_quad.base.compiled import called, inner
+from sb3_quad.base.compiled import inner
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray, IntArray
 from sb3_quad.base.validate import Frozen
 from sb3_quad.envs.simulation.motions import MAX_SECONDS, read_series
-from sb3_quad.envs.simulation.random import RECORDING, STEP, uniforms
-from sb3_quad.envs.simulation.state import W
+from sb3_quad.envs.simulation.random import STEP
+from sb3_quad.envs.simulation.state import FORCE_WORLD, TORQUE_BODY
 
-# The columns of a file besides t, by the rows of a table that they become
-WRENCH_COLUMNS = {
-    "fx": W.force_world,
-    "fy": W.force_world + 1,
-    "fz": W.force_world + 2,
-    "tx": W.torque_body,
-    "ty": W.torque_body + 1,
-    "tz": W.torque_body + 2,
-}
-WIND_COLUMNS = {"vx": 0, "vy": 1, "vz": 2}
+# The columns of a file, and the rows of the state or wrench that those after t become
+WRENCH_COLUMNS = ["t", "fx", "fy", "fz", "tx", "ty", "tz"]
+WRENCH_ROWS = np.r_[FORCE_WORLD, TORQUE_BODY]
+WIND_COLUMNS = ["t", "vx", "vy", "vz"]
 GREATEST = 1e4  # N, N m or m/s
 Seconds = Annotated[float, Field(ge=0, le=MAX_SECONDS)]
 
@@ -40,11 +35,9 @@ class Recording(Frozen):
 
     file: str | Path
     """path of a CSV file with the column t, s, and others that its keyword names"""
-    start: Literal["random"] | Seconds | Annotated[tuple[Seconds, ...], Field(min_length=1)] = (
-        "random"
-    )
-    """when in the log an episode begins, s after its first row; each episode samples one of several
-    times, or any. Two logs of the same length begin at the same time
+    start: Literal["random"] | Seconds | Annotated[list[Seconds], Field(min_length=1)] = "random"
+    """when in the log an episode begins, s after its first row: any time, this one, or one of
+    these; two logs of the same length begin at the same random time
     """
 
     @model_validator(mode="before")
@@ -52,60 +45,41 @@ class Recording(Frozen):
     def _from_path(cls, data: Any) -> Any:
         return {"file": data} if isinstance(data, (str, Path)) else data
 
-    def table(self, columns: dict[str, int], size: int, dt: float) -> tuple[FloatArray, IntArray]:
-        """Return what acts in each control step, (rows, size), and where episodes may begin,
-        (starts,).
+    def table(self, columns: list[str], dt: float) -> FloatArray:
+        """Return what acts in each control step, (rows, 3 or all columns but t).
 
-        :param columns: the columns of the file, three or all, and their places.
+        :param columns: t and others; the file has three of these, or all.
         :param dt: control step, s.
         :raises ConfigError: a file that cannot be read, has other columns, is longer than 600 s or
             holds a number above 10,000.
         """
-        names = ["t", *columns]
-        times, numbers = read_series(Path(self.file), names[:4], names)
-        if times[-1] > MAX_SECONDS or np.abs(numbers).max() > GREATEST:
+        times, numbers = read_series(Path(self.file), columns[:4], columns)
+        seconds, greatest = times[-1], np.abs(numbers).max()
+        if seconds > MAX_SECONDS or greatest > GREATEST:
             raise ConfigError(
-                f"{self.file}: takes {times[-1]:g} s, with numbers up to"
-                f" {np.abs(numbers).max():g}; at most {MAX_SECONDS:g} s and {GREATEST:g} are"
-                " possible: shorten it, or change its units"
+                f"{self.file}: takes {seconds:g} s, with numbers up to {greatest:g}; at most"
+                f" {MAX_SECONDS:g} s and {GREATEST:g} are possible: shorten it, or change its units"
             )
         # Rounding errors must not take a row.
-        steps = dt * np.arange(int(times[-1] / dt + 1e-6) + 1)
-        table = np.zeros((len(steps), size))
-        for place, column in zip(columns.values(), numbers.T, strict=False):
-            table[:, place] = np.interp(steps, times, column)
-        if self.start == "random":
-            return table, np.arange(len(table))
-        starts = np.round(np.atleast_1d(self.start) / dt).astype(np.int64)
-        if starts.max() >= len(table):
-            raise ConfigError(
-                f"{self.file}: start {np.max(self.start):g} is after its end, {times[-1]:g} s"
-            )
-        return table, starts
+        steps = dt * np.arange(int(seconds / dt + 1e-6) + 1)
+        return np.stack([np.interp(steps, times, column) for column in numbers.T], axis=1)
 
 
-NO_STARTS = np.zeros(1, np.int64)
-
-
-@called
-def begin_recordings(i, streams, wrench_starts, wind_starts, begins):
-    """Sample where the recordings of row i's episode begin, in place."""
-    if begins.shape[1] > 0:
-        u = uniforms(streams, i, RECORDING)[0]
-        begins[0, i] = wrench_starts[np.int64(u * wrench_starts.size)]
-        begins[1, i] = wind_starts[np.int64(u * wind_starts.size)]
+def starts_of(recording: Recording | None, dt: float, record: FloatArray) -> IntArray:
+    """Return the rows of a record at which episodes may begin."""
+    if recording is None or recording.start == "random":
+        return np.arange(len(record))
+    return np.round(np.atleast_1d(recording.start) / dt).astype(np.int64)
 
 
 @inner
-def add_recording(to, record, begins, streams, first, count):
-    """Add what acted in the log to that of a block, (size, LANES).
-
-    :param record: (rows, size); ``begins`` (0 or n,).
-    """
+def add_recording(to, record, starts, chances, streams, first, count):
+    """Add what acted in the log to what acts on a block, (size, LANES)."""
     if record.shape[0] == 0:
         return
     for lane in range(count):
-        # With an unsigned index, numba does not check whether it counts from the end.
-        row = np.uint64((begins[first + lane] + streams[STEP, first + lane]) % record.shape[0])
+        i = first + lane
+        begin = starts[np.int64(chances[i] * starts.size)]
+        row = (begin + streams[STEP, i]) % record.shape[0]
         for k in range(to.shape[0]):
-            to[k, lane] += record[row, np.uint64(k)]
+            to[k, lane] += record[row, k]
