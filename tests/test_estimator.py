@@ -13,8 +13,8 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.protocol import observed_state
 
 TRUE_SIZES = {"position": 0.02, "velocity": 0.07, "attitude": 2.5, "body_rates": 0.1}
-# m, rad, m/s, rad/s
-STD = np.repeat([0.02, np.radians(2.5), 0.07, 0.1], 3)
+# m, m/s, rad/s, rad
+STD = np.repeat([0.02, 0.07, 0.1, np.radians(2.5)], 3)
 HOVER = {"task_kwargs": {"target_distance": 0.0}}
 
 
@@ -80,7 +80,7 @@ def test_observations_show_the_estimate_and_rewards_the_truth():
     np.testing.assert_allclose(shown.body_rates, estimate.body_rates, atol=1e-6)
     relative = np.einsum("nji,njk->nik", off.true_state().rotation, estimate.rotation)
     angle = np.arccos((np.trace(relative, axis1=1, axis2=2) - 1.0) / 2.0)
-    turned = np.linalg.norm(off.estimate[E.attitude : E.velocity], axis=0)
+    turned = np.linalg.norm(off.estimate[E.attitude : E.std], axis=0)
     np.testing.assert_allclose(angle, turned, atol=1e-6)
 
 
