@@ -210,7 +210,7 @@ class Observer:
     def features(self, state):
         """Return the features without noise, in their units, (n, 18)."""
         if self.error.numel():
-            position, turned, velocity, rates = self.error[:, :12].split(3, dim=1)
+            position, velocity, rates, turned = self.error[:, :12].split(3, dim=1)
             state = State(
                 state.position + position,
                 product(state.quaternion, exponential(turned / 2)),
