@@ -19,6 +19,7 @@ from sb3_quad.envs.simulation.frames import PositionIntegral
 from sb3_quad.envs.simulation.motions import Motion
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.envs.simulation.randomization import Randomization
+from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
 from sb3_quad.envs.simulation.settings import FlightSettings, Noise
 from sb3_quad.envs.simulation.state import QUATERNION, TARGET, QuadcopterState, make_wrench
@@ -57,6 +58,8 @@ class FlightKeywords(TypedDict, total=False):
     randomize: StrMapping | Randomization | None
     preview: Sequence[int] | None
     reference: str | StrMapping | Reference | Motion | None
+    wrench: str | StrMapping | Recording | None
+    wind: str | StrMapping | Recording | None
     max_episode_steps: int | Sequence[int]
 
 
@@ -127,6 +130,12 @@ class BatchEnv:
         its wrench includes them and is a copy.
         """
         return self.batch.true_state()
+
+    def estimated_state(self) -> QuadcopterState:
+        """Return the state of all rows as their own estimators see it: a copy that is off by the
+        errors of ``noise.estimator``. Without these it is :meth:`true_state`.
+        """
+        return self.batch.estimated_state()
 
     def set_target(self, position: ArrayLike, indices: Rows = None) -> None:
         """Move targets, after reset. They stay there until the next reset of their rows.
@@ -222,7 +231,8 @@ class BatchEnv:
         """Set the observation noise until you set another.
 
         :param level: the relative standard deviation, one number or one for each of these rows; or
-            a :class:`~sb3_quad.envs.simulation.settings.Noise` or its fields. 0: no noise.
+            a :class:`~sb3_quad.envs.simulation.settings.Noise` or its fields. 0: no noise. The
+            estimator's errors stay as they are.
         :raises ConfigError: a wrong shape, or a level below 0 or above 100.
         """
         self.batch.set_noise(level, indices)
@@ -239,7 +249,7 @@ class BatchEnv:
 
     @property
     def wrench(self) -> FloatArray:
-        """The external wrench that was set or sampled, without gusts, (n, 12).
+        """The external wrench that was set or sampled, without gusts and recordings, (n, 12).
 
         Force in the world frame, force in the body frame, torque in the world frame, torque in the
         body frame; N and N m.
@@ -248,7 +258,7 @@ class BatchEnv:
 
     @property
     def wind(self) -> FloatArray:
-        """The velocity of the air without gusts, (n, 3), world frame, m/s."""
+        """The velocity of the air without gusts and recordings, (n, 3), world frame, m/s."""
         return self._by_row(self.batch.wind)
 
     @property

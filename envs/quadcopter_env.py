@@ -166,6 +166,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `vehicles` | `None` | fields of `VehicleDistribution`: each episode has another vehicle |
     | `randomize` | `None` | fields of `Randomization`: what is sampled per episode |
     | `reference` | `None` | a curve that the target flies, such as `"figure_eight"` |
+    | `wrench` | `None` | a log's force and torque: CSV file, t,fx,fy,fz[,tx,ty,tz] |
+    | `wind` | `None` | a log's velocity of the air: CSV file, t,vx,vy,vz |
     | `preview` | `None` | control steps ahead whose acceleration of the reference is observed |
     | `render_mode` | `None` | `"human"` or `"rgb_array"` |
     | `render_width` | 640 | width of pictures and window, pixels |
@@ -173,8 +175,9 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     If you give a `rotor_layout`, the body axes and rotors of `vehicle` are turned to it, so that an
     agent of one vehicle can fly another. `noise={"relative": 0.05, "additive": 0.02}` adds noise in
-    units of std. `history=None` means the current frame alone. To sample vehicles from a named
-    distribution, give `vehicles={"distribution": "raptor"}`. A `reference` is the name of a curve,
+    units of std, and its field `estimator` the errors of a state estimator. `history=None` means
+    the current frame alone. To sample vehicles from a named distribution, give
+    `vehicles={"distribution": "raptor"}`. A `reference` is the name of a curve,
     fields of `Reference`, the path of a CSV file or a function of time; it begins at the episode's
     target. Render mode `"human"` opens a
     real-time window, one per process; `"rgb_array"` makes pictures and needs no display.
@@ -182,6 +185,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     The classes are :class:`~sb3_quad.envs.simulation.tasks.Task`,
     :class:`~sb3_quad.envs.vehicles.vehicle.Vehicle`,
     :class:`~sb3_quad.envs.simulation.settings.Noise`,
+    :class:`~sb3_quad.envs.simulation.estimator.EstimatorError`,
+    :class:`~sb3_quad.envs.simulation.recordings.Recording`,
     :class:`~sb3_quad.envs.simulation.frames.PositionIntegral`,
     :class:`~sb3_quad.envs.simulation.vehicle_distribution.VehicleDistribution`,
     :class:`~sb3_quad.envs.simulation.randomization.Randomization` and
@@ -204,8 +209,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     give others. If `randomize` samples them or a wind, the next episode replaces yours. Wind acts
     on vehicles with `drag`.
 
-    `true_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`, `observation_std`,
-    `task`, `task_kwargs` and `vehicle` return the current values.
+    `true_state()`, `estimated_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`,
+    `observation_std`, `task`, `task_kwargs` and `vehicle` return the current values.
 
     ## Version History
 

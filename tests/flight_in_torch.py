@@ -226,9 +226,19 @@ class Observer:
         self.turning = up * reference[:, 11:12]
         size = len(self.settings.ages) * self.settings.frame_size
         self.preview = th.tensor(batch.observe()).double()[:, size:]
+        self.error = th.tensor(batch.estimate.T.copy())
 
     def features(self, state):
         """Return the features without noise, in their units, (n, 18)."""
+        if self.error.numel():
+            position, velocity, rates, turned = self.error[:, :12].split(3, dim=1)
+            state = State(
+                state.position + position,
+                product(state.quaternion, exponential(turned / 2)),
+                state.velocity + velocity,
+                state.body_rates + rates,
+                state.rotor_speeds,
+            )
         to_body = rotation(state.quaternion).transpose(1, 2)
         parts = [
             turn(self.from_heading.transpose(1, 2), state.position - self.target),

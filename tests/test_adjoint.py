@@ -172,9 +172,18 @@ RANDOM = {
     "rotor_inertia": st.just([0, 0.05]),
     "ground_effect_radius": st.just([20, 200]),
 }
+ESTIMATOR = {"position": 0.3, "velocity": [0, 0.5], "attitude": 20, "body_rates": 0.5}
 SEEN = {
     "features": st.just("px4"),
-    "noise": st.sampled_from([0.0, 0.2, {"relative": 0.1, "additive": 0.05}, {"additive": 0.02}]),
+    "noise": st.sampled_from(
+        [
+            0.0,
+            0.2,
+            {"relative": 0.1, "additive": 0.05},
+            {"additive": 0.02},
+            {"estimator": ESTIMATOR},
+        ]
+    ),
     "last_action": st.just(True),
     "history": st.sampled_from([[0, 1], [0, 2, 5], [0, 1, 2, 3, 10]]),
     "position_integral": st.sampled_from(
@@ -251,7 +260,9 @@ DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
     vehicle={},
     randomize={"delay": [0, 3]},
     seen={
+        "noise": {"estimator": {**ESTIMATOR, "share": 0.5}},
         "reference": {"curve": "random_smooth", "heading": "random", "heading_rate": 2.0},
+        "position_integral": {},
         "preview": [0, 5],
         "history": [0, 2],
         "last_action": True,

@@ -13,6 +13,11 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import AnyArray, Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.validate import validate
 from sb3_quad.envs.simulation.checks import per_row, repeated, whole_number
+from sb3_quad.envs.simulation.estimator import (
+    ESTIMATE_SIZE,
+    EstimatorError,
+    estimated,
+)
 from sb3_quad.envs.simulation.frames import PositionIntegral
 from sb3_quad.envs.simulation.kernel import (
     BATCH_ARGUMENTS,
@@ -29,11 +34,17 @@ from sb3_quad.envs.simulation.observation import (
     DEFAULT_STD,
     OBSERVATION_SIZE,
 )
-from sb3_quad.envs.simulation.random import new_streams
+from sb3_quad.envs.simulation.random import STEP, new_streams
 from sb3_quad.envs.simulation.randomization import Randomization
+from sb3_quad.envs.simulation.recordings import (
+    WIND_COLUMNS,
+    WRENCH_COLUMNS,
+    WRENCH_ROWS,
+    starts_of,
+)
 from sb3_quad.envs.simulation.references import NO_TRACKS
 from sb3_quad.envs.simulation.sampling import GUST_SIZE, GUST_VALUE
-from sb3_quad.envs.simulation.settings import FlightSettings, levels
+from sb3_quad.envs.simulation.settings import FlightSettings, estimator_of, levels
 from sb3_quad.envs.simulation.state import (
     FELT,
     FORCE_BODY,
@@ -80,6 +91,8 @@ _KEPT = (
     "gust",
     "wind",
     "wind_gust",
+    "chances",
+    "estimate",
     "frames",
     "integral",
     "course",
@@ -130,6 +143,11 @@ class QuadcopterBatch:
         self.gust = np.zeros((GUST_SIZE, n * bool(self.randomize.gusts)))
         self.wind = np.zeros((3, n))
         self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
+
+        self._set_recordings(settings, control_step)
+        self.estimator = estimator_of(settings.noise)
+        self.estimate = np.zeros((ESTIMATE_SIZE, n * (self.estimator is not None)))
+        self.estimator_numbers = (self.estimator or EstimatorError()).numbers(control_step)
 
         # Commands wait in a queue that is as long as the longest delay of any episode.
         delays = [vehicle.delay for vehicle in vehicles]
@@ -215,6 +233,20 @@ class QuadcopterBatch:
         if self.randomize.wind or self.randomize.wind_gusts:
             self.warn_without_drag("randomize")
         return vehicles
+
+    def _set_recordings(self, settings: FlightSettings, dt: float) -> None:
+        """Read the logs that are replayed, for control steps of ``dt``, s."""
+        self.chances = np.zeros(self.n * bool(settings.wrench or settings.wind))
+        self.wrench_record, self.wind_record = np.zeros((0, WRENCH_SIZE)), np.zeros((0, 3))
+        if settings.wrench is not None:
+            table = settings.wrench.table(WRENCH_COLUMNS, dt)
+            self.wrench_record = np.zeros((len(table), WRENCH_SIZE))
+            self.wrench_record[:, WRENCH_ROWS[: table.shape[1]]] = table
+        if settings.wind is not None:
+            self.wind_record = settings.wind.table(WIND_COLUMNS, dt)
+            self.warn_without_drag("wind")
+        self.wrench_starts = starts_of(settings.wrench, dt, self.wrench_record)
+        self.wind_starts = starts_of(settings.wind, dt, self.wind_record)
 
     def _refuse_starts_on_the_ground(self) -> None:
         lowest = self.task_parameters[:, T.start_position + 2].min()
@@ -386,6 +418,16 @@ class QuadcopterBatch:
             wrench[W.force_body + 2] += (ground_effects(self.state, vehicles) - 1.0) * thrust
         return QuadcopterState(self.state, vehicles, wrench)
 
+    def estimated_state(self) -> QuadcopterState:
+        """Return the state that the vehicles themselves would know: with the errors of
+        ``noise.estimator`` a copy, else the true one.
+        """
+        state = self.true_state()
+        if not self.estimate.size:
+            return state
+        array = estimated(state.array, self.estimate)
+        return QuadcopterState(array, state.vehicles, state.wrench)
+
     @property
     def feels_air(self) -> bool:
         """Whether some vehicle has drag or another term of :mod:`.aerodynamics`."""
@@ -413,21 +455,31 @@ class QuadcopterBatch:
 
     def total_wrench(self) -> FloatArray:
         """Return the external wrench of this control step, (WRENCH_SIZE, n): the one that was set
-        or sampled, and gusts; without drag.
+        or sampled, gusts, and the recorded one; without drag.
         """
-        if self.randomize.gusts is None:
-            return self.wrench
-        total = self.wrench.copy()
-        total[FORCE_WORLD] += self.gust[GUST_VALUE]
+        total = self.wrench
+        if len(self.wrench_record):
+            total = total + self._recorded(self.wrench_record, self.wrench_starts)
+        if self.randomize.gusts is not None:
+            total = total.copy()
+            total[FORCE_WORLD] += self.gust[GUST_VALUE]
         return total
 
     def total_wind(self) -> FloatArray:
         """Return the velocity of the air in this control step, (3, n), world frame, m/s: the one
-        that was set or sampled, and gusts.
+        that was set or sampled, gusts, and the recorded one.
         """
-        if self.randomize.wind_gusts is None:
-            return self.wind
-        return self.wind + self.wind_gust[GUST_VALUE]
+        total = self.wind
+        if len(self.wind_record):
+            total = total + self._recorded(self.wind_record, self.wind_starts)
+        if self.randomize.wind_gusts is not None:
+            total = total + self.wind_gust[GUST_VALUE]
+        return total
+
+    def _recorded(self, record: FloatArray, starts: IntArray) -> FloatArray:
+        """Return what a recording adds in this control step, (size, n)."""
+        begins = starts[(self.chances * len(starts)).astype(np.int64)]
+        return record[(begins + self.streams[STEP]) % len(record)].T
 
     @property
     def state(self) -> FloatArray:
@@ -484,9 +536,11 @@ class QuadcopterBatch:
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a
-        ``Noise``; 0 switches it off.
+        ``Noise``; 0 switches it off. The estimator's errors stay.
         """
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
+        if estimator_of(noise) not in (None, self.estimator):
+            raise ConfigError("set_noise: estimator: give it to the environment when you make it")
         relative, additive = levels(noise)
         chosen = self.rows(indices)
         self.scaling_of_rows[-2, chosen] = per_row("noise", relative, chosen.size)

@@ -17,6 +17,7 @@ from numba import float32
 
 from sb3_quad.base.compiled import LANES, atomic_add, called, compiled, inlined, inner
 from sb3_quad.envs.simulation.aerodynamics import scale_thrusts
+from sb3_quad.envs.simulation.estimator import begin_estimate, perceive
 from sb3_quad.envs.simulation.frames import (
     clear_frames,
     integrate_position,
@@ -39,7 +40,8 @@ from sb3_quad.envs.simulation.physics import (
     total_thrust,
     turn_rotors,
 )
-from sb3_quad.envs.simulation.random import STEP, gust_words
+from sb3_quad.envs.simulation.random import RECORDING, STEP, gust_words, uniforms
+from sb3_quad.envs.simulation.recordings import add_recording
 from sb3_quad.envs.simulation.reward import score, score_calm, succeeds
 from sb3_quad.envs.simulation.sampling import (
     add_gusts,
@@ -175,7 +177,8 @@ _SIZE = BLOCK.itemsize
 def step(
     control, leads, mode, actions, observations, rewards, dones,
     state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers,
-    gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams, scaling,
+    gust, wind, wind_gust, wrench_record, wrench_starts, wind_record, wind_starts, chances,
+    estimator_numbers, estimate, frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations, last_actions,
     moves, for_px4, course, tracks, track_numbers, previews,
@@ -201,6 +204,9 @@ def step(
     :param randomize_numbers: :meth:`.Randomization.numbers`.
     :param gust: (GUST_SIZE, 0 or n), gusts of force; ``wind_gust``, likewise, gusts of wind.
     :param wind: (3, n), velocity of the air without gusts, world frame, m/s.
+    :param wrench_record: (0 or rows, WRENCH_SIZE), with ``wrench_starts``; ``wind_record`` (0 or
+        rows, 3), with ``wind_starts``; ``chances`` (0 or n,); see :mod:`.recordings`.
+    :param estimator_numbers: :meth:`.EstimatorError.numbers`; ``estimate`` (ESTIMATE_SIZE, 0 or n).
     :param frames: float32 (n, depth, frame size); depth 0 if an observation is the present features
         only.
     :param ages: int64 (ages,), of the frames in an observation, control steps.
@@ -269,11 +275,15 @@ def step(
             else:
                 load_rows(state, first, b.resting)
             if mode == FLY:
-                # Gusts add to what was set or sampled.
+                # Gusts and recordings add to what was set or sampled.
                 load_rows(wrench, first, b.wrench)
                 load_rows(wind, first, b.wind)
                 add_gusts(b.force_world, gust, first, count)
                 add_gusts(b.wind, wind_gust, first, count)
+                add_recording(
+                    b.wrench, wrench_record, wrench_starts, chances, streams, first, count
+                )
+                add_recording(b.wind, wind_record, wind_starts, chances, streams, first, count)
                 _load_commands(b, first, count, actions, queue)
                 fly(b, physics_step, substeps, in_air)
                 save_rows(b.state[: X.target], first, count, state)
@@ -287,7 +297,12 @@ def step(
             load_rows(streams, first, b.stream)
             if last_actions.shape[0] > 0:
                 score_calm(b, first, count, actions, last_actions, physics_step * substeps)
+            if estimate.shape[1] > 0:
+                perceive(b, count, True, estimator_numbers, estimate)
             observe(b, moves, for_px4)
+            if estimate.shape[1] > 0:
+                # What follows reads the true state.
+                load_rows(state, first, b.resting)
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)
             if wind_gust.shape[1] > 0:
@@ -330,6 +345,9 @@ def step(
                     i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles,
                     wrench, gust, wind, wind_gust,
                 )  # fmt: skip
+                if chances.size > 0:
+                    chances[i] = uniforms(streams, i, RECORDING)[0]
+                begin_estimate(i, streams, estimator_numbers, estimate)
                 start_episode(
                     i, state, queue, streams, task_index, vehicles, task_parameters, task_weights,
                     course, tracks, track_numbers,
@@ -346,6 +364,8 @@ def step(
             follow(b, np.int64(0), state, streams, course, tracks, track_numbers)
         if scaling.shape[1] > 1:
             load_scaling(b, scaling)
+        if estimate.shape[1] > 0:
+            perceive(b, count, False, estimator_numbers, estimate)
         observe(b, moves, for_px4)
         _write_observations(
             b, count, integral, ages, frames, previews, course, tracks, track_numbers,

@@ -21,6 +21,7 @@ HARMONICS = np.arange(1, 7)
 # bytes
 LARGEST_TABLE = 20_000_000
 LONGEST_ROW = 20_000
+MAX_SECONDS = 600.0  # of a round or of all; a table must not fill the memory
 _COLUMNS = ["t", "x", "y", "z", "heading"]
 # Number of coefficients of a segment of a polynomial with the least snap
 _COEFFICIENTS = 8
@@ -51,11 +52,24 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     :raises ConfigError: a file that cannot be read, or whose times do not rise; the message names
         the row, counted from 1 after the header.
     """
+    times, points = read_series(path, _COLUMNS[:4], _COLUMNS)
+    # Headings may be wrapped to [-π, π]: take the shorter way between two of them.
+    points[:, 3:] = np.unwrap(points[:, 3:], axis=0)
+    return times, points
+
+
+def read_series(path: Path, least: list[str], most: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Return the times (t,), from 0 on, and the numbers (t, columns) of a CSV file.
+
+    :param least: the columns that its first line must name, t first; ``most``: or these.
+    :raises ConfigError: see :func:`read_points`.
+    """
     frame = read_table(path)
     names = [*frame.columns]
-    if names not in (_COLUMNS[:4], _COLUMNS):
+    if names not in (least, most):
+        columns = " or ".join(",".join(valid) for valid in (least, most))
         raise ConfigError(
-            f"{path}: its first line names {','.join(names)}; the columns must be t,x,y,z[,heading]"
+            f"{path}: its first line names {','.join(names)}; the columns must be {columns}"
         )
     if len(frame) < 2:
         raise ConfigError(f"{path}: needs two or more rows after its header")
@@ -63,8 +77,6 @@ def read_points(path: Path) -> tuple[FloatArray, FloatArray]:
     numbers = frame.to_numpy()
     times = numbers[:, 0] - numbers[0, 0]
     refuse_falling_times(path, frame["t"])
-    # Headings may be wrapped to [-π, π]: take the shorter way between two of them.
-    numbers[:, 4:] = np.unwrap(numbers[:, 4:], axis=0)
     return times, numbers[:, 1:]
 
 

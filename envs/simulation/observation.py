@@ -13,7 +13,7 @@ from numba import float32
 from sb3_quad.base.compiled import LANES, fast, inlined
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.physics import rotation, to_body
-from sb3_quad.envs.simulation.random import random_words, standard_normals
+from sb3_quad.envs.simulation.random import OBSERVATION_NOISE, random_words, standard_normals
 from sb3_quad.envs.simulation.state import first_rows, row_slices
 from sb3_quad.envs.simulation.vectors import (
     dot,
@@ -195,7 +195,7 @@ def observe(b, moves, for_px4):
     The noise belongs to the row's episode and step: it stays the same until the stream advances.
     """
     features(b, moves, for_px4)
-    random_words(b)
+    random_words(b, OBSERVATION_NOISE)
     standard_normals(b)
     _disturb_and_scale(b)
     if for_px4:

@@ -27,7 +27,7 @@ from sb3_quad.envs.simulation.vectors import polynomial
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 # Purposes: the last word of the counter. numba would compile a function for each int.
 OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST = np.arange(5, dtype=np.uint32)
-DISTRIBUTION, WIND, REFERENCE, AIR = np.arange(5, 9, dtype=np.uint32)
+DISTRIBUTION, WIND, REFERENCE, AIR, ESTIMATOR, RECORDING = np.arange(5, 11, dtype=np.uint32)
 ROUNDS = 10
 BLOCKS = 8  # as many as any purpose takes
 _MASK = uint64(0xFFFFFFFF)
@@ -117,7 +117,7 @@ def _to_uniform(high, low):
 
 
 @called
-def random_words(b):
+def random_words(b, purpose):
     """Write ``b.word``: random words of every lane, a multiple of 4, from its key and counter."""
     word = b.word
     for block in range(word.shape[0] // 4):
@@ -128,7 +128,7 @@ def random_words(b):
                 word[4 * block + 1, lane],
                 word[4 * block + 2, lane],
                 word[4 * block + 3, lane],
-            ) = _words(b.stream, lane, block, OBSERVATION_NOISE)
+            ) = _words(b.stream, lane, block, purpose)
 
 
 @inner

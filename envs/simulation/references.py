@@ -18,6 +18,7 @@ from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, Number
 from sb3_quad.envs.simulation.motions import (
     HARMONICS,
+    MAX_SECONDS,
     SINES,
     Motion,
     interpolated,
@@ -32,7 +33,6 @@ Point = tuple[Metres, Metres, Metres]
 _POSITION, _VELOCITY, _ACCELERATION, _HEADING, _HEADING_RATE, _AHEAD = row_slices(
     REFERENCE_PARTS
 ).values()
-MAX_SECONDS = 600.0  # of a round or of all; a table must not fill the memory
 # Random motion: this many pieces of this many seconds, each a sum of sines that fit into it.
 PIECES = 256
 PIECE_SECONDS = 10.0

@@ -3,6 +3,7 @@
 Training writes them into every zip.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,8 +15,10 @@ from sb3_quad.base.plugins import FLIGHT_SETTINGS
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs import MAX_EPISODE_STEPS
+from sb3_quad.envs.simulation.estimator import EstimatorError
 from sb3_quad.envs.simulation.frames import ObservationSettings
 from sb3_quad.envs.simulation.randomization import Randomization
+from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
 from sb3_quad.envs.simulation.tasks import find_mixture, resolve_tasks
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
@@ -47,8 +50,12 @@ class Noise(Frozen):
     """as a fraction of the feature's value (thesis: 0.05)"""
     additive: Level = 0.0
     """as a fraction of σ, the same wherever the vehicle is"""
+    estimator: EstimatorError | None = None
+    """fields of EstimatorError: the features are those of an estimate, before other noise"""
 
 
+# Without logs, whose files are elsewhere when a zip is read
+UNRECORDED: Mapping[str, None] = {"wrench": None, "wind": None}
 NoiseLevel = Level | list[Level] | Noise
 
 
@@ -82,6 +89,12 @@ class FlightSettings(ObservationSettings):
     reference: Reference | None = None
     """name of a curve, fields of Reference, path of a CSV file, or function of time: what the
     target does in an episode; None: it rests"""
+    wrench: Recording | None = None
+    """a log's force and maybe torque: path of a CSV file with the columns t,fx,fy,fz[,tx,ty,tz], or
+    fields of Recording; s, N in world axes, N m in body axes
+    """
+    wind: Recording | None = None
+    """likewise, a log's velocity of the air: t,vx,vy,vz; m/s, world axes; for vehicles with drag"""
     max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = MAX_EPISODE_STEPS
     """control steps after which an episode is truncated, for all rows or for each"""
 
@@ -131,6 +144,8 @@ class FlightSettings(ObservationSettings):
             "max_episode_steps",
             "randomize",
             "reference",
+            "wrench",
+            "wind",
         }
         return {name: value for name, value in self if name in kept}
 
@@ -170,14 +185,14 @@ class FlightSettings(ObservationSettings):
     def write_into(self, model: Any) -> None:
         """Write these settings into an SB3 model: ``model.flight_settings``, plain JSON with the
         parameters of the vehicle. If rows differ, they are the first vehicle and scaling, and the
-        mean level of noise. A reference stays if it is a named curve.
+        mean level of noise. A reference stays if it is a named curve; recordings do not.
 
         From then on its zips contain them, and ``load`` of Stable-Baselines3 keeps them, even
         without this package.
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
-        changes: dict[str, Any] = {"vehicle": first_vehicle(self.vehicle)}
+        changes: dict[str, Any] = {"vehicle": first_vehicle(self.vehicle), **UNRECORDED}
         if isinstance(self.noise, list):
             changes["noise"] = float(np.mean(self.noise))
         for name in ("observation_mean", "observation_std"):
@@ -201,10 +216,17 @@ def levels(noise: Any) -> tuple[FloatArray, FloatArray]:
     return np.asarray(noise, np.float64), np.zeros(())
 
 
+def estimator_of(noise: Any) -> EstimatorError | None:
+    """Return the estimator's error in a valid ``NoiseLevel``."""
+    return noise.estimator if isinstance(noise, Noise) else None
+
+
 def in_words(noise: Any) -> str:
     """Return noise such as ``5 %``, or ``5 % and 2 % of σ``; the mean if rows differ."""
     relative, additive = levels(noise)
     text = f"{100 * relative.mean():g} %"
     if additive:
         text += f" and {100 * additive.mean():g} % of σ"
+    if estimator_of(noise):
+        text += ", of an estimate that is off"
     return text

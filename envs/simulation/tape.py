@@ -20,6 +20,7 @@ from sb3_quad.envs.simulation.adjoint import (
     relation_vjp,
 )
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.estimator import displace, turn_attitudes
 from sb3_quad.envs.simulation.kernel import (
     CHUNK,
     load_rows,
@@ -37,8 +38,14 @@ from sb3_quad.envs.simulation.observation import (
     with_noise,
 )
 from sb3_quad.envs.simulation.physics import limit_speeds, rotor_speed
-from sb3_quad.envs.simulation.random import EPISODE, STEP, random_words, standard_normals
-from sb3_quad.envs.simulation.state import STATE_SIZE, P
+from sb3_quad.envs.simulation.random import (
+    EPISODE,
+    OBSERVATION_NOISE,
+    STEP,
+    random_words,
+    standard_normals,
+)
+from sb3_quad.envs.simulation.state import STATE_SIZE, P, X
 from sb3_quad.envs.simulation.threads import DONE, LEFT, finish, share_out
 
 FlightCost = Callable[[FloatArray, Float32Array, BoolArray], tuple[float, FloatArray, FloatArray]]
@@ -88,6 +95,7 @@ class FlightTape:
         self.lengths = np.full(n, n_steps)
         self.lost = np.zeros(n, np.bool_)
         self._integrals = np.zeros((n_steps, *batch.integral.shape))
+        self._estimates = np.zeros((n_steps, *batch.estimate.shape))
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
         self._winds = np.zeros((n_steps, *batch.wind.shape))
 
@@ -127,6 +135,7 @@ class FlightTape:
         self.states[t] = batch.state
         self.actions[t] = actions
         self._integrals[t] = batch.integral
+        self._estimates[t] = batch.estimate
         self._wrenches[t] = batch.total_wrench()
         self._winds[t] = batch.total_wind()
         observations, self.rewards[t], _ = batch.step_on(actions, self.substeps)
@@ -184,6 +193,7 @@ class FlightTape:
             self.actions,
             self._queue,
             self._streams,
+            self._estimates,
             self._wrenches[step],
             self._winds[step],
             batch.vehicles,
@@ -208,9 +218,9 @@ class FlightTape:
 
 @compiled
 def step_vjp(
-    control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
-    moves, for_px4, ages, integrals, integral_numbers, grad_observation, grad_frames, grad_integral,
-    gradient, grad_actions, physics_step, substeps, in_air,
+    control, leads, step, lengths, states, actions, queue, streams, estimates, wrench, wind,
+    vehicles, scaling, moves, for_px4, ages, integrals, integral_numbers, grad_observation,
+    grad_frames, grad_integral, gradient, grad_actions, physics_step, substeps, in_air,
 ):  # fmt: skip
     """Vector-Jacobian product of a control step and the observation after it, see FlightTape.
 
@@ -252,8 +262,13 @@ def step_vjp(
                 load_rows(states[step + 1], first, b.state)
                 load_rows(streams, first, b.stream)
                 b.stream[STEP] += np.uint32(step + 1)
+                is_estimate = estimates.shape[2] > 0
+                if is_estimate:
+                    displace(b, estimates[step + 1])
+                    # While gradients of features are added, all are with respect to the estimate.
+                    turn_attitudes(b, own[X.quaternion : X.velocity], estimates[step + 1], 1.0)
                 features(b, moves, for_px4)
-                random_words(b)
+                random_words(b, OBSERVATION_NOISE)
                 standard_normals(b)
                 _frames_vjp(
                     b, first, count, step + 1, lengths, actions, ages, integrals, integral_numbers,
@@ -265,6 +280,8 @@ def step_vjp(
                 if moves and not for_px4:
                     relation_vjp(b, grad_feature)
                 features_vjp(b, grad_feature, own, for_px4)
+                if is_estimate:
+                    turn_attitudes(b, own[X.quaternion : X.velocity], estimates[step + 1], -1.0)
 
             load_rows(states[step], first, b.state)
             load_rows(wrench, first, b.wrench)

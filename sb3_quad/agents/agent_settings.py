@@ -18,7 +18,7 @@ from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
-from sb3_quad.envs.simulation.settings import KEY, FlightSettings
+from sb3_quad.envs.simulation.settings import KEY, UNRECORDED, FlightSettings
 from sb3_quad.envs.simulation.tasks import Task
 from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS, beyond
 from sb3_quad.envs.vehicles.layout import Turn, find_turn
@@ -164,8 +164,8 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     changes: StrDict = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}
     if isinstance(task, dict) and "name" in task:
         changes["task"] = validate(Task, task, where)
-    settings = validate(FlightSettings, record | changes, where)
-    # The file of a reference in a zip is not opened, for the same reason.
+    # The files of recordings and references in a zip are not opened, for the same reason.
+    settings = validate(FlightSettings, record | changes | UNRECORDED, where)
     if settings.reference is not None and settings.reference.curve == "file":
         settings = settings.model_copy(update={"reference": None})
     return settings

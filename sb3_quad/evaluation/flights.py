@@ -139,9 +139,9 @@ def fly(
     ``row_seeds(seed, n_episodes)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
 
     :param controller: an expert or its name, such as ``"pid"``, asked by ``actions(state)`` for the
-        true state; an SB3 model, its zip or the name of a shipped one, asked by
-        ``predict(observation, deterministic=True)``; or a function from observations
-        (n, observation size) to actions (n, 4).
+        true state, or the estimate with ``noise.estimator``; an SB3 model, its zip or the name of a
+        shipped one, asked by ``predict(observation, deterministic=True)``; or a function from
+        observations (n, observation size) to actions (n, 4).
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
         ``noise`` and ``environment``: ``task_kwargs``, ``reference``, ``observation_std`` and
         ``observation_mean``. Give what an agent was trained to observe by
@@ -242,7 +242,7 @@ def fly_settings(
     with closing(FLEETS[backend](seeds, settings)) as fleet, one_thread_by_default():
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
-            controller, ACTIONS, observations, fleet.true_state, deterministic=deterministic
+            controller, ACTIONS, observations, fleet.estimated_state, deterministic=deterministic
         )
         following = Following(fleet.moves)
         measuring = [

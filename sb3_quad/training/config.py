@@ -248,7 +248,7 @@ class TrainingConfig(Frozen):
 # Keys of a settings file that hold keywords of environments.
 ENV_KEYS = {"env_kwargs", "eval_env_kwargs"}
 # Keywords of environments that may be the path of a file, or contain one.
-FILE_KEYS = {"vehicle", "rotor_layout", "vehicles", "reference"}
+FILE_KEYS = {"vehicle", "rotor_layout", "vehicles", "reference", "wrench", "wind"}
 # Keys of a settings file that are not the algorithm's.
 JOB_KEYS = TrainingConfig.model_fields.keys() - {"algo", "env_id", "hyperparams", "settings"}
 

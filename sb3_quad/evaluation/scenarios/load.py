@@ -51,7 +51,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
     scenarios = []
     for number, entry in enumerate(entries):
         place = f"{where}: scenario {entry.get('name', number)}"
-        for key in entry.keys() & {"vehicle", "vehicles", "reference"}:
+        for key in entry.keys() & {"vehicle", "vehicles", "reference", "wrench", "wind"}:
             entry[key] = _beside(folder, entry[key])
         # A cell of a grid is a scenario like any other.
         scenarios += [validate(Scenario, cell, place) for cell in grid(entry, place)]

@@ -12,6 +12,7 @@ from sb3_quad.base.seeds import Seed, row_seeds, seed_for
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.simulation.randomization import Randomization
+from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
 from sb3_quad.envs.simulation.settings import FlightSettings, Noise
 from sb3_quad.envs.simulation.tasks import T, Task, resolve_tasks
@@ -55,10 +56,11 @@ class Scenario(Frozen):
     """One way to judge a controller: keywords of the environments, events, and the number of the
     episodes.
 
-    ``task``, ``task_kwargs``, ``vehicle``, ``noise``, ``vehicles``, ``randomize`` and ``reference``
-    are those of :class:`~sb3_quad.envs.simulation.settings.FlightSettings`. ``start``, ``target``,
-    ``waypoints`` and ``wrenches`` are events, which come on top of what the task samples. Units m,
-    s, rad, N, N m, kg.
+    ``task``, ``task_kwargs``, ``vehicle``, ``noise``, ``vehicles``, ``randomize``, ``reference``,
+    ``wrench`` and ``wind`` are those of
+    :class:`~sb3_quad.envs.simulation.settings.FlightSettings`. ``start``, ``target``, ``waypoints``
+    and ``wrenches`` are events, which come on top of what the task samples. Units m, s, rad, N,
+    N m, kg.
     """
 
     name: str = Field(pattern=NAME)
@@ -74,7 +76,9 @@ class Scenario(Frozen):
     vehicle: str | Vehicle | None = None
     """name, or path of a YAML file (relative to the suite's); default: the agent's own, or itm"""
     noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
-    """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
+    """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …,
+    estimator: {position: …, …}}; with an estimator, experts see its estimate
+    """
     vehicles: VehicleDistribution | None = None
     """each episode has one of these, unknown to the controller, such as {distribution: raptor}"""
     randomize: Randomization | None = None
@@ -85,6 +89,12 @@ class Scenario(Frozen):
     """how the target moves from there: a curve's name, the path of a CSV file (relative to the
     suite's) or fields of Reference; default: it rests
     """
+    wrench: Recording | None = None
+    """a log's force and torque: the path of a CSV file (relative to the suite's), t,fx,fy,fz and
+    maybe tx,ty,tz; or fields of Recording
+    """
+    wind: Recording | None = None
+    """likewise, a log's velocity of the air: t,vx,vy,vz"""
     start: Start = Start()
     """replaces the task's attitude, velocity or body rates"""
     target: Vector | None = None
@@ -227,6 +237,8 @@ class Scenario(Frozen):
             vehicles=self.vehicles,
             randomize=self.randomize,
             reference=self.reference,
+            wrench=self.wrench,
+            wind=self.wind,
             max_episode_steps=self.steps,
         )
 
@@ -249,7 +261,8 @@ class Scenario(Frozen):
         # It is known only for undisturbed flights from the start of this task.
         known, _ = resolve_tasks("target_tracking", {"target_distance": distance})
         events = self.start != Start() or self.targets or self.wrenches
-        changed = events or self.randomize or self.vehicles or self.reference
+        world = self.randomize or self.vehicles or self.wrench or self.wind
+        changed = events or world or self.reference
         if changed or 0.1 not in self.tolerances or not np.array_equal(tasks, known):
             return None
         return (self.nominal_vehicle().time_optimal or {}).get(distance)
