@@ -73,6 +73,10 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | 2 | rear right | -1 | 1 | 2.12 to 6.35 |
     | 3 | rear left | -1 | 1 | 2.12 to 6.35 |
 
+    With `action="rates"`, action 0 commands the collective thrust, four times a rotor's, and 1 to 3
+    the body rates in roll, pitch and yaw, up to the `limits` of the vehicle's
+    :class:`~sb3_quad.envs.vehicles.rates.RateLoop`, which holds them.
+
     A command acts one control step (0.01 s) after you give it. Then the rotor speed follows it (Eq.
     4.1).
 
@@ -156,6 +160,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `task_kwargs` | `None` | fields of the task to override |
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a `Vehicle` |
     | `rotor_layout` | `None` | the vehicle whose axes and rotor order the agent knows |
+    | `action` | `"thrusts"` | `"rates"`: actions command collective thrust and body rates |
     | `noise` | 0.05 | relative std of the observation noise, or the fields of `Noise` |
     | `observation_mean` | `None` | mean of Eq. 3.16, (18,); `None`: zero |
     | `observation_std` | `None` | std of Eq. 3.16, (18,); `None`: the table above |
@@ -332,9 +337,10 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         # The batch turns the rotors and scores the step; in between, PyBullet moves the body.
         batch = self.batch
         drag = batch.vehicles[P.drag_x : P.drag_z + 1, 0] if batch.has_drag else None
-        rotor_wrenches = batch.turn_rotors(array[None])
-        self._body.fly(rotor_wrenches, batch.total_wrench()[:, 0], drag, batch.total_wind()[:, 0])
-        self._body.read(batch.state)
+        wrench, wind = batch.total_wrench()[:, 0], batch.total_wind()[:, 0]
+        for rotor_wrenches in batch.turn_rotors(array[None]):
+            self._body.fly(rotor_wrenches, wrench, drag, wind)
+            self._body.read(batch.state)
         observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":
             self._draw()

@@ -164,8 +164,11 @@ RANDOM = {
     "gusts": st.just({"std": [0, 0.2], "unit": "weight", "time_constant": 0.1}),
     "wind": st.just([0, 5]),
     "wind_gusts": st.just({"std": [0, 2]}),
+    "rate_gains": st.just([0.5, 2.0]),
+    "rate_lag": st.just([0.0, 0.02]),
 }
 SEEN = {
+    "action": st.just("rates"),
     "features": st.just("px4"),
     "noise": st.sampled_from([0.0, 0.2, {"relative": 0.1, "additive": 0.05}, {"additive": 0.02}]),
     "last_action": st.just(True),

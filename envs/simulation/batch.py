@@ -1,7 +1,7 @@
 """n quadcopters as arrays: the part that all environments share."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -61,6 +61,7 @@ _NO_ROWS = np.zeros(0, np.int64)
 _KEPT = (
     "state",
     "queue",
+    "filtered_rates",
     "wrench",
     "streams",
     "task_index",
@@ -127,6 +128,9 @@ class QuadcopterBatch:
         if self.randomize.delay is not None:
             delays.append(int(self.randomize.delay.high))
         self.queue = np.zeros((max(delays), 4, n))
+        # An array without columns means that actions are thrusts.
+        self.filtered_rates = np.zeros((3, n * (settings.action == "rates")))
+        self._due = np.zeros(4)
 
         # The frames that a policy sees besides the present features.
         self.observation = settings.observation
@@ -293,26 +297,32 @@ class QuadcopterBatch:
             )
         return results
 
-    def turn_rotors(self, actions: AnyArray) -> FloatArray:
+    def turn_rotors(self, actions: AnyArray) -> Iterator[FloatArray]:
         """Advance the rotors of row 0 by a control step, for another simulator that moves the body.
 
-        It then writes the state, and :meth:`score` scores the step.
+        It writes the state after each of these parts, and :meth:`score` scores the step.
 
         :param actions: (n, 4), clipped to [-1, 1].
         :return: force (N) and torque (N m) of rotors and wrench in each physics step, body frame,
-            (substeps, 2, 3). The parts of the wrench in the world frame are not included.
+            (steps, 2, 3). The parts of the wrench in the world frame are not included.
         """
-        wrenches = np.empty((self.substeps, 2, 3))
-        rotor_wrenches(
-            actions,
-            wrenches,
-            self.state,
-            self.queue,
-            self.wrench,
-            self.vehicles,
-            self.physics_step,
-        )
-        return wrenches
+        # A rate loop feels how the body turns.
+        parts = self.substeps if self.filtered_rates.size else 1
+        for part in range(parts):
+            wrenches = np.empty((self.substeps // parts, 2, 3))
+            rotor_wrenches(
+                part == 0,
+                actions,
+                self._due,
+                wrenches,
+                self.state,
+                self.queue,
+                self.filtered_rates,
+                self.wrench,
+                self.vehicles,
+                self.physics_step,
+            )
+            yield wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:
         """Clear ``outcome`` of rows that have just begun an episode; its distance is that of the
@@ -430,6 +440,8 @@ class QuadcopterBatch:
         self.state[row_slices(STATE)[quantity]] = values
         if quantity == "target" and self.course.size:
             self.course[: C.begin] = values
+        if quantity == "body_rates" and self.filtered_rates.size:
+            self.filtered_rates[:] = values
 
     def set_reference(self, reference: FloatArray, rows: IntArray) -> None:
         """Set the reference of these rows, (REFERENCE_SIZE, rows)."""

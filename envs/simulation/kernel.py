@@ -31,6 +31,7 @@ from sb3_quad.envs.simulation.observation import (
     observe,
 )
 from sb3_quad.envs.simulation.physics import (
+    command_by_rates,
     command_rotors,
     fly,
     moment,
@@ -39,6 +40,11 @@ from sb3_quad.envs.simulation.physics import (
     turn_rotors,
 )
 from sb3_quad.envs.simulation.random import STEP, gust_words
+from sb3_quad.envs.simulation.rate_loop import (
+    RATE_LOOP,
+    command_rates,
+    load_rate_loop,
+)
 from sb3_quad.envs.simulation.reward import score, score_calm, succeeds
 from sb3_quad.envs.simulation.sampling import (
     add_gusts,
@@ -51,12 +57,14 @@ from sb3_quad.envs.simulation.state import (
     STATE_SIZE,
     WRENCH,
     WRENCH_SIZE,
+    P,
     X,
 )
 from sb3_quad.envs.simulation.tasks import SCORED, T
 from sb3_quad.envs.simulation.threads import DONE, LEFT, finish
 from sb3_quad.envs.simulation.tracks import follow, observe_preview
 from sb3_quad.envs.simulation.vectors import store, vector
+from sb3_quad.envs.vehicles.rates import RATE_PARAMETERS
 from sb3_quad.envs.vehicles.vehicle import PARAMETER_NAMES
 
 CHUNK = 2 * LANES  # rows that a thread takes at once
@@ -91,6 +99,11 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         # rotor speeds to be reached in this control step
         "wanted_speeds": 4,
         "thrust": 4,  # of each rotor, N
+        # With action="rates": the thrust, N, and body rates, rad/s, to be reached; the body rates
+        # behind the gyro's filter; and what load_rate_loop computes
+        "rate_command": 4,
+        "filtered_rates": 3,
+        **RATE_LOOP,
         **WRENCH,
         "wind": 3,  # velocity of the air
         **dict.fromkeys(PARAMETER_NAMES, ()),
@@ -126,7 +139,13 @@ _TOGETHER: dict[str, tuple[str, Any]] = {
     # the state with a target that rests
     "resting": ("position", X.target_velocity),
     "wrench": ("force_world", WRENCH_SIZE),
-    "vehicle": (PARAMETER_NAMES[0], len(PARAMETER_NAMES)),
+    # without the rate loop, which "thrusts" do not need
+    "vehicle": (PARAMETER_NAMES[0], len(PARAMETER_NAMES) - len(RATE_PARAMETERS)),
+    "rate_loop": (RATE_PARAMETERS[0], len(RATE_PARAMETERS)),
+    "rate_limit": ("rate_limit_x", 3),
+    "rate_gain": ("rate_gain_x", 3),
+    "mix": ("roll_mix_0", (3, 4)),
+    "hover_share": ("hover_share_0", 4),
     "inertia": ("ixx", 3),
     "drag": ("drag_x", 3),
     # the moment of each rotor per thrust, by axis
@@ -161,9 +180,9 @@ _SIZE = BLOCK.itemsize
 @compiled
 def step(
     control, leads, mode, actions, observations, rewards, dones,
-    state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers,
-    gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams, scaling,
-    task_index, task_parameters, task_weights, returns, limits, max_steps,
+    state, queue, filtered_rates, wrench, vehicles, base_vehicles, distribution_numbers,
+    randomize_numbers, gust, wind, wind_gust, frames, ages, integral, integral_numbers, streams,
+    scaling, task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations, last_actions,
     moves, for_px4, course, tracks, track_numbers, previews,
     physics_step, substeps, autoreset,
@@ -181,7 +200,10 @@ def step(
     :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and
         ``dones`` bool (n,) are written.
     :param state: (STATE_SIZE, n), see :data:`.state.STATE`.
-    :param queue: (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s.
+    :param queue: (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s;
+        or with ``action="rates"`` the thrusts, N, and body rates, rad/s.
+    :param filtered_rates: (3, 0 or n), body rates behind the gyro's filter; without columns,
+        actions are thrusts.
     :param wrench: (WRENCH_SIZE, n), see :data:`.state.WRENCH`.
     :param vehicles: (parameters, 1 or n), as they fly; ``base_vehicles``: before randomization.
     :param distribution_numbers: :meth:`.VehicleDistribution.numbers`.
@@ -214,6 +236,7 @@ def step(
     :return: False if an action is not finite; then nothing has changed.
     """
     n = state.shape[1]
+    by_rates = filtered_rates.shape[1] > 0
     chunks = (n + CHUNK - 1) // CHUNK
     if leads:
         if mode != LOOK and not _is_finite(actions):
@@ -222,7 +245,9 @@ def step(
     blocks = new_block()
     b = blocks[0]
     b.row[:] = 0
-    load_constants(b, 0, True, scaling, vehicles, task_index, task_parameters, physics_step)
+    load_constants(
+        b, 0, True, scaling, vehicles, task_index, task_parameters, physics_step, by_rates
+    )
 
     # The rows whose observations are due at the end: those that begin an episode, or all in LOOK.
     due = np.empty(n, np.int64)
@@ -248,7 +273,7 @@ def step(
                 b.row[lane] = first + min(lane, count - 1)
             load_constants(
                 b, first, False, scaling, vehicles, task_index, task_parameters,
-                physics_step,
+                physics_step, by_rates,
             )  # fmt: skip
             if moves and tracks.shape[0] == 0:
                 load_rows(state, first, b.state)
@@ -260,8 +285,13 @@ def step(
                 load_rows(wind, first, b.wind)
                 add_gusts(b.force_world, gust, first, count)
                 add_gusts(b.wind, wind_gust, first, count)
-                _load_commands(b, first, count, actions, queue)
-                fly(b, physics_step, substeps)
+                _load_commands(b, first, count, actions, queue, by_rates)
+                if by_rates:
+                    b.rate_command[:] = b.wanted_speeds
+                    load_rows(filtered_rates, first, b.filtered_rates)
+                fly(b, physics_step, substeps, by_rates)
+                if by_rates:
+                    save_rows(b.filtered_rates, first, count, filtered_rates)
                 save_rows(b.state[: X.target], first, count, state)
             if tracks.shape[0] > 0:
                 follow(b, np.int64(1), state, streams, course, tracks, track_numbers)
@@ -317,8 +347,8 @@ def step(
                     wrench, gust, wind, wind_gust,
                 )  # fmt: skip
                 start_episode(
-                    i, state, queue, streams, task_index, vehicles, task_parameters, task_weights,
-                    course, tracks, track_numbers,
+                    i, state, queue, filtered_rates, streams, task_index, vehicles,
+                    task_parameters, task_weights, course, tracks, track_numbers,
                 )  # fmt: skip
                 if frames.shape[1] > 0:
                     clear_frames(i, frames, integral)
@@ -349,23 +379,35 @@ BATCH_ARGUMENTS = _ARGUMENTS[_ARGUMENTS.index("state") :]
 
 
 @compiled
-def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step):
-    """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body
+def rotor_wrenches(
+    begins, actions, due, out, state, queue, filtered_rates, wrench, vehicles, physics_step
+):
+    """Advance delay and rotors of row 0 by physics steps, for a simulator that moves the body
     itself.
 
     Motors do not feel the body, so all physics steps of a control step can be computed before it
-    moves.
+    moves; with ``action="rates"``, one.
 
+    :param begins: whether a control step begins.
     :param actions: float32 (n, 4), clipped to [-1, 1].
-    :param out: (substeps, 2, 3): force (N) and torque (N m) of rotors and wrench in each physics
+    :param due: (4,), the commands that are due in this control step, written when it begins.
+    :param out: (steps, 2, 3): force (N) and torque (N m) of rotors and wrench in each physics
         step, body frame.
     """
+    by_rates = filtered_rates.shape[1] > 0
     blocks = new_block()
     blocks[0].row[:] = 0
     load_rows(state, 0, blocks[0].state)
     load_rows(wrench, 0, blocks[0].wrench)
-    load_vehicles(blocks[0], vehicles, 0, physics_step)
-    _load_commands(blocks[0], 0, 1, actions, queue)
+    load_vehicles(blocks[0], vehicles, 0, physics_step, by_rates)
+    if begins:
+        _load_commands(blocks[0], 0, 1, actions, queue, by_rates)
+        due[:] = blocks[0].wanted_speeds[:, 0]
+    if by_rates:
+        load_rows(due.reshape(4, 1), 0, blocks[0].rate_command)
+        load_rows(filtered_rates, 0, blocks[0].filtered_rates)
+        command_by_rates(blocks[0])
+        filtered_rates[:, 0] = blocks[0].filtered_rates[:, 0]
     b = blocks[0]
     out[:, 0] = b.force_body[:, 0]
     out[:, 1] = b.torque_body[:, 0]
@@ -418,7 +460,7 @@ def save_rows(source, first, count, target):
 
 
 @inlined
-def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
+def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt, by_rates):
     """Load what does not change during an episode: scaling, vehicles, limits and costs.
 
     :param shared: True: load what is the same for all rows, once for all blocks of a call. False:
@@ -427,7 +469,7 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
     if (scaling.shape[1] == 1) == shared:
         load_scaling(b, scaling)
     if (vehicles.shape[1] == 1) == shared:
-        load_vehicles(b, vehicles, first, dt)
+        load_vehicles(b, vehicles, first, dt, by_rates)
     if (tasks.shape[0] == 1) == shared:
         # Limits and costs are the last columns of a task.
         for lane in range(LANES):
@@ -437,8 +479,11 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
 
 
 @called
-def load_vehicles(b, vehicles, first, dt):
-    """Load the vehicles of a block, with the divisions of a control step precomputed."""
+def load_vehicles(b, vehicles, first, dt, by_rates):
+    """Load the vehicles of a block, with the divisions of a control step precomputed.
+
+    :param by_rates: whether to load their rate loops, too.
+    """
     load_rows(vehicles, first, b.vehicle)
     for lane in range(LANES):
         lift = b.thrust_coefficient[lane]
@@ -454,6 +499,9 @@ def load_vehicles(b, vehicles, first, dt):
         ixx, iyy, izz = vector(b.inertia, lane)
         store(b.gyro, lane, (izz - iyy, ixx - izz, iyy - ixx))
         store(b.rates_gain, lane, (dt / ixx, dt / iyy, dt / izz))
+    if by_rates:
+        load_rows(vehicles[P.rate_limit_x :], first, b.rate_loop)
+        load_rate_loop(b, dt)
 
 
 @called
@@ -468,7 +516,7 @@ def load_scaling(b, scaling):
 
 
 @inlined
-def _load_commands(b, first, count, actions, queue):
+def _load_commands(b, first, count, actions, queue, by_rates):
     """Put the commands of a block into the queue, and move those that are due to
     ``b.wanted_speeds``.
 
@@ -481,7 +529,10 @@ def _load_commands(b, first, count, actions, queue):
     for lane in range(LANES):
         for k in range(4):
             command[k, lane] = actions[b.row[lane], k]
-    command_rotors(b)
+    if by_rates:
+        command_rates(b)
+    else:
+        command_rotors(b)
     if delay == 0:
         for k in range(4):
             for lane in range(LANES):
