@@ -300,7 +300,7 @@ def refuse_other_action(name: str, source: Any, action: str) -> None:
     record = getattr(source, FLIGHT_SETTINGS, None)
     if isinstance(record, dict):
         known = record.get("action", "thrusts")
-    if known != action:
+    if isinstance(known, str) and known != action:
         raise ConfigError(
             f"{name}: commands {known}, and here actions are {action}; give action: {known}, or a"
             f" controller of {action}"
