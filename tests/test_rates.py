@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sb3_quad.agents.agent_settings import settings_of_model
 from sb3_quad.agents.zips import load_model
@@ -23,6 +21,7 @@ from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
 
 LOOPS = {"rate_gains": [0.5, 2.0], "rate_lag": [0.0, 0.02]}
+TORQUE = {"magnitude": 0.05, "unit": "weight", "axes": [1.0, 1.0, 0.3]}
 
 
 def new_batch(n, seed=0, **keywords):
@@ -58,7 +57,7 @@ def test_a_row_of_the_batch_flies_as_on_pybullet(vehicle):
             np.testing.assert_allclose(*states, rtol=1e-9, atol=1e-9)
             rates = env.batch.filtered_rates
             np.testing.assert_allclose(rates, batch.filtered_rates, atol=1e-9)
-    env.reset(seed=3, options={"state": {"body_rates": [1.0, -2.0, 3.0]}})
+    env.reset(options={"state": {"body_rates": [1.0, -2.0, 3.0]}})
     np.testing.assert_array_equal(env.batch.filtered_rates[:, 0], [1.0, -2.0, 3.0])
 
 
@@ -74,18 +73,18 @@ def wanted(batch, action, rates):
     return vehicle.mixer @ thrusts, thrusts
 
 
-@given(seed=st.integers(0, 2**31), size=st.sampled_from([0.1, 1.0, 5.0]))
-def test_roll_and_pitch_come_before_thrust_and_thrust_before_yaw(seed, size):
+def test_roll_and_pitch_come_before_thrust_and_thrust_before_yaw():
     # Motors that reach any speed within the physics step show what the loop commands.
     fast = {"motor_gain": 100.0, "delay": 0, "rotor_thrust_limits": [0.0, 7.0]}
     vehicle = changed(**fast, rates={"limits": [9, 8, 3], "gains": [20, 25, 9], "lag": 0})
-    batch = new_batch(16, vehicle=vehicle)
-    rng = np.random.default_rng(seed)
-    action = rng.uniform(-1.0, 1.0, (16, 4)).astype(np.float32)
-    rates = size * rng.standard_normal((3, 16))
-    found, thrusts = wanted(batch, action, rates)
+    rng = np.random.default_rng(0)
+    n = 600
+    action = rng.uniform(-1.0, 1.0, (n, 4)).astype(np.float32)
+    rates = rng.choice([0.1, 1.0, 5.0], n) * rng.standard_normal((3, n))
+    found, thrusts = wanted(new_batch(n, vehicle=vehicle), action, rates)
 
     inertia = np.array(vehicle.inertia)[:, None]
+    action = action.astype(float)
     error = np.array([[9.0], [8.0], [3.0]]) * action.T[1:] - rates
     torque = inertia * np.array([[20.0], [25.0], [9.0]]) * error
     torque += np.cross(rates.T, (inertia * rates).T).T
@@ -104,6 +103,8 @@ def test_roll_and_pitch_come_before_thrust_and_thrust_before_yaw(seed, size):
     assert (share > -1e-9).all() and (share < 1.0 + 1e-9).all()
     at_limit = np.minimum(thrusts - least, most - thrusts).min(axis=0) < 1e-9
     assert at_limit[share < 1.0 - 1e-6].all()
+    # Each of these happens.
+    assert (scale < 1.0).any() and (share < 0.5).any() and (share > 1.0 - 1e-9).any()
 
 
 def test_a_vehicle_in_flight_has_the_body_rates_that_are_commanded():
@@ -130,7 +131,7 @@ def test_thrusts_do_not_feel_the_rate_loop():
 
 
 def test_a_loop_is_random_by_numbers_of_its_own():
-    rest = {"mass": [0.5, 2.0], "delay": [0, 3], "thrust": [0.8, 1.0]}
+    rest = {"mass": [0.8, 1.2], "delay": [0, 3], "thrust": [0.9, 1.0]}
     plain = new_batch(400, randomize=rest).vehicles
     batch = new_batch(400, randomize={**rest, **LOOPS})
     rates = slice(P.rate_limit_x, P.rate_limit_x + len(RATE_PARAMETERS))
@@ -176,9 +177,9 @@ def test_experts_fly_with_body_rates(expert, task, vehicle):
     keywords = {} if expert == "pid" else {"randomize": LOOPS}
     if expert.startswith("privileged"):
         # Without knowing it, the rates would be wrong all the time.
-        keywords["randomize"] = {**LOOPS, "torque": {"magnitude": 0.05, "unit": "weight"}}
+        keywords["randomize"] = {**LOOPS, "torque": TORQUE}
     flights = fly(expert, task, 20, 0, vehicle=vehicle, action="rates", **keywords)
-    assert flights.survived.mean() == 1.0 and np.median(flights.final_error) < 0.1
+    assert flights.survival.all() and np.median(flights.final_error) < 0.1
 
 
 def test_a_zip_says_what_its_actions_command(tmp_path):
@@ -193,7 +194,7 @@ def test_a_zip_says_what_its_actions_command(tmp_path):
     APG("MlpPolicy", env, initial_policy=model, n_steps=8, **small).learn(64)
     # It flies as it was trained.
     flights = fly(str(tmp_path / "rates.zip"), "state_recovery", 2, max_episode_steps=20)
-    assert len(flights) == 2
+    assert flights.n == 2
 
 
 @pytest.mark.parametrize("action", ["thrusts", "rates"])
