@@ -72,10 +72,14 @@ def fly_geometric(state, constants, wrench, by_rates, actions):
         rate, nx, ny = desired_turn(b, omega, gains)
         if by_rates:
             yaw_rate = desired_yaw_rate(state, i, body_to_world, gains)
-            # The loop gives a moment if the rates differ by that over its gain.
+            wanted = rate * nx, rate * ny, yaw_rate
             loop = vector_at(constants.vehicles, P.rate_gain_x, k)
             for axis in range(3):
-                rates[axis] = (rate * nx, rate * ny, yaw_rate)[axis] - torque[axis] / loop[axis]
+                # A loop slower than the law gets more than the wanted rate, to be as quick. It
+                # gives a moment if the rates differ by that over its gain.
+                slowness = gains[G.body_rates] * inertia[axis] / loop[axis]
+                lead = max(slowness - 1.0, 0.0) * (wanted[axis] - omega[axis])
+                rates[axis] = wanted[axis] + lead - torque[axis] / loop[axis]
             command_rates(mass * size * b[2], rates, constants.vehicles[:, k], actions[i])
             continue
 
