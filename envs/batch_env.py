@@ -21,7 +21,7 @@ from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
-from sb3_quad.envs.simulation.settings import FlightSettings, Noise
+from sb3_quad.envs.simulation.settings import Action, FlightSettings, Noise
 from sb3_quad.envs.simulation.state import QUATERNION, TARGET, QuadcopterState, make_wrench
 from sb3_quad.envs.simulation.tasks import TaskSpec
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
@@ -47,6 +47,7 @@ class FlightKeywords(TypedDict, total=False):
     task_kwargs: StrMapping | None
     vehicle: VehicleSource | Sequence[VehicleSource]
     rotor_layout: VehicleSource | None
+    action: Action
     noise: ArrayLike | StrMapping | Noise
     observation_mean: ArrayLike | None
     observation_std: ArrayLike | None

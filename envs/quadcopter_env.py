@@ -2,6 +2,7 @@
 
 import math
 import sys
+from functools import partial
 from typing import Annotated
 
 import gymnasium
@@ -72,6 +73,10 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | 1 | front right | -1 | 1 | 2.12 to 6.35 |
     | 2 | rear right | -1 | 1 | 2.12 to 6.35 |
     | 3 | rear left | -1 | 1 | 2.12 to 6.35 |
+
+    With `action="rates"`, action 0 commands the collective thrust, four times a rotor's, and 1 to 3
+    the body rates in roll, pitch and yaw, up to the `limits` of the vehicle's
+    :class:`~sb3_quad.envs.vehicles.rates.RateLoop`, which holds them.
 
     A command acts one control step (0.01 s) after you give it. Then the rotor speed follows it (Eq.
     4.1).
@@ -156,6 +161,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `task_kwargs` | `None` | fields of the task to override |
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a `Vehicle` |
     | `rotor_layout` | `None` | the vehicle whose axes and rotor order the agent knows |
+    | `action` | `"thrusts"` | `"rates"`: actions command collective thrust and body rates |
     | `noise` | 0.05 | relative std of the observation noise, or the fields of `Noise` |
     | `observation_mean` | `None` | mean of Eq. 3.16, (18,); `None`: zero |
     | `observation_std` | `None` | std of Eq. 3.16, (18,); `None`: the table above |
@@ -336,13 +342,11 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
         # The batch turns the rotors and scores the step; in between, PyBullet moves the body.
         batch = self.batch
-        rotors, speeds = batch.turn_rotors(array[None])
-
-        def air(step: int, state: FloatArray) -> FloatArray:
-            return batch.air_on(state, rotors[step], speeds[step : step + 2])
-
-        self._body.fly(rotors, batch.total_wrench()[:, 0], air if batch.feels_air else None)
-        self._body.read(batch.state)
+        wrench = batch.total_wrench()[:, 0]
+        for rotors, speeds in batch.turn_rotors(array[None]):
+            air = partial(batch.air_on, rotors, speeds) if batch.feels_air else None
+            self._body.fly(rotors, wrench, air)
+            self._body.read(batch.state)
         observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":
             self._draw()

@@ -122,15 +122,57 @@ class Vehicles:
         self.rotor_inertia = some(P.rotor_inertia)
         self.ground_radius = some(P.ground_effect_radius)
         self.thrust_factors = some(P.thrust_factor_0, 4)
+        # The rate loop
+        self.shares = some(P.hover_share_0, 4) / 4.0
+        self.rate_limits = some(P.rate_limit_x, 3)
+        self.rate_gains = some(P.rate_gain_x, 3)
+        self.rate_lag = some(P.rate_lag)
+        self.mix = some(P.roll_mix_0, 12).reshape(n, 3, 4)
 
     def commanded_speeds(self, actions):
         """Return the rotor speeds that actions command, (n, 4) (Eqs. 3.18 and 2.4)."""
         thrust = self.thrust_middle + self.thrust_half_range * actions.clamp(-1.0, 1.0)
+        return self.speeds_of(thrust)
+
+    def speeds_of(self, thrust):
+        """Return the rotor speeds that are commanded for thrusts, (n, 4)."""
         speeds = (thrust / self.lift).sqrt()
         most = (self.thrust_middle + self.thrust_half_range) * self.battery
         greatest = (most / self.lift).sqrt()
         excess = (speeds.amax(dim=1, keepdim=True) - greatest).clamp(min=0.0)
         return th.minimum(speeds - self.shared * excess, greatest).clamp(min=0.0)
+
+    def commanded_rates(self, actions):
+        """Return the collective thrusts and body rates that actions command, (n, 4)."""
+        actions = actions.clamp(-1.0, 1.0)
+        thrust = 4.0 * (self.thrust_middle + self.thrust_half_range * actions[:, :1])
+        return th.cat([thrust, self.rate_limits * actions[:, 1:]], dim=1)
+
+    def held_rates(self, rates, command):
+        """Return the rotor speeds with which the rate loop holds a command, (n, 4), for filtered
+        body rates (n, 3).
+        """
+        torque = self.rate_gains * (command[:, 1:] - rates)
+        torque = torque + th.linalg.cross(rates, self.inertia * rates)
+        high = self.thrust_middle + self.thrust_half_range
+        low = th.maximum(self.thrust_middle - self.thrust_half_range, 0.001 * high)
+        # Roll and pitch first: scaled until they fit, then the thrust makes room.
+        highest = (high / self.shares).amin(dim=1, keepdim=True)
+        lowest = (low / self.shares).amax(dim=1, keepdim=True)
+        tilts = (self.mix[:, :2] * torque[:, :2, None]).sum(dim=1) / self.shares
+        spread = tilts.amax(dim=1, keepdim=True) - tilts.amin(dim=1, keepdim=True)
+        tilts = tilts * (highest - lowest) / th.maximum(spread, highest - lowest)
+        total = th.maximum(command[:, :1], lowest - tilts.amin(dim=1, keepdim=True))
+        total = th.minimum(total, highest - tilts.amax(dim=1, keepdim=True))
+        thrust = self.shares * (total + tilts)
+        # Yaw takes what is left.
+        yaw = self.mix[:, 2]
+        room = th.where(yaw * torque[:, 2:] > 0.0, high - thrust, thrust - low) / yaw.abs()
+        room = room.amin(dim=1, keepdim=True).clamp(min=0.0)
+        moment = th.minimum(torque[:, 2:].abs(), room) * torque[:, 2:].sign()
+        thrust = thrust + yaw * moment
+        # But for rounding, it is within its limits.
+        return self.speeds_of(thrust + (thrust.clamp(low, high) - thrust).detach())
 
     def physics_step(self, state, wanted_speeds, wrench, wind, dt):
         """Return the state after a physics step.
@@ -315,14 +357,22 @@ def fly(batch, act, steps, substeps, start=None):
     # Commands under way, then those of this flight, (commands, n, 4)
     commands = [*th.tensor(batch.queue).transpose(1, 2)]
     delay, longest, rows = vehicles.delay, len(batch.queue), th.arange(batch.n)
+    by_rates = batch.filtered_rates.size > 0
+    commanded = vehicles.commanded_rates if by_rates else vehicles.commanded_speeds
+    filtered = th.tensor(batch.filtered_rates.T)
     states, observations, actions = [], [observer.seen], []
     for step in range(steps):
         action = act(step, observations[-1])
-        commands.append(vehicles.commanded_speeds(action))
+        commands.append(commanded(action))
         due = th.where(delay > step, step, longest + step - delay)
         wanted = th.stack(commands)[due, rows]
         wrench, wind = th.tensor(batch.total_wrench().T), th.tensor(batch.total_wind().T)
+        due_now = wanted
         for _ in range(substeps):
+            if by_rates:
+                # PT1
+                filtered = filtered + dt / (dt + vehicles.rate_lag) * (state.body_rates - filtered)
+                wanted = vehicles.held_rates(filtered, due_now)
             state = vehicles.physics_step(state, wanted, wrench, wind, dt)
         # The batch flies along for its random numbers.
         batch.step_on(action.detach().numpy(), substeps)

@@ -171,9 +171,12 @@ RANDOM = {
     "rate_damping": st.just([0, 8]),
     "rotor_inertia": st.just([0, 0.05]),
     "ground_effect_radius": st.just([20, 200]),
+    "rate_gains": st.just([0.5, 2.0]),
+    "rate_lag": st.just([0.0, 0.02]),
 }
 ESTIMATOR = {"position": 0.3, "velocity": [0, 0.5], "attitude": 20, "body_rates": 0.5}
 SEEN = {
+    "action": st.just("rates"),
     "features": st.just("px4"),
     "noise": st.sampled_from(
         [

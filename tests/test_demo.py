@@ -191,8 +191,18 @@ def vehicle_called(name):
 
 @node
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["crazyflie", "airy", "other world", "battery"])
-def test_given_actions_lead_to_where_python_flies(name, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "action"),
+    [
+        ("crazyflie", "thrusts"),
+        ("airy", "thrusts"),
+        ("other world", "thrusts"),
+        ("battery", "thrusts"),
+        ("other world", "rates"),
+        ("battery", "rates"),
+    ],
+)
+def test_given_actions_lead_to_where_python_flies(name, action, tmp_path):
     vehicle = vehicle_called(name)
     task = {"start_position": (0.0, 0.0, 5000.0), "max_distance": 1e6}
     random = (
@@ -200,12 +210,14 @@ def test_given_actions_lead_to_where_python_flies(name, tmp_path):
         if name == "other world"
         else None
     )
-    env = Env(task="recovery_and_tracking", vehicle=vehicle, task_kwargs=task, randomize=random)
+    keywords = {"vehicle": vehicle, "action": action}
+    env = Env(task="recovery_and_tracking", task_kwargs=task, randomize=random, **keywords)
     wrench = {"force": [0.2, -0.1, 0.3], "torque": [1e-4, -2e-4, 1e-4], "wind": [3.0, -2.0, 0.5]}
     env.set_wrench(wrench["force"], wrench["torque"])
     env.set_wind(wrench["wind"])
     walk = np.cumsum(0.03 * np.random.default_rng(0).standard_normal((STEPS, 4)), axis=0)
-    actions = np.clip(vehicle.hover_action + walk, -1, 1).astype(np.float32)
+    hover = vehicle.hover_action * ([1, 0, 0, 0] if action == "rates" else 1)
+    actions = np.clip(hover + walk, -1, 1).astype(np.float32)
     world = {"mass": 1.2, "motors": 0.7, "thrust": 0.9, "delay": 3} if random else None
     job = {
         "vehicle": vehicle.model_dump(mode="json"),
@@ -213,6 +225,8 @@ def test_given_actions_lead_to_where_python_flies(name, tmp_path):
         "wrench": wrench,
         "world": world,
     }
+    if action == "rates":
+        job["agent"] = {"label": "given", "kind": "network", "action": action}
     path = in_node(tmp_path, **job, steps=STEPS, actions=actions.astype(float).tolist())
     assert apart(path, fly(env, lambda _, step: actions[[step]])) <= 1e-9
 

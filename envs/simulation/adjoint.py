@@ -1,10 +1,11 @@
 """The adjoint of a control step: carry the gradient of a flight's cost from the state after the
 step to the state before it.
 
-``gradient`` arrays, float64 (MOVING, LANES), hold the derivative of the cost with respect to
-the first ``MOVING`` rows of a block's state. Each function here is the vector-Jacobian product
-(vjp) of one function of :mod:`.physics` or :mod:`.observation`: it turns the gradient with respect
-to the results into the gradient with respect to the arguments.
+``gradient`` arrays, float64 (CARRIED, LANES), hold the derivative of the cost with respect to
+the first ``MOVING`` rows of a block's state, and to the filtered body rates of its rate loops. Each
+function here is the vector-Jacobian product (vjp) of one function of :mod:`.physics`,
+:mod:`.rate_loop` or :mod:`.observation`: it turns the gradient with respect to the results into the
+gradient with respect to the arguments.
 
 The states between the physics steps of a control step are computed again: that costs less than
 keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as 1.
@@ -22,6 +23,7 @@ from sb3_quad.envs.simulation.aerodynamics import (
 )
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE, F, heading_of
 from sb3_quad.envs.simulation.physics import (
+    command_by_rates,
     fly,
     quaternion_product,
     rotation,
@@ -30,6 +32,7 @@ from sb3_quad.envs.simulation.physics import (
     to_world,
     total_thrust,
 )
+from sb3_quad.envs.simulation.rate_loop import room_for_yaw
 from sb3_quad.envs.simulation.state import X
 from sb3_quad.envs.simulation.vectors import (
     add,
@@ -47,6 +50,7 @@ from sb3_quad.envs.simulation.vectors import (
 )
 
 MOVING = X.target  # the rows of the state that a flight changes
+CARRIED = MOVING + 3  # with the filtered body rates of the rate loop
 
 
 @inlined
@@ -220,24 +224,106 @@ def accelerate_vjp(b, before, after, gradient, grad_wanted, dt, in_air):
 
 
 @inner
-def flight_vjp(b, states, gradient, grad_wanted, dt, substeps, in_air):
+def flight_vjp(b, states, gradient, grad_wanted, grad_speed, dt, substeps, in_air, by_rates):
     """Vector-Jacobian product of :func:`.physics.fly`.
 
     It takes the physics steps of a control step, the last one first.
 
     :param b: a block with the state before the control step; its flight is computed again.
-    :param states: memory for the states in between, (substeps + 1, MOVING, LANES).
-    :param grad_wanted: (4, LANES), is set to the gradient with respect to the wanted rotor speeds.
+    :param states: memory for the states in between, (substeps + 1, CARRIED, LANES).
+    :param grad_wanted: (4, LANES), is set to the gradient with respect to the wanted rotor speeds,
+        or with ``by_rates`` to the commanded thrust and body rates.
+    :param grad_speed: memory, (4, LANES).
     """
     for substep in range(substeps):
-        states[substep] = b.state[:MOVING]
-        fly(b, dt, 1, in_air)
-    states[substeps] = b.state[:MOVING]
+        states[substep, :MOVING] = b.state[:MOVING]
+        states[substep, MOVING:] = b.filtered_rates
+        fly(b, dt, 1, in_air, by_rates)
+    states[substeps, :MOVING] = b.state[:MOVING]
     grad_wanted[:] = 0.0
     for substep in range(substeps - 1, -1, -1):
         before, after = states[substep], states[substep + 1]
         move_vjp(before, after, gradient, dt)
-        accelerate_vjp(b, before, after, gradient, grad_wanted, dt, in_air)
+        if by_rates:
+            b.state[:MOVING] = before[:MOVING]
+            b.filtered_rates[:] = before[MOVING:]
+            command_by_rates(b)
+            grad_speed[:] = 0.0
+            accelerate_vjp(b, before, after, gradient, grad_speed, dt, in_air)
+            limits_vjp(b, grad_speed)
+            control_rates_vjp(b, gradient, grad_speed, grad_wanted)
+        else:
+            accelerate_vjp(b, before, after, gradient, grad_wanted, dt, in_air)
+
+
+@fast
+def control_rates_vjp(b, gradient, grad_speed, grad_command):
+    """Vector-Jacobian product of :func:`.rate_loop.control_rates`, in place.
+
+    :param b: a block after it, with the rotor speeds in ``b.command``.
+    :param grad_speed: (4, LANES), with respect to these speeds.
+    :param grad_command: (4, LANES), to which the gradient with respect to the commanded thrust and
+        body rates is added.
+    """
+    for lane in range(LANES):
+        grad = grad_speed[:, lane]
+        scale = b.tilt_scale[lane]
+        # Thrusts, and the yaw moment, which ends where the first rotor has no room left
+        grad_z = 0.0
+        room, first = 1e9, 0
+        for k in range(4):
+            grad[k] *= 0.5 * b.square_per_thrust[lane] / b.command[k, lane]
+            grad_z += b.mix[2, k, lane] * grad[k]
+            own_room = room_for_yaw(b, lane, k)
+            if own_room < room:
+                room, first = own_room, k
+        if abs(b.yaw[lane]) > room:
+            if room > 0.0:
+                # A rotor that adds thrust for the yaw has less room the more it gives.
+                sign = -1.0 if b.mix[2, first, lane] > 0.0 else 1.0
+                grad[first] += sign * b.yaw_per_thrust[first, lane] * grad_z
+            grad_z = 0.0
+
+        # The collective thrust is the commanded one, or what a limit of the rotors allows.
+        grad_total = grad_scale = grad_most = grad_least = 0.0
+        for k in range(4):
+            grad[k] *= b.mix_share[k, lane]
+            grad_total += grad[k]
+            grad_scale += grad[k] * b.tilt[k, lane]
+        most, least = b.most_tilt[lane], b.least_tilt[lane]
+        if b.total[lane] < b.rate_command[0, lane]:
+            grad_scale -= most * grad_total
+            grad_most = -scale * grad_total
+        elif b.total[lane] > b.rate_command[0, lane]:
+            grad_scale -= least * grad_total
+            grad_least = -scale * grad_total
+        else:
+            grad_command[0, lane] += grad_total
+        if scale < 1.0:
+            by_spread = grad_scale * scale / (most - least)
+            grad_most -= by_spread
+            grad_least += by_spread
+        grad_x = grad_y = 0.0
+        for k in range(4):
+            grad_tilt = scale * grad[k]
+            if b.tilt[k, lane] == most:
+                grad_tilt += grad_most
+            if b.tilt[k, lane] == least:
+                grad_tilt += grad_least
+            grad_x += b.mix[0, k, lane] * grad_tilt
+            grad_y += b.mix[1, k, lane] * grad_tilt
+
+        # The torque, by the commanded and the filtered body rates
+        grad_torque = grad_x, grad_y, grad_z
+        by_error = multiply(vector(b.rate_gain, lane), grad_torque)
+        _add(grad_command, 1, lane, by_error)
+        wx, wy, wz = vector(b.filtered_rates, lane)
+        gx, gy, gz = multiply(vector(b.gyro, lane), grad_torque)
+        gyroscopic = gy * wz + gz * wy, gx * wz + gz * wx, gx * wy + gy * wx
+        filtered = add(vector_at(gradient, MOVING, lane), subtract(gyroscopic, by_error))
+        share = b.filter_share[lane]
+        _add(gradient, X.body_rates, lane, scaled(share, filtered))
+        store(gradient[MOVING:], lane, scaled(1.0 - share, filtered))
 
 
 @inner

@@ -1,7 +1,7 @@
 """n quadcopters as arrays: the part that all environments share."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -81,6 +81,7 @@ _NO_ROWS = np.zeros(0, np.int64)
 _KEPT = (
     "state",
     "queue",
+    "filtered_rates",
     "wrench",
     "streams",
     "task_index",
@@ -154,6 +155,9 @@ class QuadcopterBatch:
         if self.randomize.delay is not None:
             delays.append(int(self.randomize.delay.high))
         self.queue = np.zeros((max(delays), 4, n))
+        # An array without columns means that actions are thrusts.
+        self.filtered_rates = np.zeros((3, n * (settings.action == "rates")))
+        self._due = np.zeros(4)
 
         # The frames that a policy sees besides the present features.
         self.observation = settings.observation
@@ -338,44 +342,52 @@ class QuadcopterBatch:
             )
         return results
 
-    def turn_rotors(self, actions: AnyArray) -> tuple[FloatArray, FloatArray]:
+    def turn_rotors(self, actions: AnyArray) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Advance the rotors of row 0 by a control step, for another simulator that moves the body.
 
-        It then writes the state, and :meth:`score` scores the step. In each physics step it adds
-        :meth:`total_wrench`, and :meth:`air_on` if ``feels_air``.
+        It writes the state after each of these parts, and :meth:`score` scores the step. In each
+        physics step it adds :meth:`total_wrench`, and :meth:`air_on` if ``feels_air``.
 
         :param actions: (n, 4), clipped to [-1, 1].
-        :return: force (N) and torque (N m) of the rotors in each physics step, body frame,
-            (substeps, 2, 3), and their speeds before these and after each, (substeps + 1, 4).
+        :return: for each part force (N) and torque (N m) of the rotors in each physics step, body
+            frame, (steps, 2, 3), and their speeds before these and after each, (steps + 1, 4).
         """
-        wrenches = np.zeros((self.substeps, 2, 3))
-        speeds = np.empty((self.substeps + 1, 4))
-        rotor_wrenches(
-            actions,
-            wrenches,
-            speeds,
-            self.state,
-            self.queue,
-            self.vehicles,
-            self.physics_step,
-            self.in_air,
-        )
-        return wrenches, speeds
+        # A rate loop feels how the body turns.
+        parts = self.substeps if self.filtered_rates.size else 1
+        for part in range(parts):
+            steps = self.substeps // parts
+            wrenches = np.zeros((steps, 2, 3))
+            speeds = np.empty((steps + 1, 4))
+            rotor_wrenches(
+                part == 0,
+                actions,
+                self._due,
+                wrenches,
+                speeds,
+                self.state,
+                self.queue,
+                self.filtered_rates,
+                self.vehicles,
+                self.physics_step,
+                self.in_air,
+            )
+            yield wrenches, speeds
 
-    def air_on(self, state: FloatArray, rotors: FloatArray, speeds: FloatArray) -> FloatArray:
+    def air_on(
+        self, rotors: FloatArray, speeds: FloatArray, step: int, state: FloatArray
+    ) -> FloatArray:
         """Return the wrench of the air in a physics step of row 0, (WRENCH_SIZE,).
 
+        :param rotors: what :meth:`turn_rotors` gives, and ``speeds``, of which ``step`` is the one.
         :param state: (STATE_SIZE, 1), before the step; its rotor speeds are not read.
-        :param rotors: force and torque of the rotors, (2, 3); ``speeds`` before and after it,
-            (2, 4).
         """
         vehicle = self.vehicles[:, :1]
-        state[ROTOR_SPEEDS, 0] = speeds[1]
+        state[ROTOR_SPEEDS, 0] = speeds[step + 1]
         wrench = air_wrenches(state, vehicle, self.total_wind()[:, :1])[:, 0]
         gained = ground_effects(state, vehicle)[0] - 1.0
-        wrench[FORCE_BODY] += gained * rotors[0]
-        wrench[TORQUE_BODY] += gained * rotors[1]
-        before, after = rotor_momenta(vehicle, speeds.T)
+        wrench[FORCE_BODY] += gained * rotors[step, 0]
+        wrench[TORQUE_BODY] += gained * rotors[step, 1]
+        before, after = rotor_momenta(vehicle, speeds[step : step + 2].T)
         wrench[W.torque_body + 2] += (before - after) / self.physics_step
         return wrench
 
@@ -520,6 +532,8 @@ class QuadcopterBatch:
         self.state[row_slices(STATE)[quantity]] = values
         if quantity == "target" and self.course.size:
             self.course[: C.begin] = values
+        if quantity == "body_rates" and self.filtered_rates.size:
+            self.filtered_rates[:] = values
 
     def set_reference(self, reference: FloatArray, rows: IntArray) -> None:
         """Set the reference of these rows, (REFERENCE_SIZE, rows)."""

@@ -33,6 +33,7 @@ from sb3_quad.envs.simulation.observation import (
     observe,
 )
 from sb3_quad.envs.simulation.physics import (
+    command_by_rates,
     command_rotors,
     fly,
     moment,
@@ -41,6 +42,11 @@ from sb3_quad.envs.simulation.physics import (
     turn_rotors,
 )
 from sb3_quad.envs.simulation.random import RECORDING, STEP, gust_words, uniforms
+from sb3_quad.envs.simulation.rate_loop import (
+    RATE_LOOP,
+    command_rates,
+    load_rate_loop,
+)
 from sb3_quad.envs.simulation.recordings import add_recording
 from sb3_quad.envs.simulation.reward import score, score_calm, succeeds
 from sb3_quad.envs.simulation.sampling import (
@@ -61,6 +67,7 @@ from sb3_quad.envs.simulation.tasks import SCORED, T
 from sb3_quad.envs.simulation.threads import DONE, LEFT, finish
 from sb3_quad.envs.simulation.tracks import follow, observe_preview
 from sb3_quad.envs.simulation.vectors import store, vector
+from sb3_quad.envs.vehicles.rates import RATE_PARAMETERS
 from sb3_quad.envs.vehicles.vehicle import PARAMETER_NAMES
 
 CHUNK = 2 * LANES  # rows that a thread takes at once
@@ -95,6 +102,11 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         # rotor speeds to be reached in this control step
         "wanted_speeds": 4,
         "thrust": 4,  # of each rotor, N
+        # With action="rates": the thrust, N, and body rates, rad/s, to be reached; the body rates
+        # behind the gyro's filter; and what load_rate_loop computes
+        "rate_command": 4,
+        "filtered_rates": 3,
+        **RATE_LOOP,
         **WRENCH,
         "wind": 3,  # velocity of the air
         **dict.fromkeys(PARAMETER_NAMES[: P.rotor_drag_x], ()),
@@ -137,11 +149,16 @@ _TOGETHER: dict[str, tuple[str, Any]] = {
     "wrench": ("force_world", WRENCH_SIZE),
     # what is always loaded of a vehicle, and its terms of aerodynamics.py
     "vehicle": (PARAMETER_NAMES[0], P.rotor_drag_x),
-    "air": ("rotor_drag_x", len(PARAMETER_NAMES) - P.rotor_drag_x),
+    "air": ("rotor_drag_x", P.rate_limit_x - P.rotor_drag_x),
     "rotor_drag": ("rotor_drag_x", 3),
     "airspeed_moment": ("airspeed_moment_roll", 2),
     "rate_damping": ("rate_damping_x", 3),
     "thrust_factor": ("thrust_factor_0", 4),
+    "rate_loop": (RATE_PARAMETERS[0], len(RATE_PARAMETERS)),
+    "rate_limit": ("rate_limit_x", 3),
+    "rate_gain": ("rate_gain_x", 3),
+    "mix": ("roll_mix_0", (3, 4)),
+    "hover_share": ("hover_share_0", 4),
     "inertia": ("ixx", 3),
     "drag": ("drag_x", 3),
     # the moment of each rotor per thrust, by axis
@@ -176,7 +193,7 @@ _SIZE = BLOCK.itemsize
 @compiled
 def step(
     control, leads, mode, actions, observations, rewards, dones,
-    state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers,
+    state, queue, filtered_rates, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers,
     gust, wind, wind_gust, wrench_record, wrench_starts, wind_record, wind_starts, chances,
     estimator_numbers, estimate, frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps,
@@ -197,7 +214,10 @@ def step(
     :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and
         ``dones`` bool (n,) are written.
     :param state: (STATE_SIZE, n), see :data:`.state.STATE`.
-    :param queue: (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s.
+    :param queue: (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s;
+        or with ``action="rates"`` the thrusts, N, and body rates, rad/s.
+    :param filtered_rates: (3, 0 or n), body rates behind the gyro's filter; without columns,
+        actions are thrusts.
     :param wrench: (WRENCH_SIZE, n), see :data:`.state.WRENCH`.
     :param vehicles: (parameters, 1 or n), as they fly; ``base_vehicles``: before randomization.
     :param distribution_numbers: :meth:`.VehicleDistribution.numbers`.
@@ -234,6 +254,7 @@ def step(
     :return: False if an action is not finite; then nothing has changed.
     """
     n = state.shape[1]
+    by_rates = filtered_rates.shape[1] > 0
     chunks = (n + CHUNK - 1) // CHUNK
     if leads:
         if mode != LOOK and not _is_finite(actions):
@@ -242,7 +263,9 @@ def step(
     blocks = new_block()
     b = blocks[0]
     b.row[:] = 0
-    load_constants(b, 0, True, scaling, vehicles, task_index, task_parameters, physics_step, in_air)
+    load_constants(
+        b, 0, True, scaling, vehicles, task_index, task_parameters, physics_step, in_air, by_rates
+    )
 
     # The rows whose observations are due at the end: those that begin an episode, or all in LOOK.
     due = np.empty(n, np.int64)
@@ -268,7 +291,7 @@ def step(
                 b.row[lane] = first + min(lane, count - 1)
             load_constants(
                 b, first, False, scaling, vehicles, task_index, task_parameters,
-                physics_step, in_air,
+                physics_step, in_air, by_rates,
             )  # fmt: skip
             if moves and tracks.shape[0] == 0:
                 load_rows(state, first, b.state)
@@ -284,8 +307,13 @@ def step(
                     b.wrench, wrench_record, wrench_starts, chances, streams, first, count
                 )
                 add_recording(b.wind, wind_record, wind_starts, chances, streams, first, count)
-                _load_commands(b, first, count, actions, queue)
-                fly(b, physics_step, substeps, in_air)
+                _load_commands(b, first, count, actions, queue, by_rates)
+                if by_rates:
+                    b.rate_command[:] = b.wanted_speeds
+                    load_rows(filtered_rates, first, b.filtered_rates)
+                fly(b, physics_step, substeps, in_air, by_rates)
+                if by_rates:
+                    save_rows(b.filtered_rates, first, count, filtered_rates)
                 save_rows(b.state[: X.target], first, count, state)
             if tracks.shape[0] > 0:
                 follow(b, np.int64(1), state, streams, course, tracks, track_numbers)
@@ -349,8 +377,8 @@ def step(
                     chances[i] = uniforms(streams, i, RECORDING)[0]
                 begin_estimate(i, streams, estimator_numbers, estimate)
                 start_episode(
-                    i, state, queue, streams, task_index, vehicles, task_parameters, task_weights,
-                    course, tracks, track_numbers,
+                    i, state, queue, filtered_rates, streams, task_index, vehicles,
+                    task_parameters, task_weights, course, tracks, track_numbers,
                 )  # fmt: skip
                 if frames.shape[1] > 0:
                     clear_frames(i, frames, integral)
@@ -383,23 +411,35 @@ BATCH_ARGUMENTS = _ARGUMENTS[_ARGUMENTS.index("state") :]
 
 
 @compiled
-def rotor_wrenches(actions, out, speeds, state, queue, vehicles, physics_step, in_air):
-    """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body
+def rotor_wrenches(
+    begins, actions, due, out, speeds, state, queue, filtered_rates, vehicles, physics_step, in_air
+):
+    """Advance delay and rotors of row 0 by physics steps, for a simulator that moves the body
     itself.
 
     Motors do not feel the body, so all physics steps of a control step can be computed before it
-    moves.
+    moves; with ``action="rates"``, one.
 
+    :param begins: whether a control step begins.
     :param actions: float32 (n, 4), clipped to [-1, 1].
-    :param out: (substeps, 2, 3): force (N) and torque (N m) of the rotors in each physics step,
-        body frame, far from the ground.
-    :param speeds: (substeps + 1, 4): rotor speeds before them, and after each.
+    :param due: (4,), the commands that are due in this control step, written when it begins.
+    :param out: (steps, 2, 3): force (N) and torque (N m) of the rotors in each physics step, body
+        frame, far from the ground.
+    :param speeds: (steps + 1, 4): rotor speeds before them, and after each.
     """
+    by_rates = filtered_rates.shape[1] > 0
     blocks = new_block()
     blocks[0].row[:] = 0
     load_rows(state, 0, blocks[0].state)
-    load_vehicles(blocks[0], vehicles, 0, physics_step, in_air)
-    _load_commands(blocks[0], 0, 1, actions, queue)
+    load_vehicles(blocks[0], vehicles, 0, physics_step, in_air, by_rates)
+    if begins:
+        _load_commands(blocks[0], 0, 1, actions, queue, by_rates)
+        due[:] = blocks[0].wanted_speeds[:, 0]
+    if by_rates:
+        load_rows(due.reshape(4, 1), 0, blocks[0].rate_command)
+        load_rows(filtered_rates, 0, blocks[0].filtered_rates)
+        command_by_rates(blocks[0])
+        filtered_rates[:, 0] = blocks[0].filtered_rates[:, 0]
     b = blocks[0]
     speeds[0] = b.rotor_speeds[:, 0]
     b.ground_effect_radius[0] = 0.0
@@ -455,7 +495,7 @@ def save_rows(source, first, count, target):
 
 
 @inlined
-def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt, in_air):
+def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt, in_air, by_rates):
     """Load what does not change during an episode: scaling, vehicles, limits and costs.
 
     :param shared: True: load what is the same for all rows, once for all blocks of a call. False:
@@ -464,7 +504,7 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt, i
     if (scaling.shape[1] == 1) == shared:
         load_scaling(b, scaling)
     if (vehicles.shape[1] == 1) == shared:
-        load_vehicles(b, vehicles, first, dt, in_air)
+        load_vehicles(b, vehicles, first, dt, in_air, by_rates)
     if (tasks.shape[0] == 1) == shared:
         # Limits and costs are the last columns of a task.
         for lane in range(LANES):
@@ -474,8 +514,11 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt, i
 
 
 @called
-def load_vehicles(b, vehicles, first, dt, in_air):
-    """Load the vehicles of a block, with the divisions of a control step precomputed."""
+def load_vehicles(b, vehicles, first, dt, in_air, by_rates):
+    """Load the vehicles of a block, with the divisions of a control step precomputed.
+
+    :param by_rates: whether to load their rate loops, too.
+    """
     load_rows(vehicles, first, b.vehicle)
     if in_air:
         load_rows(vehicles[P.rotor_drag_x :], first, b.air)
@@ -497,6 +540,9 @@ def load_vehicles(b, vehicles, first, dt, in_air):
         ixx, iyy, izz = vector(b.inertia, lane)
         store(b.gyro, lane, (izz - iyy, ixx - izz, iyy - ixx))
         store(b.rates_gain, lane, (dt / ixx, dt / iyy, dt / izz))
+    if by_rates:
+        load_rows(vehicles[P.rate_limit_x :], first, b.rate_loop)
+        load_rate_loop(b, dt)
 
 
 @called
@@ -511,7 +557,7 @@ def load_scaling(b, scaling):
 
 
 @inlined
-def _load_commands(b, first, count, actions, queue):
+def _load_commands(b, first, count, actions, queue, by_rates):
     """Put the commands of a block into the queue, and move those that are due to
     ``b.wanted_speeds``.
 
@@ -524,7 +570,10 @@ def _load_commands(b, first, count, actions, queue):
     for lane in range(LANES):
         for k in range(4):
             command[k, lane] = actions[b.row[lane], k]
-    command_rotors(b)
+    if by_rates:
+        command_rates(b)
+    else:
+        command_rotors(b)
     if delay == 0:
         for k in range(4):
             for lane in range(LANES):

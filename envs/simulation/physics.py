@@ -24,6 +24,7 @@ from sb3_quad.envs.simulation.aerodynamics import (
     scale_thrusts,
     speed_sum,
 )
+from sb3_quad.envs.simulation.rate_loop import control_rates
 from sb3_quad.envs.simulation.vectors import (
     add,
     dot,
@@ -98,6 +99,16 @@ def limit_speeds(b, speeds, lane):
     excess = max(max(s0, s1, s2, s3) - greatest, 0.0) * b.shared_saturation[lane]
     for k in range(4):
         speeds[k, lane] = max(min(speeds[k, lane] - excess, greatest), 0.0)
+
+
+@fast
+def command_by_rates(b):
+    """Let the rate loop command the rotors for a physics step."""
+    control_rates(b)
+    for lane in range(LANES):
+        for k in range(4):
+            b.wanted_speeds[k, lane] = b.command[k, lane]
+        limit_speeds(b, b.wanted_speeds, lane)
 
 
 @inlined
@@ -281,9 +292,14 @@ def move(b, dt):
 
 
 @inlined
-def fly(b, physics_step, substeps, in_air):
-    """Compute the physics steps of one control step of a loaded block, in place."""
+def fly(b, physics_step, substeps, in_air, by_rates):
+    """Compute the physics steps of one control step of a loaded block, in place.
+
+    :param by_rates: whether the rate loop commands the rotors.
+    """
     for _ in range(substeps):
+        if by_rates:
+            command_by_rates(b)
         if in_air:
             accelerate_in_air(b, physics_step)
         else:

@@ -28,6 +28,7 @@ KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 # Purposes: the last word of the counter. numba would compile a function for each int.
 OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST = np.arange(5, dtype=np.uint32)
 DISTRIBUTION, WIND, REFERENCE, AIR, ESTIMATOR, RECORDING = np.arange(5, 11, dtype=np.uint32)
+RATE_LOOP = np.uint32(11)
 ROUNDS = 10
 BLOCKS = 8  # as many as any purpose takes
 _MASK = uint64(0xFFFFFFFF)

@@ -23,6 +23,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray, StrMapping
 from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.envs.simulation.state import first_rows, row_slices
+from sb3_quad.envs.vehicles.rates import LARGEST_LAG
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 # The kinds of range; a FIXED one samples nothing. Its numbers, like all that are not given, are 0.
@@ -88,6 +89,7 @@ Magnitude = Range[Annotated[float, Field(ge=0, le=1e4)]]
 Offset = Range[Annotated[float, Field(ge=-1, le=1)]]  # m
 Battery = Range[Annotated[float, Field(ge=0.1, le=1)]]
 Delay = Range[Annotated[float, Field(ge=0, le=MAX_DELAY, multiple_of=1)]]
+RateLag = Range[Annotated[float, Field(ge=0, le=LARGEST_LAG)]]
 
 
 Turning = Range[Annotated[float, Field(ge=-1e4, le=1e4)]]
@@ -261,6 +263,10 @@ class Randomization(Frozen):
     """velocity of the air, m/s, horizontal unless it has a direction; acts on vehicles with drag"""
     wind_gusts: Gusts | None = None
     """a random velocity added to the wind, such as {std: [0, 1]}, m/s"""
+    rate_gains: Factor | None = None
+    """factors of the rate loop's gains, one of roll and pitch and one of yaw, such as [0.5, 2]"""
+    rate_lag: RateLag | None = None
+    """added lag of the rate loop, s, such as [0, 0.02]"""
 
     @model_validator(mode="after")
     def _check_wind(self) -> "Randomization":

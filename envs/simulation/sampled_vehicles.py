@@ -55,6 +55,7 @@ def sample_vehicles(
                 p.thrust_middle + p.thrust_half_range,
             ),
             "collision_radius": p.collision_radius,
+            "rates": {"lag": p.rate_lag},
         }
         sampled.append(base.model_copy(update=changes))
     return sampled

@@ -12,6 +12,7 @@ from sb3_quad.envs.simulation.random import (
     EPISODE,
     EPISODE_START,
     GUST,
+    RATE_LOOP,
     STEP,
     VEHICLE,
     WIND,
@@ -41,6 +42,10 @@ _FACTORS = (
     (P.thrust_middle, R.thrust, 6),
     (P.thrust_half_range, R.thrust, 6),
     (P.battery, R.battery, 14),
+    # The firmware's moments, too, are as far off as its thrusts.
+    (P.rate_gain_x, R.thrust, 6),
+    (P.rate_gain_y, R.thrust, 6),
+    (P.rate_gain_z, R.thrust, 6),
 )
 _SEVEN_BITS = np.uint64(127)
 # Mean and deviation of the sum of three whole numbers, uniform from 0 to 127
@@ -50,14 +55,16 @@ _SUM_STD = math.sqrt(3 * (128**2 - 1) / 12)
 
 @called
 def start_episode(
-    i, state, queue, streams, task_index, vehicles, tasks, weights, course, tracks, track_numbers
-):
+    i, state, queue, filtered_rates, streams, task_index, vehicles, tasks, weights, course, tracks,
+    track_numbers,
+):  # fmt: skip
     """Begin the next episode of row i's stream, in place: sample task, state and target.
 
     Targets are never below ground.
 
     :param state: float64 (STATE_SIZE, n), see :mod:`.state`.
-    :param queue: float64 (delay, 4, n), commanded rotor speeds on their way; set to hover.
+    :param queue: float64 (delay, 4, n), commands on their way; set to hover.
+    :param filtered_rates: float64 (3, 0 or n), see :func:`.kernel.step`.
     :param streams: uint32 (4, n), see :mod:`.random`.
     :param task_index: int64 (n,), the sampled row of the table of tasks.
     :param vehicles: float64 (len(PARAMETER_NAMES), n), or (len(PARAMETER_NAMES), 1) for all rows.
@@ -116,6 +123,11 @@ def start_episode(
         s[X.rotor_speeds + rotor] = speed
         for late in range(queue.shape[0]):
             queue[late, rotor, i] = speed
+    if filtered_rates.shape[1] > 0:
+        filtered_rates[:, i] = s[X.body_rates : X.rotor_speeds]
+        # Hover is a thrust without body rates.
+        queue[:, 0, i] = 4.0 * vehicle[P.hover_thrust]
+        queue[:, 1:, i] = 0.0
 
 
 @inlined
@@ -240,6 +252,12 @@ def _randomize_vehicle(i, streams, table, vehicles):
     for rotor in range(4):
         v[P.roll_arm_0 + rotor] = arm * v[P.roll_arm_0 + rotor] - y
         v[P.pitch_arm_0 + rotor] = arm * v[P.pitch_arm_0 + rotor] + x
+    u = uniforms(streams, i, RATE_LOOP)
+    tilting = between(table, R.rate_gains, u[0], 1.0)
+    v[P.rate_gain_x] *= tilting
+    v[P.rate_gain_y] *= tilting
+    v[P.rate_gain_z] *= between(table, R.rate_gains, u[1], 1.0)
+    v[P.rate_lag] += between(table, R.rate_lag, u[2], 0.0)
     if table[R.delay + 2] != FIXED:
         delay = math.floor(between(table, R.delay, u[10], 0.0))
         v[P.delay] = min(delay, table[R.delay + 1] - 1.0)

@@ -5,7 +5,7 @@ Training writes them into every zip.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -34,6 +34,7 @@ Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
 # The attribute of a model, and so the key of the JSON in its zip
 KEY = FLIGHT_SETTINGS
 Level = Annotated[float, Field(ge=0, le=100)]
+Action = Literal["thrusts", "rates"]
 
 
 _OBSERVATION = set(ObservationSettings.model_fields)
@@ -74,6 +75,10 @@ class FlightSettings(ObservationSettings):
     """name, path or Vehicle; or a list of them with the same time steps"""
     rotor_layout: str | Path | Vehicle | None = None
     """name, path or Vehicle to whose axes and rotor order the vehicle is turned"""
+    action: Action = "thrusts"
+    """what actions command: the rotors' thrusts; or collective thrust and body rates, which the
+    vehicle's RateLoop holds
+    """
     noise: Annotated[NoiseLevel, AsList] = 0.05
     """relative standard deviation of the noise, one for all rows or one each; or fields of Noise"""
     observation_mean: Scaling = None
@@ -152,9 +157,9 @@ class FlightSettings(ObservationSettings):
     @property
     def observed(self) -> dict[str, Any]:
         """The settings that an agent needs wherever it flies: scaling and frames of its
-        observations, and the order of its rotors.
+        observations, what its actions command, and the order of its rotors.
         """
-        needed = _OBSERVATION | {"rotor_layout", "observation_mean", "observation_std"}
+        needed = _OBSERVATION | {"action", "rotor_layout", "observation_mean", "observation_std"}
         return self.model_dump(mode="json", include=needed)
 
     @property

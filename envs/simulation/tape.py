@@ -11,6 +11,7 @@ from sb3_quad.base.compiled import LANES, atomic_add, compiled, inner
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.envs.simulation.adjoint import (
+    CARRIED,
     DIFFERENTIATED,
     MOVING,
     features_vjp,
@@ -45,6 +46,7 @@ from sb3_quad.envs.simulation.random import (
     random_words,
     standard_normals,
 )
+from sb3_quad.envs.simulation.rate_loop import rate_command
 from sb3_quad.envs.simulation.state import STATE_SIZE, P, X
 from sb3_quad.envs.simulation.threads import DONE, LEFT, finish, share_out
 
@@ -98,6 +100,7 @@ class FlightTape:
         self._estimates = np.zeros((n_steps, *batch.estimate.shape))
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
         self._winds = np.zeros((n_steps, *batch.wind.shape))
+        self._filtered = np.zeros((n_steps, *batch.filtered_rates.shape))
 
     def reset(self, continue_flights: bool = False) -> Float32Array:
         """Begin a recording; return the observations, float32 (n, size).
@@ -138,6 +141,7 @@ class FlightTape:
         self._estimates[t] = batch.estimate
         self._wrenches[t] = batch.total_wrench()
         self._winds[t] = batch.total_wind()
+        self._filtered[t] = batch.filtered_rates
         observations, self.rewards[t], _ = batch.step_on(actions, self.substeps)
         self._at = t + 1
         self.states[self._at] = batch.state
@@ -174,6 +178,7 @@ class FlightTape:
         self.grad_start = np.zeros((MOVING, batch.n))
         self._grad_frames = np.zeros((batch.ages[-1] + 1, batch.n, batch.observation.frame_size))
         self._grad_integral = np.zeros_like(batch.integral)
+        self._grad_filtered = np.zeros_like(batch.filtered_rates)
         return value
 
     def backward(self, step: int, grad_observation: Float32Array) -> FloatArray:
@@ -196,6 +201,7 @@ class FlightTape:
             self._estimates,
             self._wrenches[step],
             self._winds[step],
+            self._filtered[step],
             batch.vehicles,
             batch.scaling,
             batch.moves,
@@ -206,6 +212,7 @@ class FlightTape:
             grad_observation,
             self._grad_frames,
             self._grad_integral,
+            self._grad_filtered,
             self.grad_start,
             self._grad_actions,
             self.physics_step,
@@ -219,8 +226,9 @@ class FlightTape:
 @compiled
 def step_vjp(
     control, leads, step, lengths, states, actions, queue, streams, estimates, wrench, wind,
-    vehicles, scaling, moves, for_px4, ages, integrals, integral_numbers, grad_observation,
-    grad_frames, grad_integral, gradient, grad_actions, physics_step, substeps, in_air,
+    filtered_rates, vehicles, scaling, moves, for_px4, ages, integrals, integral_numbers,
+    grad_observation, grad_frames, grad_integral, grad_filtered, gradient, grad_actions,
+    physics_step, substeps, in_air,
 ):  # fmt: skip
     """Vector-Jacobian product of a control step and the observation after it, see FlightTape.
 
@@ -228,7 +236,8 @@ def step_vjp(
 
     :param grad_frames: (depth, n, frame size), with respect to the frames of the latest control
         steps, step s in slot s % depth.
-    :param grad_integral: (0 or 3, n), with respect to the position integral.
+    :param grad_integral: (0 or 3, n), with respect to the position integral; ``grad_filtered``
+        (3, 0 or n), to the filtered body rates.
     :param gradient: (MOVING, n), with respect to the state after the step; becomes that with
         respect to the state before.
     :param grad_actions: (steps, n, 4), is added to where an earlier action acts after a delay or is
@@ -239,10 +248,12 @@ def step_vjp(
     if leads:
         control[LEFT] = chunks
     blocks = new_block()
-    substep_states = np.empty((substeps + 1, MOVING, LANES))
-    own = np.empty((MOVING, LANES))
+    by_rates = filtered_rates.shape[1] > 0
+    substep_states = np.empty((substeps + 1, CARRIED, LANES))
+    own = np.empty((CARRIED, LANES))
     grad_feature = np.empty((OBSERVATION_SIZE, LANES))
     grad_wanted = np.empty((4, LANES))
+    grad_speed = np.empty((4, LANES))
     taken = 0
     while True:
         left = atomic_add(control, LEFT, -1)
@@ -255,8 +266,11 @@ def step_vjp(
             count = min(LANES, n - first)
             for lane in range(LANES):
                 b.row[lane] = first + min(lane, count - 1)
-            load_vehicles(b, vehicles, first, physics_step, in_air)
-            load_rows(gradient, first, own)
+            load_vehicles(b, vehicles, first, physics_step, in_air, by_rates)
+            load_rows(gradient, first, own[:MOVING])
+            if by_rates:
+                load_rows(grad_filtered, first, own[MOVING:])
+                load_rows(filtered_rates, first, b.filtered_rates)
             if step + 1 < len(actions):
                 load_scaling(b, scaling)
                 load_rows(states[step + 1], first, b.state)
@@ -290,23 +304,36 @@ def step_vjp(
                 i = b.row[lane]
                 acted = step - np.int64(b.delay[lane])
                 for k in range(4):
-                    if acted >= 0:
-                        b.command[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
-                    else:
+                    if acted < 0:
                         b.command[k, lane] = queue[step, k, i]
+                    elif by_rates:
+                        b.command[k, lane] = rate_command(b, lane, k, actions[acted, i, k])
+                    else:
+                        b.command[k, lane] = rotor_speed(b, lane, actions[acted, i, k])
                     b.wanted_speeds[k, lane] = b.command[k, lane]
-                limit_speeds(b, b.wanted_speeds, lane)
+                if by_rates:
+                    b.rate_command[:, lane] = b.command[:, lane]
+                else:
+                    limit_speeds(b, b.wanted_speeds, lane)
                 if step >= lengths[i]:
                     own[:, lane] = 0.0
-            flight_vjp(b, substep_states, own, grad_wanted, physics_step, substeps, in_air)
-            limits_vjp(b, grad_wanted)
-            save_rows(own, first, count, gradient)
+            flight_vjp(
+                b, substep_states, own, grad_wanted, grad_speed, physics_step, substeps, in_air,
+                by_rates,
+            )  # fmt: skip
+            if by_rates:
+                save_rows(own[MOVING:], first, count, grad_filtered)
+            else:
+                limits_vjp(b, grad_wanted)
+            save_rows(own[:MOVING], first, count, gradient)
             for lane in range(count):
                 i = first + lane
                 acted = step - np.int64(b.delay[lane])
                 for k in range(4):
                     if acted >= 0 and abs(actions[acted, i, k]) < float32(1.0):
                         slope = b.square_half_range[lane] / (2.0 * b.command[k, lane])
+                        if by_rates:
+                            slope = b.command_range[k, lane]
                         grad_actions[acted, i, k] += slope * grad_wanted[k, lane]
     atomic_add(control, DONE, taken)
     if leads:

@@ -30,10 +30,13 @@ from sb3_quad.envs.simulation.randomization import (
     numbers_of,
 )
 from sb3_quad.envs.simulation.state import P, first_rows
+from sb3_quad.envs.vehicles.rates import derived_gain, derived_limit
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.envs.vehicles.distributions")
 EDGE = 1e-3
+_derived_gain = called(derived_gain)
+_derived_limit = called(derived_limit)
 Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
@@ -193,6 +196,9 @@ def sample_from_distribution(i, streams, table, vehicles):
     for rotor in range(4):
         v[P.roll_arm_0 + rotor] *= size
         v[P.pitch_arm_0 + rotor] *= size
+        v[P.roll_mix_0 + rotor] /= size
+        v[P.pitch_mix_0 + rotor] /= size
+        v[P.yaw_mix_0 + rotor] *= abs(v[P.yaw_arm_0 + rotor]) / ratio
         v[P.yaw_arm_0 + rotor] = math.copysign(ratio, v[P.yaw_arm_0 + rotor])
 
     # Inertia: the ratios of its axes, then its size by Ixx. Moments of the air grow with it.
@@ -209,6 +215,17 @@ def sample_from_distribution(i, streams, table, vehicles):
         if axis < 2:
             v[P.airspeed_moment_roll + axis] *= growth
     v[P.rotor_inertia] *= v[P.izz] / before[2]
+
+    # The rate loop has default limits and gains.
+    gain = _derived_gain(v[P.rate_lag], v[P.motor_gain_up], v[P.motor_gain_down])
+    for axis in range(3):
+        arms = 0.0
+        for rotor in range(4):
+            arms += abs(v[P.roll_arm_0 + 4 * axis + rotor])
+        inertia = v[P.ixx + axis]
+        v[P.rate_gain_x + axis] = gain * inertia
+        turn = arms * v[P.thrust_half_range] / inertia
+        v[P.rate_limit_x + axis] = _derived_limit(turn, gain)
 
 
 @called

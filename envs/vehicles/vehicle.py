@@ -14,6 +14,12 @@ from sb3_quad.base.validate import LARGEST, Frozen, Quantity, check, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.vehicles.gains import GeometricGains
 from sb3_quad.envs.vehicles.layout import NamedLayout, Turn, find_turn
+from sb3_quad.envs.vehicles.rates import (
+    RATE_PARAMETERS,
+    RateLoop,
+    derived_gain,
+    derived_limit,
+)
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.envs.vehicles")
 # Physics steps in a control step.
@@ -66,7 +72,7 @@ PARAMETER_NAMES = (
     "hover_share_1",
     "hover_share_2",
     "hover_share_3",
-    # Those of simulation/aerodynamics.py come last.
+    # Those of simulation/aerodynamics.py, which are loaded where a vehicle has some
     "rotor_drag_x",
     "rotor_drag_y",
     "rotor_drag_z",
@@ -82,6 +88,7 @@ PARAMETER_NAMES = (
     "thrust_factor_1",
     "thrust_factor_2",
     "thrust_factor_3",
+    *RATE_PARAMETERS,
 )
 # A name is a part of file names, and of what reports and exported files say.
 # Of blanks, it may hold the space alone, since others end a line.
@@ -183,6 +190,8 @@ class Vehicle(Frozen):
     """control steps from a command to its effect; or give latency, s, a multiple of control_step"""
     collision_radius: Quantity
     """radius of the collision sphere at the centre of mass, m"""
+    rates: RateLoop = RateLoop()
+    """the rate loop of action: rates, fields of RateLoop; or betaflight or px4"""
     geometric_gains: GeometricGains | None = Field(default=None, repr=False)
     """gains of the geometric expert, found for this vehicle; without them it derives gains"""
     time_optimal: dict[Quantity, Quantity] | None = Field(default=None, repr=False)
@@ -346,9 +355,13 @@ class Vehicle(Frozen):
         changes["rotor_positions"] = positions.tolist()
         changes["rotor_directions"] = other.rotor_directions
         changes["thrust_factors"] = [self.thrust_factors[k] for k in turn.order]
+        rates = self.rates.model_dump(exclude_none=True)
         # The moments by airspeed turn as the diagonal of a matrix does, like the others.
-        for name in ("inertia", "drag", "rotor_drag", "rate_damping", "airspeed_moment"):
-            values = np.array(getattr(self, name))
+        names = ("inertia", "drag", "rotor_drag", "rate_damping", "airspeed_moment")
+        of_axes = {name: getattr(self, name) for name in names} | rates
+        del of_axes["lag"]
+        for name, given in of_axes.items():
+            values = np.array(given)
             turned = turn.axes @ np.diag([*values, 0.0][:3]) @ turn.axes.T
             if abs(turned[0, 1]) > 0.02 * np.abs(values[:2]).min():
                 raise ConfigError(
@@ -356,7 +369,9 @@ class Vehicle(Frozen):
                     f"{math.degrees(turn.angle):.0f}° to the layout of {other.name}, "
                     f"but its {name} differs in x and y"
                 )
-            changes[name] = turned.diagonal()[: len(values)].tolist()
+            where = rates if name in rates else changes
+            where[name] = turned.diagonal()[: len(values)].tolist()
+        changes["rates"] = rates
         return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
@@ -440,6 +455,16 @@ class Vehicle(Frozen):
         return np.asarray(np.abs(arms).sum(axis=1) * half + np.abs(arms.sum(axis=1)) * middle)
 
     @property
+    def rate_limits_and_gains(self) -> tuple[list[float], list[float]]:
+        """Greatest commanded body rates, rad/s, and gains, 1/s, of the rate loop, by axis."""
+        lag, half = self.rates.lag, self._middle_and_half[1]
+        gain = derived_gain(lag, self.motor_gain_up, self.motor_gain_down)
+        gains = self.rates.gains or (gain, gain, gain)
+        turns = np.abs(self.mixer[1:]).sum(axis=1) * half / self.inertia
+        derived = [derived_limit(*axis) for axis in zip(turns.tolist(), gains, strict=True)]
+        return [*(self.rates.limits or derived)], [*gains]
+
+    @property
     def gyration_ratios(self) -> FloatArray:
         """Radii of gyration √(I/m), divided by the arm length, (3,).
 
@@ -513,6 +538,7 @@ class Vehicle(Frozen):
         """Return the numbers that the compiled kernel needs, in the order of ``PARAMETER_NAMES``,
         (names,).
         """
+        limits, gains = self.rate_limits_and_gains
         return np.array(
             [
                 self.mass,
@@ -538,6 +564,10 @@ class Vehicle(Frozen):
                 self.rotor_inertia,
                 self.ground_effect_radius,
                 *self.thrust_factors,
+                *limits,
+                *np.multiply(gains, self.inertia),
+                self.rates.lag,
+                *self.mixer_inverse[:, 1:].T.flat,
             ]
         )
 

@@ -125,7 +125,8 @@ def _observed(settings: FlightSettings) -> StrDict:
         "observation_mean": settings.observation_mean or DEFAULT_MEAN.tolist(),
         "observation_std": settings.observation_std or DEFAULT_STD.tolist(),
     }
-    del observed["rotor_layout"]
+    # An agent of other actions is refused elsewhere.
+    del observed["rotor_layout"], observed["action"]
     return observed
 
 

@@ -27,6 +27,7 @@ def resolve_expert(
     vehicle: VehicleSource | Sequence[Any] = "itm",
     kind: str = "expert",
     layout: VehicleSource | None = None,
+    action: str = "thrusts",
 ) -> Any:
     """Return the expert that ``spec`` names.
 
@@ -37,6 +38,7 @@ def resolve_expert(
     :param vehicle: the vehicle that a named expert is designed for; of several, the first.
     :param kind: the word for it in messages.
     :param layout: ``rotor_layout`` of the environments that it flies in.
+    :param action: what the actions of an expert of ``EXPERTS`` command, as there.
     :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be
         imported.
     :raises ExpertError: a factory that fails.
@@ -53,8 +55,9 @@ def resolve_expert(
             refuse_settings(path)
         return model
     factory = import_factory(text, kind)
+    keywords = {"action": action} if text in EXPERTS else {}
     with raised_as(ExpertError, f"{kind} {text}: the factory failed"):
-        return factory(first_vehicle(vehicle, layout))
+        return factory(first_vehicle(vehicle, layout), **keywords)
 
 
 def import_factory(text: str, kind: str) -> Any:

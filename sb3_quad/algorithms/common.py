@@ -23,7 +23,12 @@ from sb3_quad.algorithms.chain import (
     share_statistics,
     statistics_of,
 )
-from sb3_quad.algorithms.labelling import ExpertLike, Labeller, labeller_for
+from sb3_quad.algorithms.labelling import (
+    ExpertLike,
+    Labeller,
+    labeller_for,
+    refuse_other_action,
+)
 from sb3_quad.algorithms.networks import Terms, network_of, one_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
@@ -352,6 +357,7 @@ def copy_policy(teacher: Any, model: BaseAlgorithm, name: str = "") -> None:
     name = name or f"the policy of {type(teacher).__name__}"
     record = getattr(model, FLIGHT_SETTINGS, {})
     if record and hasattr(teacher, FLIGHT_SETTINGS):
+        refuse_other_action(name, teacher, record.get("action", "thrusts"))
         plugin("observation")(name, teacher, record)
     here = chain_of(model) or []
     learnt = chain_of(teacher)

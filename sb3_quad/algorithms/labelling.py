@@ -88,15 +88,19 @@ class Labeller:
         self.env = env
         vehicles = env.get_attr("vehicle") if env.has_attr("vehicle") else ["itm"]
         source: Any = expert
+        settings = env.get_attr(FLIGHT_SETTINGS, [0])[0] if env.has_attr(FLIGHT_SETTINGS) else None
+        action = getattr(settings, "action", "thrusts")
         if isinstance(expert, (str, Path)):
-            source = plugin("expert")(expert, vehicles[0])
+            source = plugin("expert")(expert, vehicles[0], action=action)
+        if settings is not None:
+            refuse_other_action(f"expert {type(source).__name__}", source, action)
         warn_of_vehicle(source, vehicles)
         self._true_state = true_state_of(env) if hasattr(source, "actions") else None
 
         # The source may act within other limits: a model within those that it has learnt with, an
         # expert on the true state within those of the quadcopter below any wrappers.
         own: Any = getattr(source, "action_space", None)
-        if self._true_state is not None and env.has_attr(FLIGHT_SETTINGS):
+        if self._true_state is not None and settings is not None:
             own = spaces.Box(-1.0, 1.0, env.action_space.shape)
         if not isinstance(own, spaces.Box) or own.shape != env.action_space.shape:
             own = env.action_space
@@ -115,8 +119,8 @@ class Labeller:
         if check:
             self._refuse_wrappers(describe(env))
         # Only a model of this package says what it has learnt to observe.
-        if env.has_attr(FLIGHT_SETTINGS) and hasattr(source, FLIGHT_SETTINGS):
-            plugin("observation")(name, source, env.get_attr(FLIGHT_SETTINGS, [0])[0])
+        if settings is not None and hasattr(source, FLIGHT_SETTINGS):
+            plugin("observation")(name, source, settings)
         self._raw: Any = None if self._true_state else unwrap_vec_normalize(env)
         self._turned = isinstance(env, VecTransposeImage) and not self._is_model
 
@@ -282,6 +286,24 @@ def refuse_wide_actions(space: spaces.Space[Any]) -> None:
         raise ConfigError(
             f"action space {space}: cloning needs actions within [-1, 1]; wrap the environment in"
             " gymnasium.wrappers.RescaleAction(env, -1, 1)"
+        )
+
+
+def refuse_other_action(name: str, source: Any, action: str) -> None:
+    """Refuse a controller whose actions command something else. A function does not say what.
+
+    :param name: what the message calls it.
+    :param action: what actions command here.
+    :raises ConfigError: they command something else.
+    """
+    known = getattr(source, "action", "thrusts" if hasattr(source, "actions") else action)
+    record = getattr(source, FLIGHT_SETTINGS, None)
+    if isinstance(record, dict):
+        known = record.get("action", "thrusts")
+    if isinstance(known, str) and known != action:
+        raise ConfigError(
+            f"{name}: commands {known}, and here actions are {action}; give action: {known}, or a"
+            f" controller of {action}"
         )
 
 

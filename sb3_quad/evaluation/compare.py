@@ -131,7 +131,9 @@ def _load(
     own = {}
     pilots = {}
     for label, controller in controllers.items():
-        pilot = resolve_expert(controller, env_kwargs.get("vehicle", "itm"), "controller")
+        action = env_kwargs.get("action", "thrusts")
+        vehicle = env_kwargs.get("vehicle", "itm")
+        pilot = resolve_expert(controller, vehicle, "controller", action=action)
         known = known_settings(controller, pilot)
         if known is None:
             continue
@@ -145,7 +147,9 @@ def _load(
     for label, controller in controllers.items():
         how = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
         if label not in pilots:
-            pilots[label] = resolve_expert(controller, how.vehicle, "controller", how.rotor_layout)
+            pilots[label] = resolve_expert(
+                controller, how.vehicle, "controller", how.rotor_layout, how.action
+            )
         settings[label] = how
     return settings, pilots
 

@@ -201,7 +201,8 @@ def _fly(spec: ControllerSpec, scenario: Scenario) -> tuple[Entry, Arrays]:
     :return: its entry, and the arrays of its flights (``flightlog.py``).
     """
     flown = _flown_by(spec, scenario)
-    controller = resolve_expert(spec.spec, flown.nominal_vehicle(), "controller")
+    action = flown.settings.action
+    controller = resolve_expert(spec.spec, flown.nominal_vehicle(), "controller", action=action)
     # A model from a factory says only now what it observes.
     known = known_settings(spec.spec, controller)
     recorder = Recorder(RECORDED)

@@ -21,7 +21,7 @@ from sb3_quad.agents.agent_settings import (
 )
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.controller import Controller
-from sb3_quad.algorithms.labelling import warn_of_vehicle
+from sb3_quad.algorithms.labelling import refuse_other_action, warn_of_vehicle
 from sb3_quad.algorithms.networks import one_thread_by_default
 from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown
 from sb3_quad.base.files import write_arrays
@@ -170,7 +170,8 @@ def fly(
     name = str(controller)
     if not isinstance(controller, (str, Path)):
         name = type(controller).__name__
-    controller = resolve_expert(controller, flown, "controller", layout)
+    action = environment.get("action", "thrusts")
+    controller = resolve_expert(controller, flown, "controller", layout, action)
     own = settings_of_model(controller)
     if own is not None:
         if vehicle is None:
@@ -178,6 +179,7 @@ def fly(
         # A model flies with its rotors where it knows them.
         if layout is None:
             environment["rotor_layout"] = own.layout
+        environment.setdefault("action", own.action)
     environment.setdefault("max_episode_steps", MAX_EPISODE_STEPS)
     settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
     warn_of_differences(name, controller, settings)
@@ -237,6 +239,7 @@ def fly_settings(
         raise ConfigError(f"max_episode_steps {limit}: must be one number, for all flights")
     plan = plan or Plan()
     course = Course(plan.waypoints, plan.radius)
+    refuse_other_action(type(controller).__name__, controller, settings.action)
     seen: list[Float32Array] = []
     done: list[Float32Array] = []
     with closing(FLEETS[backend](seeds, settings)) as fleet, one_thread_by_default():

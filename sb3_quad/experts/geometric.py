@@ -17,7 +17,7 @@ from sb3_quad.envs.vehicles.gains import GeometricGains
 from sb3_quad.envs.vehicles.vehicle import VehicleSource, load_vehicle
 from sb3_quad.experts.geometric_gains import TrueConstants, constants_of, derived_gains
 from sb3_quad.experts.geometric_law import fly_geometric
-from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.experts.protocol import Action, Actions, Expert
 
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 # Half of the drag from the vehicle's own motion is not compensated, because it damps.
@@ -45,6 +45,8 @@ class GeometricExpert(Expert):
     :param privileged: whether it uses each vehicle's true parameters and compensates the external
         wrench, if the state has them (``state.vehicles``, ``state.wrench``). Its gains then scale
         with the vehicle as :func:`derived_gains` do.
+    :param action: what its actions command, see :class:`Expert`. As ``rates`` they are the thrust
+        along the body's z axis, and the rates at which it wants to turn.
     """
 
     def __init__(
@@ -52,8 +54,9 @@ class GeometricExpert(Expert):
         vehicle: VehicleSource = "itm",
         gains: GeometricGains | None = None,
         privileged: bool = False,
+        action: Action = "thrusts",
     ) -> None:
-        super().__init__(vehicle)
+        super().__init__(vehicle, action)
         self.gains = gains or self.vehicle.geometric_gains or derived_gains(self.vehicle)
         # The law's constants for the vehicle as designed, and if they are known, for the true ones.
         self._nominal = constants_of(
@@ -74,7 +77,7 @@ class GeometricExpert(Expert):
             if state.wrench is not None:
                 wrench = self._to_compensate(state, state.wrench)
         actions = np.empty((state.n, 4), dtype=np.float32)
-        fly_geometric(state.array, constants, wrench, actions)
+        fly_geometric(state.array, constants, wrench, self.action == "rates", actions)
         return actions
 
     @staticmethod
@@ -89,17 +92,22 @@ class GeometricExpert(Expert):
         return wrench
 
 
-def privileged_geometric(vehicle: VehicleSource = "itm") -> GeometricExpert:
+def privileged_geometric(
+    vehicle: VehicleSource = "itm", action: Action = "thrusts"
+) -> GeometricExpert:
     """Return a :class:`GeometricExpert` that knows the true vehicle and wrench."""
-    return GeometricExpert(vehicle, privileged=True)
+    return GeometricExpert(vehicle, privileged=True, action=action)
 
 
-def privileged_derived(vehicle: VehicleSource = "itm") -> GeometricExpert:
+def privileged_derived(
+    vehicle: VehicleSource = "itm", action: Action = "thrusts"
+) -> GeometricExpert:
     """Return a privileged expert with the derived gains of each vehicle.
 
     It is meant for distributions of vehicles unlike this one. If commands act late, its outer loop
     is slower and its inner one faster: agents that learn from it can cope with slow motors.
     """
-    expert = GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), privileged=True)
+    gains = derived_gains(load_vehicle(vehicle))
+    expert = GeometricExpert(vehicle, gains, privileged=True, action=action)
     expert._true = TrueConstants(expert.vehicle, expert.gains, is_gentle=True)
     return expert

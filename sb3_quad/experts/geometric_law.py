@@ -20,17 +20,20 @@ from sb3_quad.envs.simulation.vectors import (
     vector_at,
 )
 from sb3_quad.experts.geometric_gains import G
+from sb3_quad.experts.protocol import command_rates
 
 
 @compiled
-def fly_geometric(state, constants, wrench, actions):
+def fly_geometric(state, constants, wrench, by_rates, actions):
     """Write the actions of n vehicles, (n, 4).
 
     :param state: (STATE_SIZE, n).
     :param constants: ``LawConstants`` with n columns, or one for all vehicles.
     :param wrench: the external wrench to compensate, (WRENCH_SIZE, n) or (WRENCH_SIZE, 1).
+    :param by_rates: whether actions command thrust and body rates rather than rotor thrusts.
     """
     tilting = np.empty(4)
+    rates = np.empty(3)
     for i in range(actions.shape[0]):
         # A single column serves all vehicles.
         k = min(i, constants.gains.shape[1] - 1)
@@ -66,8 +69,22 @@ def fly_geometric(state, constants, wrench, actions):
         b = divide(to_body(body_to_world, f), size)
         b = seen_later(b, omega, constants.lag[k])
 
+        rate, nx, ny = desired_turn(b, omega, gains)
+        if by_rates:
+            yaw_rate = desired_yaw_rate(state, i, body_to_world, gains)
+            wanted = rate * nx, rate * ny, yaw_rate
+            loop = vector_at(constants.vehicles, P.rate_gain_x, k)
+            for axis in range(3):
+                # A loop slower than the law gets more than the wanted rate, to be as quick. It
+                # gives a moment if the rates differ by that over its gain.
+                slowness = gains[G.body_rates] * inertia[axis] / loop[axis]
+                lead = max(slowness - 1.0, 0.0) * (wanted[axis] - omega[axis])
+                rates[axis] = wanted[axis] + lead - torque[axis] / loop[axis]
+            command_rates(mass * size * b[2], rates, constants.vehicles[:, k], actions[i])
+            continue
+
         # Moments for the turn, against the yaw rate, and against the external torque.
-        mx, my = turn_moments(b, omega, gains, inertia)
+        mx, my = turn_moments(rate, nx, ny, omega, gains, inertia)
         mz = yaw_moment(state, i, body_to_world, omega[2], gains, inertia[2])
         moments = subtract((mx, my, mz), torque)
         allocate(
@@ -101,14 +118,23 @@ def yaw_moment(state, i, body_to_world, r, gains, izz):
 
     The heading is where the body's x axis points, seen from above.
     """
-    cosine, sine, rate = vector_at(state, X.target_heading, i)
+    cosine, sine, _ = vector_at(state, X.target_heading, i)
     if cosine == sine == 0.0:
         return -gains[G.yaw_rate] * izz * r
+    # Critically damped, and as quick as roll and pitch.
+    wanted = desired_yaw_rate(state, i, body_to_world, gains)
+    return gains[G.body_rates] * izz * (wanted - r)
+
+
+@inner
+def desired_yaw_rate(state, i, body_to_world, gains):
+    """Return the yaw rate towards the commanded heading, rad/s; 0 without one."""
+    cosine, sine, rate = vector_at(state, X.target_heading, i)
+    if cosine == sine == 0.0:
+        return 0.0
     (x, _, _), (y, _, _), (_, _, upright) = body_to_world
     error = math.atan2(sine * x - cosine * y, cosine * x + sine * y)
-    # Critically damped, and as quick as roll and pitch.
-    gain = gains[G.body_rates]
-    return gain * izz * (upright * (rate + 0.25 * gain * error) - r)
+    return upright * (rate + 0.25 * gains[G.body_rates] * error)
 
 
 @inner
@@ -196,10 +222,11 @@ def seen_later(b, omega, time):
 
 
 @inner
-def turn_moments(b, omega, gains, inertia):
-    """Return the roll and pitch moments that turn the thrust to direction b, body frame, N m."""
-    p, q, r = omega
-    ixx, iyy, izz = inertia
+def desired_turn(b, omega, gains):
+    """Return the rate, rad/s, at which the thrust has to turn to direction b, and x and y of the
+    axis, body frame.
+    """
+    p, q, _ = omega
     deceleration = gains[G.angular_deceleration]
 
     # Turn by the angle α about the axis n, which is level in the body.
@@ -221,8 +248,14 @@ def turn_moments(b, omega, gains, inertia):
         nx = -nx
         ny = -ny
         alpha = 2.0 * math.pi - alpha
-    rate = alpha * braking_profile(gains[G.attitude], alpha / deceleration)
+    return alpha * braking_profile(gains[G.attitude], alpha / deceleration), nx, ny
 
+
+@inner
+def turn_moments(rate, nx, ny, omega, gains, inertia):
+    """Return the roll and pitch moments for a turn, see :func:`desired_turn`, body frame, N m."""
+    p, q, r = omega
+    ixx, iyy, izz = inertia
     # The desired rates stay fixed in the world while the body yaws. Then add Euler's gyroscopic
     # terms.
     p_dot = gains[G.body_rates] * (rate * nx - p) + r * rate * ny

@@ -8,9 +8,9 @@ from sb3_quad.base.compiled import compiled
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.simulation.physics import rotation, to_body
 from sb3_quad.envs.simulation.state import QuadcopterState, X
-from sb3_quad.envs.simulation.vectors import subtract, vector_at
+from sb3_quad.envs.simulation.vectors import scaled, subtract, vector_at
 from sb3_quad.envs.vehicles.vehicle import VehicleSource
-from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.experts.protocol import Action, Actions, Expert, command_rates
 
 # The thesis scales φ_des and θ_des to a quarter, "to ensure smoother rotations" (3.2.1).
 ANGLE_FACTOR = 0.25
@@ -32,7 +32,9 @@ class PIDExpert(Expert):
     :param kd: velocity gain, 1/s, on the body-frame velocity.
     :param natural_frequency: ωn, rad/s.
     :param damping: ξ.
-    :raises ConfigError: a gain that is negative or not finite.
+    :param action: what its actions command, see :class:`Expert`. As ``rates`` they are the thrust,
+        and ωn / 2 ξ times the errors of the angles.
+    :raises ConfigError: a gain that is negative or not finite; or no damping for ``rates``.
     """
 
     def __init__(
@@ -43,8 +45,9 @@ class PIDExpert(Expert):
         kd: float = 4.1,
         natural_frequency: float = 9.0,
         damping: float = 1.0,
+        action: Action = "thrusts",
     ) -> None:
-        super().__init__(vehicle)
+        super().__init__(vehicle, action)
         gains = (kp, ki, kd, natural_frequency, damping)
         if not all(0.0 <= gain < math.inf for gain in gains):
             raise ConfigError(
@@ -57,11 +60,18 @@ class PIDExpert(Expert):
         position_gains = np.array([kp, kd, ki * v.control_step, v.mass, v.gravity])
         proportional = inertia * natural_frequency**2
         derivative = inertia * 2 * damping * natural_frequency
+        slope = 0.0
+        if action == "rates":
+            if 0.0 in (damping, natural_frequency):
+                raise ConfigError("PIDExpert: natural_frequency and damping: rates need both")
+            slope = natural_frequency / (2 * damping)
         self._constants = (
             position_gains,
             np.stack([proportional, derivative]),
             v.mixer_inverse,
             np.array(v.thrust_range),
+            v.parameters(),
+            slope,
         )
 
     def actions(self, state: QuadcopterState) -> Actions:
@@ -72,8 +82,12 @@ class PIDExpert(Expert):
 
 
 @compiled
-def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
-    """Write the actions of n vehicles, (n, 4), from their state, (STATE_SIZE, n)."""
+def _pid(state, gains, attitude, mixer_inverse, limits, vehicle, slope, actions):  # type: ignore[no-untyped-def]
+    """Write the actions of n vehicles, (n, 4), from their state, (STATE_SIZE, n).
+
+    :param vehicle: parameters, (len(PARAMETER_NAMES),).
+    :param slope: body rate per error of an angle, 1/s; 0 for actions that are thrusts.
+    """
     kp, kd, ki_dt, mass, g = gains
     proportional, derivative = attitude
     low, high = limits
@@ -114,6 +128,10 @@ def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignor
         u3 = proportional[1] * (pitch_des - pitch) - derivative[1] * q
         yaw = math.atan2(c * r21 - s * r11, c * r11 + s * r21)
         u4 = -proportional[2] * yaw - derivative[2] * (r - yaw_rate)
+        if slope > 0.0:
+            errors = roll_des - roll, pitch_des - pitch, yaw_rate / slope - yaw
+            command_rates(u1, scaled(slope, errors), vehicle, actions[i])
+            continue
 
         # Scale all four thrusts by one factor, so that the largest is allowed.
         largest = -math.inf

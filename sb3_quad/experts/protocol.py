@@ -1,19 +1,23 @@
 """The base class of experts: they act on the true state, or on observations as SB3's models do."""
 
 from abc import ABC, abstractmethod
+from typing import get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ExpertError
+from sb3_quad.base.compiled import inner
+from sb3_quad.base.errors import ExpertError, refuse_unknown
 from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.envs.simulation.settings import Action
 from sb3_quad.envs.simulation.state import (
     BODY_RATES,
     POSITION,
     QUATERNION,
     STATE_SIZE,
     VELOCITY,
+    P,
     QuadcopterState,
 )
 from sb3_quad.envs.vehicles.vehicle import VehicleSource, load_vehicle
@@ -34,6 +38,9 @@ class Expert(ABC):
 
     :param vehicle: name, YAML path or a :class:`~sb3_quad.envs.vehicles.vehicle.Vehicle` that the
         expert is designed for.
+    :param action: what its actions command, ``thrusts`` or ``rates``, as ``action`` of the
+        environments.
+    :raises ConfigError: another ``action``.
     """
 
     # μ and σ of Eq. 3.16, shape (18,), which `predict` undoes. They are the environments' defaults;
@@ -43,9 +50,12 @@ class Expert(ABC):
 
     # Whether it uses each vehicle's true parameters rather than those of ``vehicle``.
     is_privileged = False
+    action: Action = "thrusts"
 
-    def __init__(self, vehicle: VehicleSource = "itm") -> None:
+    def __init__(self, vehicle: VehicleSource = "itm", action: Action = "thrusts") -> None:
+        refuse_unknown("action", [action], get_args(Action))
         self.vehicle = load_vehicle(vehicle)
+        self.action = action
 
     @abstractmethod
     def actions(self, state: QuadcopterState) -> Actions:
@@ -74,6 +84,19 @@ class Expert(ABC):
         rows = np.atleast_2d(array)
         actions = self.actions(observed_state(rows, self.observation_mean, self.observation_std))
         return actions.reshape(*array.shape[:-1], actions.shape[1]), state
+
+
+@inner
+def command_rates(thrust, rates, vehicle, actions):  # type: ignore[no-untyped-def]
+    """Write the action (4,) that commands a thrust, N, and body rates (3), rad/s.
+
+    :param vehicle: parameters, (len(PARAMETER_NAMES),).
+    """
+    own = (thrust / 4.0 - vehicle[P.thrust_middle]) / vehicle[P.thrust_half_range]
+    actions[0] = min(1.0, max(-1.0, own))
+    for axis in range(3):
+        own = rates[axis] / vehicle[P.rate_limit_x + axis]
+        actions[1 + axis] = min(1.0, max(-1.0, own))
 
 
 def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -> QuadcopterState:

@@ -11,6 +11,7 @@ from torch.nn.utils import parameters_to_vector
 
 from sb3_quad.agents.agent_settings import agent_settings
 from sb3_quad.agents.zips import load_model, saved_algorithm
+from sb3_quad.algorithms.labelling import refuse_other_action
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.templates import render
@@ -91,6 +92,7 @@ def export_policy(
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     model = load_model(path)
     settings, source = agent_settings(path, model)
+    refuse_other_action(f"model {path}", model, "thrusts")
     if vehicle is None:
         vehicle = _own_vehicle(f"model {path}", settings, source)
     flown = first_vehicle(vehicle)

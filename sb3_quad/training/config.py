@@ -26,6 +26,7 @@ from sb3_quad.agents.pretrained import agent_path, pretrained_names
 from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.chain import chain_of
+from sb3_quad.algorithms.labelling import refuse_other_action
 from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.process import print_once
@@ -139,6 +140,7 @@ class TrainingConfig(Frozen):
             DEFAULT_EXPERT if self.expert is None else self.expert,
             self.env_kwargs.get("vehicle", "itm"),
             layout=self.task and self.flight_settings.rotor_layout,
+            action=self.env_kwargs.get("action", "thrusts"),
         )
 
     def keyword(self, name: str) -> Any:
@@ -477,6 +479,7 @@ def as_agent(agent: BaseAlgorithm, config: TrainingConfig, changes: StrMapping) 
     notice = unlike_trained("-i", own, vehicle)
     if notice:
         print_once(f"warning: {notice}; --env-kwargs vehicle:… gives another one")
+    refuse_other_action("-i", agent, config.env_kwargs.get("action", own.action))
     observed = own.observed
     # The agent knows one order of the rotors.
     if find_turn(vehicle, own.layout) != Turn():

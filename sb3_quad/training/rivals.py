@@ -99,7 +99,9 @@ def fly_rivals(
                 flown.append(Flown(name, _fly(rival, own), own))
             else:
                 layout = config.flight_settings.rotor_layout
-                expert = resolve_expert(name, config.env_kwargs["vehicle"], layout=layout)
+                action = config.flight_settings.action
+                vehicle = config.env_kwargs["vehicle"]
+                expert = resolve_expert(name, vehicle, layout=layout, action=action)
                 flown.append(Flown(name, _fly(expert, job)))
         except ConfigError as error:
             # Its rotors may be in other places.

@@ -197,7 +197,8 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
-        controllers[spec.label] = resolve_expert(spec.spec, vehicle, "controller")
+        action = options.env_kwargs.get("action", "thrusts")
+        controllers[spec.label] = resolve_expert(spec.spec, vehicle, "controller", action=action)
         observed[spec.label] = {
             name: spec.observed[name] for name in spec.observed.keys() - options.env_kwargs.keys()
         }

@@ -14,7 +14,7 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
-from sb3_quad.envs.simulation.settings import FlightSettings, Noise
+from sb3_quad.envs.simulation.settings import Action, FlightSettings, Noise
 from sb3_quad.envs.simulation.tasks import T, Task, resolve_tasks
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
@@ -56,8 +56,8 @@ class Scenario(Frozen):
     """One way to judge a controller: keywords of the environments, events, and the number of the
     episodes.
 
-    ``task``, ``task_kwargs``, ``vehicle``, ``noise``, ``vehicles``, ``randomize``, ``reference``,
-    ``wrench`` and ``wind`` are those of
+    ``task``, ``task_kwargs``, ``vehicle``, ``action``, ``noise``, ``vehicles``, ``randomize``,
+    ``reference``, ``wrench`` and ``wind`` are those of
     :class:`~sb3_quad.envs.simulation.settings.FlightSettings`. ``start``, ``target``, ``waypoints``
     and ``wrenches`` are events, which come on top of what the task samples. Units m, s, rad, N,
     N m, kg.
@@ -75,6 +75,8 @@ class Scenario(Frozen):
     """fields of the task to override, such as {target_distance: 15}"""
     vehicle: str | Vehicle | None = None
     """name, or path of a YAML file (relative to the suite's); default: the agent's own, or itm"""
+    action: Action = "thrusts"
+    """what the actions of experts command; an agent's are those of its training"""
     noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
     """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …,
     estimator: {position: …, …}}; with an estimator, experts see its estimate
@@ -233,6 +235,7 @@ class Scenario(Frozen):
             task=self.task,
             task_kwargs=self.task_kwargs,
             vehicle=self.nominal_vehicle(),
+            action=self.action,
             noise=self.noise,
             vehicles=self.vehicles,
             randomize=self.randomize,

@@ -14,6 +14,7 @@
  * @property {"pid" | "geometric" | "network"} kind
  * @property {string} [vehicle] that it was trained on; of an agent of any vehicle empty
  * @property {Layout} [layout] the rotors as it knows them
+ * @property {"thrusts" | "rates"} [action] what it commands: thrusts, unless it says otherwise
  * @property {ObservationSettings} [observation]
  * @property {number[]} [mean] μ of Eq. 3.16
  * @property {number[]} [std] σ
@@ -31,8 +32,9 @@ import { commandedSpeeds, distanceOf, physicsStep, rotation, tiltOf } from "./dy
 import { geometric, pid } from "./experts.js";
 import { forward } from "./network.js";
 import { Observer } from "./observation.js";
+import { RateLoop } from "./rates.js";
 import { part, STATE_SIZE, X } from "./tables.js";
-import { findTurn, parametersOf } from "./vehicle.js";
+import { CALM, findTurn, parametersOf } from "./vehicle.js";
 
 export const NEAR = 0.1; // m: arrival
 export const MAX_DISTANCE = 30; // m, farther from the target ends a flight
@@ -52,9 +54,12 @@ export class Flight {
     this.agent = agent;
     this.parameters = parametersOf(vehicle);
     this.state = new Float64Array(STATE_SIZE);
-    this.actions = new Float32Array(4); // in the vehicle's own order of the rotors
+    this.world = CALM;
+    this.actions = new Float32Array(4); // in the vehicle's own order of the rotors; thrust and body rates in the agent's axes
     /** @type {number[][]} */
-    this.queue = []; // rotor speeds that have been commanded and are not due yet
+    this.queue = []; // rotor speeds, or thrusts and body rates, that have been commanded and are not due yet
+    /** @type {RateLoop | null} */
+    this.loop = null; // of an agent that commands body rates
     /** @type {Motion | null} */
     this.course = null; // that the target follows; null: it rests
     this.courseTime = 0; // s
@@ -68,6 +73,7 @@ export class Flight {
       const turn = findTurn(vehicle, agent.layout ?? vehicle);
       if (!turn) throw new Error(`${agent.label} knows other rotors than ${vehicle.name} has`);
       this.turn = turn;
+      if (agent.action === "rates") this.loop = new RateLoop(vehicle, turn.angle);
       const settings = agent.observation ?? { last_action: false, history: null, position_integral: null };
       this.observer = new Observer(settings, vehicle.control_step, { mean: agent.mean, std: agent.std, clip: agent.clip, turn, normal });
     } else {
@@ -78,11 +84,17 @@ export class Flight {
 
   /** Fly in another world from now on. @param {World} world @param {number} noise relative */
   setWorld(world, noise) {
+    this.world = world;
     this.parameters = parametersOf(this.vehicle, world);
     this.noise = noise;
-    const { delay, hoverSpeeds } = this.parameters;
+    const { delay } = this.parameters;
     while (this.queue.length > delay) this.queue.shift();
-    while (this.queue.length < delay) this.queue.unshift(this.queue[0] ?? [...hoverSpeeds]);
+    while (this.queue.length < delay) this.queue.unshift(this.queue[0] ?? this.#hover);
+  }
+
+  /** The command of a hover. */
+  get #hover() {
+    return [...(this.loop?.hover(this.world) ?? this.parameters.hoverSpeeds)];
   }
 
   /** Begin an episode with rotors in hover. @param {Start} start */
@@ -92,7 +104,8 @@ export class Flight {
     this.course = null;
     for (const name of STARTED) this.state.set(start[name], X[name]);
     this.state.set(hover, X.rotor_speeds);
-    this.queue = Array.from({ length: delay }, () => [...hover]);
+    this.queue = Array.from({ length: delay }, () => this.#hover);
+    this.loop?.begin(this.state);
     this.time = 0;
     this.lost = "";
     this.away = false;
@@ -131,17 +144,25 @@ export class Flight {
     if (this.law) this.law(this.state, this.actions, this.#ahead);
     else if (this.observation && this.agent.layers && this.turn) {
       const known = forward(this.agent.layers, this.observation);
-      this.turn.order.forEach((own, k) => (this.actions[own] = Math.min(1, Math.max(-1, known[k]))));
+      this.#orders.forEach((own, k) => (this.actions[own] = Math.min(1, Math.max(-1, known[k]))));
     }
     return this.actions;
   }
 
+  /** Where each of the agent's four actions stands in the vehicle's. */
+  get #orders() {
+    return this.loop || !this.turn ? [0, 1, 2, 3] : this.turn.order;
+  }
+
   /** One control step. @param {Wrench} wrench @param {ArrayLike<number>} actions */
   step(wrench = NO_WRENCH, actions = this.act()) {
-    const p = this.parameters;
-    this.queue.push(commandedSpeeds(actions, p));
-    const wanted = this.queue.shift() ?? [];
-    for (let k = 0; k < p.substeps; k++) physicsStep(this.state, wanted, p, wrench);
+    const p = this.parameters, { loop } = this;
+    this.queue.push(loop ? loop.command(actions, p) : commandedSpeeds(actions, p));
+    const due = this.queue.shift() ?? [];
+    for (let k = 0; k < p.substeps; k++) {
+      const wanted = loop ? loop.hold(this.state, due, p, this.world.thrust) : due;
+      physicsStep(this.state, wanted, p, wrench);
+    }
     this.time += this.vehicle.control_step;
     if (this.course) {
       this.courseTime += this.vehicle.control_step;
@@ -149,7 +170,7 @@ export class Flight {
     }
     if (this.observer && this.turn) {
       this.observer.noise = this.noise;
-      this.observation = this.observer.next(this.state, this.turn.order.map((own) => actions[own]), this.#ahead);
+      this.observation = this.observer.next(this.state, this.#orders.map((own) => actions[own]), this.#ahead);
     }
     this.#judge();
   }

@@ -32,6 +32,7 @@
  * @property {number} control_step s
  * @property {number} delay control steps
  * @property {number} collision_radius m
+ * @property {{limits?: Triple | null, gains?: Triple | null, lag?: number}} [rates] see RateLoop
  * @property {Object<string, any> | null} [geometric_gains]
  * @property {Object<string, number> | null} [time_optimal] least times, s, to within 0.1 m of targets, by their distance, m
  *
@@ -129,7 +130,7 @@ export const hoverShares = (v) => mixerInverse(v).map(([share]) => Math.round(4e
 const lift = (v) => v.thrust_coefficient || hoverThrust(v) / 1e6;
 
 /** k_m of rotors that speed up and that slow down, 1/s. @param {Vehicle} v */
-const motorGains = (v) => [v.motor_gain_up ?? v.motor_gain ?? NaN, v.motor_gain_down ?? v.motor_gain ?? NaN];
+export const motorGains = (v) => [v.motor_gain_up ?? v.motor_gain ?? NaN, v.motor_gain_down ?? v.motor_gain ?? NaN];
 
 /** From a command to its thrust, s: delay, half the control step, and the motors. @param {Vehicle} v */
 export function commandLag(v) {

@@ -203,6 +203,7 @@ export async function readAgent(label, content) {
       kind: "network",
       vehicle: settings.vehicles ? "" : settings.vehicle?.name,
       layout: settings.rotor_layout ?? settings.vehicle,
+      action: settings.action,
       observation: { last_action, history, position_integral, preview },
       mean: row(settings.observation_mean),
       std: row(settings.observation_std),
