@@ -223,7 +223,7 @@ class QuadcopterBatch:
             self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.vehicles), self.n)).copy()
 
         # Without air, the compiled step is spared its terms.
-        still = (self.base_vehicles[P.rotor_drag_x :] == STILL).all()
+        still = (self.base_vehicles[P.rotor_drag_x : P.rate_limit_x] == STILL).all()
         self.in_air = self.randomize.sets_air or not still
 
         # All vehicles can fly if the hardest to fly can.

@@ -194,9 +194,9 @@ _SIZE = BLOCK.itemsize
 def step(
     control, leads, mode, actions, observations, rewards, dones,
     state, queue, filtered_rates, wrench, vehicles, base_vehicles, distribution_numbers,
-    randomize_numbers, gust, wind, wind_gust, wrench_record, wrench_starts, wind_record, wind_starts, chances,
-    estimator_numbers, estimate, frames, ages, integral, integral_numbers, streams, scaling,
-    task_index, task_parameters, task_weights, returns, limits, max_steps,
+    randomize_numbers, gust, wind, wind_gust, wrench_record, wrench_starts, wind_record,
+    wind_starts, chances, estimator_numbers, estimate, frames, ages, integral, integral_numbers,
+    streams, scaling, task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations, last_actions,
     moves, for_px4, course, tracks, track_numbers, previews,
     physics_step, substeps, in_air, autoreset,
