@@ -482,6 +482,11 @@ class Vehicle(Frozen):
         return self.hover_speed_sum * np.divide(self.airspeed_moment, self.inertia[:2])
 
     @property
+    def rotor_drag_rates(self) -> FloatArray:
+        """``rotor_drag`` in hover by the mass, (3,), 1/s."""
+        return self.hover_speed_sum * np.divide(self.rotor_drag, self.mass)
+
+    @property
     def damping_rates(self) -> FloatArray:
         """``rate_damping`` by the inertia, (3,), 1/s."""
         return np.divide(self.rate_damping, self.inertia)

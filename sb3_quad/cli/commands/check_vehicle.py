@@ -126,8 +126,7 @@ def _divergence(vehicle: "Vehicle") -> float:
     """
     import numpy as np
 
-    by_rotors = vehicle.hover_speed_sum * np.array(vehicle.rotor_drag)
-    drag = (vehicle.drag + by_rotors) / vehicle.mass
+    drag = np.divide(vehicle.drag, vehicle.mass) + vehicle.rotor_drag_rates
     fastest = 0.0
     for k, d, f in zip(drag[[1, 0]], vehicle.damping_rates, vehicle.airspeed_turns, strict=False):
         rates = np.roots([1.0, k + d, k * d, vehicle.gravity * f])
@@ -142,10 +141,6 @@ def warnings(vehicle: "Vehicle") -> list[str]:
     gains = (vehicle.motor_gain_up, vehicle.motor_gain_down)
     arm = vehicle.arm_length
     lag = float(command_lag(vehicle.parameters(), vehicle.control_step))
-    least, most = vehicle.thrust_limits
-    # Of what a rotor has left in hover, the part that balances the moment at 1 m/s
-    needed = vehicle.airspeed_turns * vehicle.inertia[:2] / vehicle.greatest_moments[:2]
-    needed *= (most - least) / (2.0 * min(most - 1.0, 1.0 - least))
     # The key, its values, the least and the greatest that are likely, what it is and advice.
     measured = (
         (
@@ -186,13 +181,6 @@ def warnings(vehicle: "Vehicle") -> list[str]:
             (0.0, MOST_DIVERGENCE),
             "divergence of the hover by the time from a command to its thrust; beyond, airspeed "
             "turns the vehicle over before the experts act; is it in kg m/rad?",
-        ),
-        (
-            "airspeed_moment",
-            [max(map(abs, needed))],
-            (0.0, 1.0),
-            "moment at 1 m/s by the greatest of the rotors in hover; beyond, airspeed turns the "
-            "vehicle over; is it in kg m/rad?",
         ),
     )
     lines = []
