@@ -161,7 +161,12 @@ class Vehicle(Frozen):
     """moment of inertia of a rotor about its axis, kg m^2: gyroscopic moment and yaw reaction"""
     ground_effect_radius: NonNegative = 0.0
     """R of the ground effect 1 / (1 - (R / 4z)^2) on the thrust, a rotor's radius or more, m"""
-    thrust_factors: tuple[ThrustFactor, ThrustFactor, ThrustFactor, ThrustFactor] = (1.0,) * 4
+    thrust_factors: tuple[ThrustFactor, ThrustFactor, ThrustFactor, ThrustFactor] = (
+        1.0,
+        1.0,
+        1.0,
+        1.0,
+    )
     """factor of the thrust and drag moment of each rotor at its speed"""
     gravity: Rate = GRAVITY
     """g, m/s^2"""
