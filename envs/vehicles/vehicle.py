@@ -100,6 +100,7 @@ MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 CONTROL_STEP = 0.01  # s
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 _NO_LIMITS = (0.0, 0.0)
+_EQUAL = (1.0, 1.0, 1.0, 1.0)
 # Results of a search, which are valid for one vehicle only
 _FOUND = ("geometric_gains", "time_optimal")
 
@@ -161,12 +162,7 @@ class Vehicle(Frozen):
     """moment of inertia of a rotor about its axis, kg m^2: gyroscopic moment and yaw reaction"""
     ground_effect_radius: NonNegative = 0.0
     """R of the ground effect 1 / (1 - (R / 4z)^2) on the thrust, a rotor's radius or more, m"""
-    thrust_factors: tuple[ThrustFactor, ThrustFactor, ThrustFactor, ThrustFactor] = (
-        1.0,
-        1.0,
-        1.0,
-        1.0,
-    )
+    thrust_factors: tuple[ThrustFactor, ThrustFactor, ThrustFactor, ThrustFactor] = _EQUAL
     """factor of the thrust and drag moment of each rotor at its speed"""
     gravity: Rate = GRAVITY
     """g, m/s^2"""
