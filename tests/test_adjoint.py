@@ -164,7 +164,7 @@ RANDOM = {
     "gusts": st.just({"std": [0, 0.2], "unit": "weight", "time_constant": 0.1}),
     "wind": st.just([0, 5]),
     "wind_gusts": st.just({"std": [0, 2]}),
-    "rotors": st.just([0.85, 1.15]),
+    "rotors": st.just([0.95, 1.15]),
     "rotor_drag": st.just([0.1, 1.0]),
     "translational_lift": st.just([0, 0.1]),
     "airspeed_moment": st.just([-5, 15]),

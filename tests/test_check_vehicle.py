@@ -104,7 +104,15 @@ def written(path, **changes):
 
 def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, capsys):
     limits = {"thrust_limits": None, "rotor_thrust_limits": [2.0, 6.0]}
-    air = {"rate_damping": [0.02, 0.03, 0.04], "airspeed_moment": [1e-5, 2e-5]}
+    air = {
+        "rotor_drag": [1e-4, 1e-4, 2e-4],
+        "translational_lift": 0.015,
+        "rate_damping": [0.02, 0.03, 0.04],
+        "airspeed_moment": [1e-5, 2e-5],
+        "rotor_inertia": 1e-5,
+        "ground_effect_radius": 0.2,
+        "thrust_factors": [1.0, 0.95, 1.0, 1.0],
+    }
     own = written(tmp_path / "own.yaml", name="own", mass=1.5, **limits, **air)
     assert main(["check-vehicle", own, "-n", "8"]) == 0
     printed = capsys.readouterr().out
@@ -113,6 +121,7 @@ def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, cap
     moments = ", ".join(f"{each:.1f}" for each in vehicle.greatest_moments / vehicle.inertia)
     assert f"{moments} rad/s²" in printed
     assert f"{1e-5 * vehicle.hover_speed_sum / vehicle.inertia[0]:.3g}, " in printed
+    assert "0.01 m/s² upwards" in printed and "+33 % at 0.1 m" in printed
     assert f"{0.04 / vehicle.inertia[2]:.3g} 1/s of roll, pitch and yaw" in printed
     assert f"{1000 / vehicle.motor_gain_up:.1f} ms up" in printed
     assert re.search(r"success, % +│ +\S+ \(.* 100\.0 \(", printed)

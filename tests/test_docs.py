@@ -17,7 +17,8 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md"))]
 # Page and number of blocks that cannot simply be run, and why, or which test runs them.
 ELSEWHERE = {
-    ("docs/evaluate.md", 0): "reads the folder of a whole evaluation",
+    ("docs/evaluate.md", 0): "reads a log that others have published",
+    ("docs/evaluate.md", 1): "reads the folder of a whole evaluation",
     ("docs/export.md", 0): "tests/test_export.py",
     ("docs/export.md", 1): "tests/test_export.py",
     ("docs/export.md", 2): "tests/test_export.py",

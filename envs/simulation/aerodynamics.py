@@ -8,7 +8,8 @@ angular momentum H of the rotors about the body's z axis:
 - translational lift h (vx² + vy²) along z (four times RotorPy's k_h; Svacha et al., ICUAS 2017);
 - a moment by airspeed, a Σ vy about x and -b Σ vx about y: positive numbers turn the thrust against
   the airspeed (RotorPy's k_flap, with the other sign);
-- damping -d ω (Mahony, Kumar and Corke, "Multirotor aerial vehicles", 2012);
+- damping -d ω, since rotors flap as the body turns (Pounds, Mahony and Corke, "Modelling and
+  control of a large quadrotor robot", 2010);
 - the rotors' moments: -ω × H e_z, and -dH/dt about z;
 - near the ground, thrust times 1 / (1 - (R / 4z)²) (Cheeseman and Bennett, "The effect of the
   ground on a helicopter rotor in forward flight", 1955), constant below z = R / 2.

@@ -491,7 +491,7 @@ class QuadcopterBatch:
     def _recorded(self, record: FloatArray, starts: IntArray) -> FloatArray:
         """Return what a recording adds in this control step, (size, n)."""
         begins = starts[(self.chances * len(starts)).astype(np.int64)]
-        return record[(begins + self.streams[STEP]) % len(record)].T
+        return np.asarray(record[(begins + self.streams[STEP]) % len(record)].T)
 
     @property
     def state(self) -> FloatArray:

@@ -166,7 +166,7 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
     if isinstance(task, dict) and "name" in task:
         changes["task"] = validate(Task, task, where)
     # The files of recordings and references in a zip are not opened, for the same reason.
-    settings = validate(FlightSettings, record | changes | UNRECORDED, where)
+    settings = validate(FlightSettings, {**record, **changes, **UNRECORDED}, where)
     if settings.reference is not None and settings.reference.curve == "file":
         settings = settings.model_copy(update={"reference": None})
     return settings
