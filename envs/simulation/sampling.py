@@ -252,15 +252,15 @@ def _randomize_vehicle(i, streams, table, vehicles):
     for rotor in range(4):
         v[P.roll_arm_0 + rotor] = arm * v[P.roll_arm_0 + rotor] - y
         v[P.pitch_arm_0 + rotor] = arm * v[P.pitch_arm_0 + rotor] + x
+    if table[R.delay + 2] != FIXED:
+        delay = math.floor(between(table, R.delay, u[10], 0.0))
+        v[P.delay] = min(delay, table[R.delay + 1] - 1.0)
     u = uniforms(streams, i, RATE_LOOP)
     tilting = between(table, R.rate_gains, u[0], 1.0)
     v[P.rate_gain_x] *= tilting
     v[P.rate_gain_y] *= tilting
     v[P.rate_gain_z] *= between(table, R.rate_gains, u[1], 1.0)
     v[P.rate_lag] += between(table, R.rate_lag, u[2], 0.0)
-    if table[R.delay + 2] != FIXED:
-        delay = math.floor(between(table, R.delay, u[10], 0.0))
-        v[P.delay] = min(delay, table[R.delay + 1] - 1.0)
 
 
 @called

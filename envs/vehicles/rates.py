@@ -26,8 +26,8 @@ IDLE = 0.001
 PRESETS = {
     # Actual rates with their default of 670°/s; low-pass filters of the gyro at 250 and 500 Hz
     "betaflight": {"limits": (math.radians(670.0),) * 3, "lag": 0.00096},
-    # MC_ROLLRATE_MAX, MC_PITCHRATE_MAX, MC_YAWRATE_MAX; the delay of IMU_GYRO_CUTOFF, a filter of
-    # second order at 40 Hz
+    # MC_ROLLRATE_MAX, MC_PITCHRATE_MAX, MC_YAWRATE_MAX; the delay of the second-order filter of
+    # IMU_GYRO_CUTOFF, 40 Hz
     "px4": {"limits": (*[math.radians(220.0)] * 2, math.radians(200.0)), "lag": 0.0056},
 }
 # Beyond, a loop at 400 Hz is unstable.
