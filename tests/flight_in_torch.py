@@ -143,7 +143,7 @@ class Vehicles:
         share = th.where(self.exact, x / (1 + x / 2 + x**2 / 12), x)
         speeds = old + share * (wanted_speeds - old)
         thrust = self.lift * speeds * th.where(self.exact, old, speeds)
-        height = th.maximum(state.position[:, 2:], 0.5 * self.ground_radius)
+        height = th.maximum(state.position[:, 2:], 0.5 * self.ground_radius).clamp(min=1e-9)
         near = self.ground_radius / (4.0 * height)
         thrust = thrust * self.thrust_factors / (1.0 - near.square())
 
