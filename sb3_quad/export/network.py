@@ -151,13 +151,12 @@ class Network(nn.Module):
         ]
 
 
-def build_network(trained: TrainedPolicy, where: str = "model", features: str = "body") -> Network:
+def build_network(trained: TrainedPolicy, where: str = "model") -> Network:
     """Build the network of an SB3 model with ``MlpPolicy``, on-policy, SAC's or TD3's, with its
     scaling and its rotors.
 
     :param where: the name of the model in messages.
-    :param features: the features that it must have been trained with.
-    :raises ConfigError: an unknown output, other features or spaces than the quadcopter's, a policy
+    :raises ConfigError: an unknown output, other spaces than the quadcopter's, a policy
         that :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
     """
@@ -174,11 +173,6 @@ def build_network(trained: TrainedPolicy, where: str = "model", features: str = 
     if model.action_space != ACTIONS:
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
-        )
-    if trained.observation.features != features:
-        raise ConfigError(
-            f"{where}: --format px4 needs and takes features: px4, all others body; "
-            f"train with --env-kwargs features:{features}"
         )
     # C knows these layers only.
     for layer in layers:
