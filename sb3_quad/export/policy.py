@@ -61,7 +61,8 @@ def export_policy(
 
     The file takes the features of an observation in physical units, see
     ``metadata["observation"]``, relative to a moving reference, see ``metadata["reference"]``. It
-    returns the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
+    returns the four rotors' thrusts (N) or speeds (rad/s), or the collective thrust (N) and body
+    rates (rad/s) of a policy that commands these, by the policy's mean action, clipped.
     Earlier frames that the policy sees are in a state, ``metadata["state"]``. A vehicle that is not
     given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it. If
     it finds none, the vehicle must be given, and the scaling is that of Table A.2.
@@ -91,7 +92,12 @@ def export_policy(
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     model = load_model(path)
     settings, source = agent_settings(path, model)
-    refuse_other_action(f"model {path}", model, "thrusts")
+    if file_format in FOLDERS:
+        refuse_other_action(f"model {path}", model, "thrusts")
+    if settings.action == "rates":
+        if output != "thrusts":
+            raise ConfigError(f"model {path}: commands thrust and body rates; remove --output")
+        output = "rates"
     if vehicle is None:
         vehicle = _own_vehicle(f"model {path}", settings, source)
     flown = first_vehicle(vehicle)
@@ -163,7 +169,7 @@ def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:
         version=__version__,
         network=network,
         # The limits of the results are those of the extreme actions.
-        limits=trained.results([-1.0, 1.0]),
+        limits=trained.results([[-1.0] * 4, [1.0] * 4]),
         features=FEATURES,
         places=GROUPS,
         n_parameters=parameters_to_vector(network.parameters()).numel(),
