@@ -111,9 +111,9 @@ class TrainedPolicy:
         or collective thrust and body rates, N and rad/s, of actions (..., 4), in float64.
         """
         if self.output == "rates":
-            return self.limits.mean(axis=0) + np.ptp(self.limits, axis=0) / 2.0 * np.asarray(
-                actions
-            )
+            half = np.ptp(self.limits, axis=0) / 2.0
+            commands: FloatArray = self.limits.mean(axis=0) + half * np.asarray(actions)
+            return commands
         thrusts = self.vehicle.action_to_thrust(np.asarray(actions, np.float64))
         if self.output == "thrusts":
             return thrusts
