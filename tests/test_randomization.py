@@ -149,7 +149,7 @@ def test_an_episode_is_random_within_the_ranges():
         P.rate_damping_z: (1.0 / base[P.izz], 0.0, 8.0),
         P.rotor_inertia: (1.0 / base[P.izz], 0.0, 0.02),
         P.ground_effect_radius: (1.0 / load_vehicle("itm").arm_length, 0.0, 80.0),
-        **{P.thrust_factor_0 + k: (1.0, 0.9, 1.1) for k in range(4)},
+        **{P.thrust_factor_0 + k: (1.0, 0.95, 1.1) for k in range(4)},
     }
     for row, (unit, low, high) in air.items():
         slack = 0.02 * (high - low)
