@@ -2,6 +2,7 @@
 
 import time
 import weakref
+from collections.abc import Callable
 
 import numpy as np
 
@@ -18,17 +19,17 @@ from sb3_quad.envs.rendering.window import (
 from sb3_quad.envs.simulation.physics import rotation_rows, to_body
 from sb3_quad.envs.simulation.state import (
     BODY_RATES,
-    FORCE_WORLD,
     POSITION,
     QUATERNION,
+    STATE_SIZE,
     TARGET,
-    TORQUE_WORLD,
     VELOCITY,
     P,
     QuadcopterState,
 )
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
+Air = Callable[[int, FloatArray], FloatArray]
 RENDER_MODES = ("human", "rgb_array")
 # PyBullet's window makes the simulation wait for each frame, so it draws only this many per second.
 WINDOW_FPS = 25.0
@@ -59,7 +60,7 @@ class BulletBody:
 
     def become(self, parameters: FloatArray) -> None:
         """Take on the mass and inertia in a vehicle's ``parameters()``."""
-        # Without damping by PyBullet itself; drag is added in :meth:`fly`.
+        # Without damping by PyBullet itself; the air acts in :meth:`fly`.
         self.client.changeDynamics(
             self.body,
             -1,
@@ -82,42 +83,36 @@ class BulletBody:
         self.client.resetBasePositionAndOrientation(self.body, state.position[0], attitude)
         self.client.resetBaseVelocity(self.body, state.velocity[0], rates)
 
-    def fly(
-        self, wrenches: FloatArray, wrench: FloatArray, drag: FloatArray | None, wind: FloatArray
-    ) -> None:
-        """Simulate one physics step for each of ``wrenches``.
+    def fly(self, rotors: FloatArray, wrench: FloatArray, air: Air | None = None) -> None:
+        """Simulate one physics step for each of ``rotors``.
 
-        :param wrenches: (steps, 2, 3), force and torque at the centre of mass, body frame.
-        :param wrench: (WRENCH_SIZE,), the external wrench; its world-frame parts act as well.
-        :param drag: (3,), d of the vehicle, N s/m; None: no drag.
-        :param wind: (3,), velocity of the air, world frame, m/s.
+        :param rotors: (steps, 2, 3), force and torque of the rotors, body frame.
+        :param wrench: (WRENCH_SIZE,), the external wrench at the centre of mass.
+        :param air: returns the wrench of the air, (WRENCH_SIZE,), in a physics step of this number,
+            from the body's state before it, (STATE_SIZE, 1); None: no air.
         """
         client = self.client
         body = self.body
-        world_force = wrench[FORCE_WORLD].tolist()
-        world_torque = wrench[TORQUE_WORLD].tolist()
-        # Calls of PyBullet are slow, so leave out those that do nothing.
-        is_disturbed = any(world_force) or any(world_torque)
-        for force, torque in wrenches.tolist():
-            if is_disturbed:
+        total = wrench
+        for step, rotor in enumerate(rotors):
+            # The air depends on the velocity, which changes in each physics step.
+            if air is not None:
+                state = np.zeros((STATE_SIZE, 1))
+                self.read(state)
+                total = wrench + air(step, state)
+            parts = total.reshape(4, 3)
+            world_force, world_torque = parts[::2].tolist()
+            # Calls of PyBullet are slow, so leave out those that do nothing.
+            if any(world_force) or any(world_torque):
                 # PyBullet applies a world-frame force at a point of the world: the present centre
                 # of mass.
                 position, _ = client.getBasePositionAndOrientation(body)
                 client.applyExternalForce(body, -1, world_force, position, p.WORLD_FRAME)
                 client.applyExternalTorque(body, -1, world_torque, p.WORLD_FRAME)
-            # Drag depends on the velocity, which changes in each physics step.
-            if drag is not None:
-                force = np.add(force, self._drag(drag, wind))
+            force, torque = (rotor + parts[1::2]).tolist()
             client.applyExternalForce(body, -1, force, _ORIGIN, p.LINK_FRAME)
             client.applyExternalTorque(body, -1, torque, p.LINK_FRAME)
             client.stepSimulation()
-
-    def _drag(self, drag: FloatArray, wind: FloatArray) -> FloatArray:
-        """Return the drag at the current velocity, (3,), body frame, N."""
-        _, quaternion = self.client.getBasePositionAndOrientation(self.body)
-        velocity, _ = self.client.getBaseVelocity(self.body)
-        rotation = np.array(p.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
-        return np.asarray(-drag * (rotation.T @ (velocity - wind)))
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""

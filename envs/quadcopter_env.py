@@ -331,9 +331,12 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
         # The batch turns the rotors and scores the step; in between, PyBullet moves the body.
         batch = self.batch
-        drag = batch.vehicles[P.drag_x : P.drag_z + 1, 0] if batch.has_drag else None
-        rotor_wrenches = batch.turn_rotors(array[None])
-        self._body.fly(rotor_wrenches, batch.total_wrench()[:, 0], drag, batch.total_wind()[:, 0])
+        rotors, speeds = batch.turn_rotors(array[None])
+
+        def air(step: int, state: FloatArray) -> FloatArray:
+            return batch.air_on(state, rotors[step], speeds[step : step + 2])
+
+        self._body.fly(rotors, batch.total_wrench()[:, 0], air if batch.feels_air else None)
         self._body.read(batch.state)
         observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":

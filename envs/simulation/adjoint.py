@@ -13,6 +13,13 @@ keeping them. Where PyBullet limits a velocity to 100 the derivative is taken as
 import math
 
 from sb3_quad.base.compiled import LANES, fast, inlined, inner
+from sb3_quad.envs.simulation.aerodynamics import (
+    air_force,
+    air_vjp,
+    ground_effect,
+    rotor_momentum,
+    speed_sum,
+)
 from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE, F, heading_of
 from sb3_quad.envs.simulation.physics import (
     fly,
@@ -113,8 +120,91 @@ def move_vjp(before, after, gradient, dt):
         _add(gradient, X.body_rates, lane, scaled(half_step, turned))
 
 
+@inlined
+def _accelerate_vjp(b, before, after, gradient, grad_wanted, lane, dt, in_air):
+    """Vector-Jacobian product of a lane, see :func:`accelerate_vjp`.
+
+    :param in_air: a constant, whether the terms of :mod:`.aerodynamics` act.
+    """
+    r = rotation(before[X.quaternion :], lane)
+
+    # Gradient with respect to the torque in the body frame, and through the gyroscopic terms to
+    # the body rates
+    torque = multiply(vector(b.rates_gain, lane), vector(gradient[X.body_rates :], lane))
+    w = vector(before[X.body_rates :], lane)
+    wx, wy, wz = w
+    gx, gy, gz = multiply(vector(b.gyro, lane), torque)
+    gyroscopic = gy * wz + gz * wy, gx * wz + gz * wx, gx * wy + gy * wx
+    _add(gradient, X.body_rates, lane, scaled(-1.0, gyroscopic))
+
+    # Gradient with respect to the force, in the world frame and in the body frame
+    push = vector(gradient[X.velocity :], lane)
+    push = scaled(b.velocity_gain[lane], push)
+    in_body = to_body(r, push)
+
+    # The air: its force, and the gradients with respect to the airspeed in the body frame, the sum
+    # of the rotor speeds, and the rotors' angular momentum before and after the step
+    airspeed = subtract(vector(before[X.velocity :], lane), vector(b.wind, lane))
+    in_air_force = 0.0, 0.0, 0.0
+    grad_v = 0.0, 0.0, 0.0
+    by_total = by_old = by_momentum = by_height = 0.0
+    ground, slope = 1.0, 0.0
+    if in_air:
+        v = to_body(r, airspeed)
+        speeds = after[X.rotor_speeds :]
+        total, momentum = speed_sum(speeds, lane), rotor_momentum(b, speeds, lane)
+        in_air_force = air_force(b, v, total, lane)
+        grad_v, grad_w, by_total, by_momentum = air_vjp(
+            b, v, w, total, momentum, in_body, torque, lane
+        )
+        _add(gradient, X.body_rates, lane, grad_w)
+        by_old = torque[2] / dt
+        by_momentum -= by_old
+        ground, slope = ground_effect(b.ground_effect_radius[lane], before[X.position + 2, lane])
+
+    # Gradient with respect to the rotors: each thrust acts along the body's z axis and about
+    # all three axes.
+    for k in range(4):
+        old, new = before[X.rotor_speeds + k, lane], after[X.rotor_speeds + k, lane]
+        lift, exact = b.thrust_coefficient[lane], b.exact_motors[lane]
+        if in_air:
+            lift *= ground * b.thrust_factor[k, lane]
+        grad_thrust = lift * (in_body[2] + dot(vector(b.arm[:, k], lane), torque))
+        b.thrust[k, lane] = lift * new * (new + exact * (old - new))
+        grad_new = gradient[X.rotor_speeds + k, lane]
+        grad_new += grad_thrust * (2.0 * new * (1.0 - exact) + exact * old)
+        grad_old = grad_thrust * exact * new
+        if in_air:
+            spin = -math.copysign(b.rotor_inertia[lane], b.arm[2, k, lane])
+            grad_new += by_total + spin * by_momentum
+            grad_old += spin * by_old
+            by_height += grad_thrust * new * (new + exact * (old - new))
+        speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
+        factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
+        grad_wanted[k, lane] += factor * grad_new
+        gradient[X.rotor_speeds + k, lane] = (1.0 - factor) * grad_new + grad_old
+    if in_air:
+        gradient[X.position + 2, lane] += slope * by_height
+
+    # Recompute the force in the body frame: drag from the airspeed, and the thrusts.
+    drag = vector(b.drag, lane)
+    fx, fy, fz = subtract(vector(b.force_body, lane), multiply(drag, to_body(r, airspeed)))
+    force = fx, fy, fz + total_thrust(b, lane)
+    braked = multiply(scaled(-1.0, drag), in_body)
+    if in_air:
+        force, braked = add(force, in_air_force), add(braked, grad_v)
+
+    # Gradient with respect to the velocity, through the drag, and to the attitude: forces, drag
+    # and torques turn.
+    _add(gradient, X.velocity, lane, to_world(r, braked))
+    x, y, z = transposed((push, airspeed, vector(b.torque_world, lane)))
+    turned = transposed((force, braked, torque))
+    matrix = matvec(turned, x), matvec(turned, y), matvec(turned, z)
+    _add_rotation(before[X.quaternion :], gradient, lane, matrix)
+
+
 @fast
-def accelerate_vjp(b, before, after, gradient, grad_wanted):
+def accelerate_vjp(b, before, after, gradient, grad_wanted, dt, in_air):
     """Vector-Jacobian product of :func:`.physics.accelerate`, in place.
 
     :param b: a block whose vehicle, wrench, wind and wanted speeds are loaded.
@@ -122,56 +212,16 @@ def accelerate_vjp(b, before, after, gradient, grad_wanted):
     :param grad_wanted: (4, LANES), to which the gradient with respect to the wanted rotor speeds is
         added.
     """
-    for lane in range(LANES):
-        r = rotation(before[X.quaternion :], lane)
-
-        # Gradient with respect to the torque in the body frame, and through the gyroscopic terms to
-        # the body rates
-        torque = multiply(vector(b.rates_gain, lane), vector(gradient[X.body_rates :], lane))
-        wx, wy, wz = vector(before[X.body_rates :], lane)
-        gx, gy, gz = multiply(vector(b.gyro, lane), torque)
-        gyroscopic = gy * wz + gz * wy, gx * wz + gz * wx, gx * wy + gy * wx
-        _add(gradient, X.body_rates, lane, scaled(-1.0, gyroscopic))
-
-        # Gradient with respect to the force, in the world frame and in the body frame
-        push = vector(gradient[X.velocity :], lane)
-        push = scaled(b.velocity_gain[lane], push)
-        in_body = to_body(r, push)
-
-        # Gradient with respect to the rotors: each thrust acts along the body's z axis and about
-        # all three axes.
-        for k in range(4):
-            old, new = before[X.rotor_speeds + k, lane], after[X.rotor_speeds + k, lane]
-            lift, exact = b.thrust_coefficient[lane], b.exact_motors[lane]
-            grad_thrust = lift * (in_body[2] + dot(vector(b.arm[:, k], lane), torque))
-            b.thrust[k, lane] = lift * new * (new + exact * (old - new))
-            grad_new = gradient[X.rotor_speeds + k, lane]
-            grad_new += grad_thrust * (2.0 * new * (1.0 - exact) + exact * old)
-            speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
-            factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
-            grad_wanted[k, lane] += factor * grad_new
-            gradient[X.rotor_speeds + k, lane] = (
-                1.0 - factor
-            ) * grad_new + grad_thrust * exact * new
-
-        # Recompute the force in the body frame: drag from the airspeed, and the thrusts.
-        airspeed = subtract(vector(before[X.velocity :], lane), vector(b.wind, lane))
-        drag = vector(b.drag, lane)
-        fx, fy, fz = subtract(vector(b.force_body, lane), multiply(drag, to_body(r, airspeed)))
-        force = fx, fy, fz + total_thrust(b, lane)
-
-        # Gradient with respect to the velocity, through the drag, and to the attitude: forces, drag
-        # and torques turn.
-        braked = multiply(scaled(-1.0, drag), in_body)
-        _add(gradient, X.velocity, lane, to_world(r, braked))
-        x, y, z = transposed((push, airspeed, vector(b.torque_world, lane)))
-        turned = transposed((force, braked, torque))
-        matrix = matvec(turned, x), matvec(turned, y), matvec(turned, z)
-        _add_rotation(before[X.quaternion :], gradient, lane, matrix)
+    if in_air:
+        for lane in range(LANES):
+            _accelerate_vjp(b, before, after, gradient, grad_wanted, lane, dt, True)
+    else:
+        for lane in range(LANES):
+            _accelerate_vjp(b, before, after, gradient, grad_wanted, lane, dt, False)
 
 
 @inner
-def flight_vjp(b, states, gradient, grad_wanted, dt, substeps):
+def flight_vjp(b, states, gradient, grad_wanted, dt, substeps, in_air):
     """Vector-Jacobian product of :func:`.physics.fly`.
 
     It takes the physics steps of a control step, the last one first.
@@ -182,13 +232,13 @@ def flight_vjp(b, states, gradient, grad_wanted, dt, substeps):
     """
     for substep in range(substeps):
         states[substep] = b.state[:MOVING]
-        fly(b, dt, 1)
+        fly(b, dt, 1, in_air)
     states[substeps] = b.state[:MOVING]
     grad_wanted[:] = 0.0
     for substep in range(substeps - 1, -1, -1):
         before, after = states[substep], states[substep + 1]
         move_vjp(before, after, gradient, dt)
-        accelerate_vjp(b, before, after, gradient, grad_wanted)
+        accelerate_vjp(b, before, after, gradient, grad_wanted, dt, in_air)
 
 
 @inner

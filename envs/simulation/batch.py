@@ -35,16 +35,25 @@ from sb3_quad.envs.simulation.references import NO_TRACKS
 from sb3_quad.envs.simulation.sampling import GUST_SIZE, GUST_VALUE
 from sb3_quad.envs.simulation.settings import FlightSettings, levels
 from sb3_quad.envs.simulation.state import (
+    FELT,
+    FORCE_BODY,
     FORCE_WORLD,
     REFERENCE,
+    ROTOR_SPEEDS,
     STATE,
     STATE_SIZE,
+    STILL,
+    TORQUE_BODY,
     WRENCH_SIZE,
     P,
     QuadcopterState,
+    W,
     X,
-    drag_forces,
+    air_wrenches,
+    ground_effects,
+    rotor_momenta,
     row_slices,
+    thrusts_far_from_ground,
 )
 from sb3_quad.envs.simulation.tasks import T, resolve_tasks
 from sb3_quad.envs.simulation.threads import share_out
@@ -191,6 +200,10 @@ class QuadcopterBatch:
         if self.distribution is not None or self.randomize.sets_vehicle:
             self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.vehicles), self.n)).copy()
 
+        # Without air, the compiled step is spared its terms.
+        still = (self.base_vehicles[P.rotor_drag_x :] == STILL).all()
+        self.in_air = self.randomize.sets_air or not still
+
         # All vehicles can fly if the hardest to fly can.
         hardest = vehicles
         self.distribution_numbers = NO_DISTRIBUTION
@@ -293,26 +306,46 @@ class QuadcopterBatch:
             )
         return results
 
-    def turn_rotors(self, actions: AnyArray) -> FloatArray:
+    def turn_rotors(self, actions: AnyArray) -> tuple[FloatArray, FloatArray]:
         """Advance the rotors of row 0 by a control step, for another simulator that moves the body.
 
-        It then writes the state, and :meth:`score` scores the step.
+        It then writes the state, and :meth:`score` scores the step. In each physics step it adds
+        :meth:`total_wrench`, and :meth:`air_on` if ``feels_air``.
 
         :param actions: (n, 4), clipped to [-1, 1].
-        :return: force (N) and torque (N m) of rotors and wrench in each physics step, body frame,
-            (substeps, 2, 3). The parts of the wrench in the world frame are not included.
+        :return: force (N) and torque (N m) of the rotors in each physics step, body frame,
+            (substeps, 2, 3), and their speeds before these and after each, (substeps + 1, 4).
         """
-        wrenches = np.empty((self.substeps, 2, 3))
+        wrenches = np.zeros((self.substeps, 2, 3))
+        speeds = np.empty((self.substeps + 1, 4))
         rotor_wrenches(
             actions,
             wrenches,
+            speeds,
             self.state,
             self.queue,
-            self.wrench,
             self.vehicles,
             self.physics_step,
+            self.in_air,
         )
-        return wrenches
+        return wrenches, speeds
+
+    def air_on(self, state: FloatArray, rotors: FloatArray, speeds: FloatArray) -> FloatArray:
+        """Return the wrench of the air in a physics step of row 0, (WRENCH_SIZE,).
+
+        :param state: (STATE_SIZE, 1), before the step; its rotor speeds are not read.
+        :param rotors: force and torque of the rotors, (2, 3); ``speeds`` before and after it,
+            (2, 4).
+        """
+        vehicle = self.vehicles[:, :1]
+        state[ROTOR_SPEEDS, 0] = speeds[1]
+        wrench = air_wrenches(state, vehicle, self.total_wind()[:, :1])[:, 0]
+        gained = ground_effects(state, vehicle)[0] - 1.0
+        wrench[FORCE_BODY] += gained * rotors[0]
+        wrench[TORQUE_BODY] += gained * rotors[1]
+        before, after = rotor_momenta(vehicle, speeds.T)
+        wrench[W.torque_body + 2] += (before - after) / self.physics_step
+        return wrench
 
     def clear_outcome(self, rows: Rows = None) -> None:
         """Clear ``outcome`` of rows that have just begun an episode; its distance is that of the
@@ -342,31 +375,36 @@ class QuadcopterBatch:
     def true_state(self) -> QuadcopterState:
         """Return the true state of all rows.
 
-        It is a live view, except that gusts and drag, which are a part of its wrench, are those of
-        this control step.
+        It is a live view, except that gusts and the forces and moments of the air, which are a part
+        of its wrench, are those of this control step.
         """
         vehicles = np.broadcast_to(self.vehicles, (len(self.vehicles), self.n))
         wrench = self.total_wrench()
-        if self.has_drag:
-            wrench = wrench.copy()
-            wrench[FORCE_WORLD] += drag_forces(self.state, vehicles, self.total_wind())
+        if self.feels_air:
+            wrench = wrench + air_wrenches(self.state, vehicles, self.total_wind())
+            thrust = thrusts_far_from_ground(self.state, vehicles)
+            wrench[W.force_body + 2] += (ground_effects(self.state, vehicles) - 1.0) * thrust
         return QuadcopterState(self.state, vehicles, wrench)
 
     @property
-    def has_drag(self) -> bool:
-        """Whether some vehicle has drag."""
-        return bool(self.vehicles[P.drag_x : P.drag_z + 1].any())
+    def feels_air(self) -> bool:
+        """Whether some vehicle has drag or another term of :mod:`.aerodynamics`."""
+        return self.in_air or self.feels_wind
 
     @property
-    def may_have_drag(self) -> bool:
-        """Whether some vehicle has drag, or may have some in a later episode."""
-        if self.distribution is not None and self.distribution.drag is not None:
-            return True
-        return self.has_drag or self.randomize.drag is not None
+    def feels_wind(self) -> bool:
+        """Whether wind acts on some vehicle."""
+        return bool(self.vehicles[FELT].any())
 
     def warn_without_drag(self, what: str) -> None:
-        """Warn that the wind has no effect, and say what set it."""
-        if not self.may_have_drag:
+        """Warn that the wind has no effect, and say what set it, unless it may act on a vehicle of
+        a later episode.
+        """
+        names = ("drag", "rotor_drag", "translational_lift", "airspeed_moment")
+        may_feel = any(getattr(self.randomize, name) is not None for name in names)
+        if self.distribution is not None and self.distribution.drag is not None:
+            may_feel = True
+        if not may_feel and not self.feels_wind:
             warnings.warn(
                 f"{what}: wind acts through drag, and {self.vehicle_list[0].name} has none;"
                 " give a vehicle with drag, or randomize.drag",

@@ -16,6 +16,7 @@ import numpy as np
 from numba import float32
 
 from sb3_quad.base.compiled import LANES, atomic_add, called, compiled, inlined, inner
+from sb3_quad.envs.simulation.aerodynamics import scale_thrusts
 from sb3_quad.envs.simulation.frames import (
     clear_frames,
     integrate_position,
@@ -51,6 +52,7 @@ from sb3_quad.envs.simulation.state import (
     STATE_SIZE,
     WRENCH,
     WRENCH_SIZE,
+    P,
     X,
 )
 from sb3_quad.envs.simulation.tasks import SCORED, T
@@ -126,7 +128,13 @@ _TOGETHER: dict[str, tuple[str, Any]] = {
     # the state with a target that rests
     "resting": ("position", X.target_velocity),
     "wrench": ("force_world", WRENCH_SIZE),
-    "vehicle": (PARAMETER_NAMES[0], len(PARAMETER_NAMES)),
+    # what is always loaded of a vehicle, and its terms of aerodynamics.py
+    "vehicle": (PARAMETER_NAMES[0], P.rotor_drag_x),
+    "air": ("rotor_drag_x", len(PARAMETER_NAMES) - P.rotor_drag_x),
+    "rotor_drag": ("rotor_drag_x", 3),
+    "airspeed_moment": ("airspeed_moment_roll", 2),
+    "rate_damping": ("rate_damping_x", 3),
+    "thrust_factor": ("thrust_factor_0", 4),
     "inertia": ("ixx", 3),
     "drag": ("drag_x", 3),
     # the moment of each rotor per thrust, by axis
@@ -166,7 +174,7 @@ def step(
     task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations, last_actions,
     moves, for_px4, course, tracks, track_numbers, previews,
-    physics_step, substeps, autoreset,
+    physics_step, substeps, in_air, autoreset,
 ):  # fmt: skip
     """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
     :func:`.threads.share_out`.
@@ -210,6 +218,7 @@ def step(
     :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, also for ``tracks`` and
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
+    :param in_air: whether the terms of :mod:`.aerodynamics` act on some vehicle.
     :param autoreset: whether a row that ends begins its next episode within the same step.
     :return: False if an action is not finite; then nothing has changed.
     """
@@ -222,7 +231,7 @@ def step(
     blocks = new_block()
     b = blocks[0]
     b.row[:] = 0
-    load_constants(b, 0, True, scaling, vehicles, task_index, task_parameters, physics_step)
+    load_constants(b, 0, True, scaling, vehicles, task_index, task_parameters, physics_step, in_air)
 
     # The rows whose observations are due at the end: those that begin an episode, or all in LOOK.
     due = np.empty(n, np.int64)
@@ -248,7 +257,7 @@ def step(
                 b.row[lane] = first + min(lane, count - 1)
             load_constants(
                 b, first, False, scaling, vehicles, task_index, task_parameters,
-                physics_step,
+                physics_step, in_air,
             )  # fmt: skip
             if moves and tracks.shape[0] == 0:
                 load_rows(state, first, b.state)
@@ -261,7 +270,7 @@ def step(
                 add_gusts(b.force_world, gust, first, count)
                 add_gusts(b.wind, wind_gust, first, count)
                 _load_commands(b, first, count, actions, queue)
-                fly(b, physics_step, substeps)
+                fly(b, physics_step, substeps, in_air)
                 save_rows(b.state[: X.target], first, count, state)
             if tracks.shape[0] > 0:
                 follow(b, np.int64(1), state, streams, course, tracks, track_numbers)
@@ -349,7 +358,7 @@ BATCH_ARGUMENTS = _ARGUMENTS[_ARGUMENTS.index("state") :]
 
 
 @compiled
-def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step):
+def rotor_wrenches(actions, out, speeds, state, queue, vehicles, physics_step, in_air):
     """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body
     itself.
 
@@ -357,23 +366,25 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step):
     moves.
 
     :param actions: float32 (n, 4), clipped to [-1, 1].
-    :param out: (substeps, 2, 3): force (N) and torque (N m) of rotors and wrench in each physics
-        step, body frame.
+    :param out: (substeps, 2, 3): force (N) and torque (N m) of the rotors in each physics step,
+        body frame, far from the ground.
+    :param speeds: (substeps + 1, 4): rotor speeds before them, and after each.
     """
     blocks = new_block()
     blocks[0].row[:] = 0
     load_rows(state, 0, blocks[0].state)
-    load_rows(wrench, 0, blocks[0].wrench)
-    load_vehicles(blocks[0], vehicles, 0, physics_step)
+    load_vehicles(blocks[0], vehicles, 0, physics_step, in_air)
     _load_commands(blocks[0], 0, 1, actions, queue)
     b = blocks[0]
-    out[:, 0] = b.force_body[:, 0]
-    out[:, 1] = b.torque_body[:, 0]
+    speeds[0] = b.rotor_speeds[:, 0]
     for substep in range(len(out)):
         turn_rotors(b, 0)
-        out[substep, 0, 2] += total_thrust(b, 0)
+        if in_air:
+            scale_thrusts(b, math.inf, 0)
+        speeds[substep + 1] = b.rotor_speeds[:, 0]
+        out[substep, 0, 2] = total_thrust(b, 0)
         for axis in range(3):
-            out[substep, 1, axis] += moment(b, axis, 0)
+            out[substep, 1, axis] = moment(b, axis, 0)
     state[X.rotor_speeds : X.target, 0] = blocks[0].rotor_speeds[:, 0]
 
 
@@ -418,7 +429,7 @@ def save_rows(source, first, count, target):
 
 
 @inlined
-def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
+def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt, in_air):
     """Load what does not change during an episode: scaling, vehicles, limits and costs.
 
     :param shared: True: load what is the same for all rows, once for all blocks of a call. False:
@@ -427,7 +438,7 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
     if (scaling.shape[1] == 1) == shared:
         load_scaling(b, scaling)
     if (vehicles.shape[1] == 1) == shared:
-        load_vehicles(b, vehicles, first, dt)
+        load_vehicles(b, vehicles, first, dt, in_air)
     if (tasks.shape[0] == 1) == shared:
         # Limits and costs are the last columns of a task.
         for lane in range(LANES):
@@ -437,9 +448,11 @@ def load_constants(b, first, shared, scaling, vehicles, task_index, tasks, dt):
 
 
 @called
-def load_vehicles(b, vehicles, first, dt):
+def load_vehicles(b, vehicles, first, dt, in_air):
     """Load the vehicles of a block, with the divisions of a control step precomputed."""
     load_rows(vehicles, first, b.vehicle)
+    if in_air:
+        load_rows(vehicles[P.rotor_drag_x :], first, b.air)
     for lane in range(LANES):
         lift = b.thrust_coefficient[lane]
         exact = b.exact_motors[lane]

@@ -17,6 +17,13 @@ Functions with a ``lane`` compute one vehicle of a block, the others a whole blo
 import math
 
 from sb3_quad.base.compiled import LANES, called, fast, inlined, inner
+from sb3_quad.envs.simulation.aerodynamics import (
+    air_force,
+    air_moment,
+    rotor_momentum,
+    scale_thrusts,
+    speed_sum,
+)
 from sb3_quad.envs.simulation.vectors import (
     add,
     dot,
@@ -138,40 +145,67 @@ def moment(b, axis, lane):
     return (a0 * f0 + a1 * f1) + (a2 * f2 + a3 * f3)
 
 
+@inlined
+def _accelerate(b, lane, dt, in_air):
+    """Advance rotor speeds, velocity and body rates of a lane by a physics step, in place.
+
+    :param in_air: a constant, whether the terms of :mod:`.aerodynamics` act.
+    """
+    momentum = 0.0
+    if in_air:
+        momentum = rotor_momentum(b, b.rotor_speeds, lane)
+    # The rotors come first: their thrusts are those of this physics step.
+    turn_rotors(b, lane)
+    r = rotation(b.quaternion, lane)
+    if in_air:
+        scale_thrusts(b, b.position[2, lane], lane)
+
+    # The force without gravity, first in the body frame. Drag is that of the airspeed.
+    v = vector(b.velocity, lane)
+    airspeed = to_body(r, subtract(v, vector(b.wind, lane)))
+    drag = multiply(vector(b.drag, lane), airspeed)
+    fx, fy, fz = subtract(vector(b.force_body, lane), drag)
+    total = 0.0
+    if in_air:
+        total = speed_sum(b.rotor_speeds, lane)
+        fx, fy, fz = add((fx, fy, fz), air_force(b, airspeed, total, lane))
+    force = to_world(r, (fx, fy, fz + total_thrust(b, lane)))
+    force = add(vector(b.force_world, lane), force)
+    fall = (0.0, 0.0, b.fall[lane])
+    v = add(v, subtract(scaled(b.velocity_gain[lane], force), fall))
+
+    # Euler's equations in the body frame
+    torque = to_body(r, vector(b.torque_world, lane))
+    w = vector(b.body_rates, lane)
+    wx, wy, wz = w
+    in_body = vector(b.torque_body, lane)
+    gyroscopic = multiply(vector(b.gyro, lane), (wy * wz, wz * wx, wx * wy))
+    moments = moment(b, 0, lane), moment(b, 1, lane), moment(b, 2, lane)
+    torque = add(torque, add(subtract(in_body, gyroscopic), moments))
+    if in_air:
+        after = rotor_momentum(b, b.rotor_speeds, lane)
+        reaction = 0.0, 0.0, (momentum - after) / dt
+        torque = add(torque, add(air_moment(b, airspeed, w, total, after, lane), reaction))
+    w = add(w, multiply(vector(b.rates_gain, lane), torque))
+
+    store(b.velocity, lane, v)
+    store(b.body_rates, lane, w)
+    b.speed2[lane] = max(dot(w, w), dot(v, v))
+
+
 @fast
-def accelerate(b):
+def accelerate(b, dt, in_air):
     """Advance rotor speeds, velocities and body rates by a physics step, in place.
 
     :return: whether some velocity may exceed PyBullet's limit.
     """
-    for lane in range(LANES):
-        # The rotors come first: their thrusts are those of this physics step.
-        turn_rotors(b, lane)
-        r = rotation(b.quaternion, lane)
-
-        # The force without gravity, first in the body frame. Drag is that of the airspeed.
-        v = vector(b.velocity, lane)
-        airspeed = to_body(r, subtract(v, vector(b.wind, lane)))
-        drag = multiply(vector(b.drag, lane), airspeed)
-        fx, fy, fz = subtract(vector(b.force_body, lane), drag)
-        force = to_world(r, (fx, fy, fz + total_thrust(b, lane)))
-        force = add(vector(b.force_world, lane), force)
-        fall = (0.0, 0.0, b.fall[lane])
-        v = add(v, subtract(scaled(b.velocity_gain[lane], force), fall))
-
-        # Euler's equations in the body frame
-        torque = to_body(r, vector(b.torque_world, lane))
-        w = vector(b.body_rates, lane)
-        wx, wy, wz = w
-        in_body = vector(b.torque_body, lane)
-        gyroscopic = multiply(vector(b.gyro, lane), (wy * wz, wz * wx, wx * wy))
-        moments = moment(b, 0, lane), moment(b, 1, lane), moment(b, 2, lane)
-        torque = add(torque, add(subtract(in_body, gyroscopic), moments))
-        w = add(w, multiply(vector(b.rates_gain, lane), torque))
-
-        store(b.velocity, lane, v)
-        store(b.body_rates, lane, w)
-        b.speed2[lane] = max(dot(w, w), dot(v, v))
+    # Two loops: without air, each lane is spared its terms.
+    if in_air:
+        for lane in range(LANES):
+            _accelerate(b, lane, dt, True)
+    else:
+        for lane in range(LANES):
+            _accelerate(b, lane, dt, False)
     # In a separate loop: a sum over lanes would keep the one above from being vectorised.
     over = 0
     for lane in range(LANES):
@@ -242,9 +276,9 @@ def move(b, dt):
 
 
 @inlined
-def fly(b, physics_step, substeps):
+def fly(b, physics_step, substeps, in_air):
     """Compute the physics steps of one control step of a loaded block, in place."""
     for _ in range(substeps):
-        if accelerate(b):
+        if accelerate(b, physics_step, in_air):
             limit_velocities(b)
         move(b, physics_step)

@@ -26,9 +26,8 @@ from sb3_quad.envs.simulation.vectors import polynomial
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 # Purposes: the last word of the counter. numba would compile a function for each int.
-OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST, DISTRIBUTION, WIND, REFERENCE = (
-    np.arange(8, dtype=np.uint32)
-)
+OBSERVATION_NOISE, EPISODE_START, VEHICLE, DISTURBANCE, GUST = np.arange(5, dtype=np.uint32)
+DISTRIBUTION, WIND, REFERENCE, AIR = np.arange(5, 9, dtype=np.uint32)
 ROUNDS = 10
 BLOCKS = 8  # as many as any purpose takes
 _MASK = uint64(0xFFFFFFFF)

@@ -90,6 +90,10 @@ Battery = Range[Annotated[float, Field(ge=0.1, le=1)]]
 Delay = Range[Annotated[float, Field(ge=0, le=MAX_DELAY, multiple_of=1)]]
 
 
+Turning = Range[Annotated[float, Field(ge=-1e4, le=1e4)]]
+RotorShare = Range[Annotated[float, Field(ge=0, le=1)]]
+
+
 class Factor(Range[Annotated[float, Field(ge=0.1, le=10)]]):
     """A factor between 0.1 and 10, log-uniform unless ``distribution`` says otherwise."""
 
@@ -98,6 +102,15 @@ class Factor(Range[Annotated[float, Field(ge=0.1, le=10)]]):
 
 
 UNCHANGED = Factor(low=1.0, high=1.0)
+AIR_TERMS = (
+    "rotors",
+    "rotor_drag",
+    "translational_lift",
+    "airspeed_moment",
+    "rate_damping",
+    "rotor_inertia",
+    "ground_effect_radius",
+)
 
 
 class RandomVector(Frozen):
@@ -218,6 +231,24 @@ class Randomization(Frozen):
     """whole control steps from a command to its effect, such as [0, 3]"""
     drag: NonNegativeRange | None = None
     """added drag along each body axis, 1/s times the nominal mass, such as [0, 0.5]"""
+    rotors: Factor | None = None
+    """factor of the thrust and drag moment of each rotor by itself, such as [0.7, 1.15]"""
+    rotor_drag: NonNegativeRange | None = None
+    """rotor drag along each body axis in hover, 1/s times the nominal mass, in place of the
+    vehicle's own, as the next five are
+    """
+    translational_lift: NonNegativeRange | None = None
+    """force along body z, 1/m times the nominal mass, such as [0, 0.02]"""
+    airspeed_moment: Turning | None = None
+    """angular acceleration by airspeed in hover, of roll and of pitch, rad/s² for each m/s, such as
+    [-2, 10]; positive numbers raise the nose in forward flight
+    """
+    rate_damping: NonNegativeRange | None = None
+    """damping of each body rate, 1/s times the nominal inertia, such as [0, 8]"""
+    rotor_inertia: RotorShare | None = None
+    """of a rotor about its axis, times Izz, such as [0, 0.01]"""
+    ground_effect_radius: NonNegativeRange | None = None
+    """R of the ground effect in arm lengths, such as [0, 1]"""
     wrench_share: Share = 1.0
     """fraction of the episodes with force, torque, gusts and wind"""
     force: RandomVector | None = None
@@ -247,6 +278,11 @@ class Randomization(Frozen):
         return any(isinstance(given, Range) for _, given in self)
 
     @property
+    def sets_air(self) -> bool:
+        """Whether it samples a term of :mod:`.aerodynamics`."""
+        return any(getattr(self, name) is not None for name in AIR_TERMS)
+
+    @property
     def sets_wrench(self) -> bool:
         """Whether each episode begins with a new wrench, which may be zero."""
         return self.force is not None or self.torque is not None
@@ -260,12 +296,16 @@ class Randomization(Frozen):
         least, most = vehicle.thrust_limits
         mass = self.mass or UNCHANGED
         thrust = self.thrust or UNCHANGED
-        greatest = thrust.low * (self.battery or UNCHANGED).low
+        rotors = self.rotors or UNCHANGED
+        greatest = thrust.low * (self.battery or UNCHANGED).low * rotors.low
         gain = (self.motor_gain or UNCHANGED).high
         up = gain * (self.motor_gain_up or UNCHANGED).high
         down = gain * (self.motor_gain_down or UNCHANGED).high
         changes = {
-            "thrust_limits": (least * thrust.high / mass.low, most * greatest / mass.high),
+            "thrust_limits": (
+                least * thrust.high * rotors.high / mass.low,
+                most * greatest / mass.high,
+            ),
             "motor_gain_up": vehicle.motor_gain_up * up,
             "motor_gain_down": vehicle.motor_gain_down * down,
         }

@@ -44,6 +44,12 @@ def sample_vehicles(
             "motor_gain_down": p.motor_gain_down,
             "motor_integration": "exact",
             "drag": (p.drag_x, p.drag_y, p.drag_z),
+            "rotor_drag": (p.rotor_drag_x, p.rotor_drag_y, p.rotor_drag_z),
+            "translational_lift": p.translational_lift,
+            "airspeed_moment": (p.airspeed_moment_roll, p.airspeed_moment_pitch),
+            "rate_damping": (p.rate_damping_x, p.rate_damping_y, p.rate_damping_z),
+            "rotor_inertia": p.rotor_inertia,
+            "ground_effect_radius": p.ground_effect_radius,
             "rotor_thrust_limits": (
                 p.thrust_middle - p.thrust_half_range,
                 p.thrust_middle + p.thrust_half_range,

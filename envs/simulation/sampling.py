@@ -7,6 +7,7 @@ import numpy as np
 from sb3_quad.base.compiled import called, inlined, inner
 from sb3_quad.envs.simulation.observation import GUST_WORDS
 from sb3_quad.envs.simulation.random import (
+    AIR,
     DISTURBANCE,
     EPISODE,
     EPISODE_START,
@@ -217,6 +218,7 @@ def _randomize_vehicle(i, streams, table, vehicles):
     if u[0] >= table[R.share]:
         return
     v = vehicles[:, i]
+    _randomize_air(uniforms(streams, i, AIR), table, v)
     drag = v[P.mass] * between(table, R.drag, u[13], 0.0)
     for axis in range(3):
         v[P.drag_x + axis] += drag
@@ -241,6 +243,37 @@ def _randomize_vehicle(i, streams, table, vehicles):
     if table[R.delay + 2] != FIXED:
         delay = math.floor(between(table, R.delay, u[10], 0.0))
         v[P.delay] = min(delay, table[R.delay + 1] - 1.0)
+
+
+@called
+def _randomize_air(u, table, v):
+    """Replace the terms of :mod:`.aerodynamics` of a vehicle that is not yet randomized, in place.
+
+    :param u: 13 uniforms.
+    """
+    turning = 4.0 * math.sqrt(v[P.hover_thrust] / v[P.thrust_coefficient])
+    drag = between(table, R.rotor_drag, u[4], -1.0)
+    for axis in range(3):
+        if drag >= 0.0:
+            v[P.rotor_drag_x + axis] = drag * v[P.mass] / turning
+        inertia = v[P.ixx + axis]
+        own = v[P.rate_damping_x + axis] / inertia
+        v[P.rate_damping_x + axis] = inertia * between(table, R.rate_damping, u[8 + axis], own)
+        if axis < 2:
+            k = P.airspeed_moment_roll + axis
+            own = v[k] * turning / inertia
+            v[k] = between(table, R.airspeed_moment, u[6 + axis], own) * inertia / turning
+    own = v[P.translational_lift] / v[P.mass]
+    v[P.translational_lift] = v[P.mass] * between(table, R.translational_lift, u[5], own)
+    own = v[P.rotor_inertia] / v[P.izz]
+    v[P.rotor_inertia] = v[P.izz] * between(table, R.rotor_inertia, u[11], own)
+    arm = arm_length(v)
+    own = v[P.ground_effect_radius] / arm
+    v[P.ground_effect_radius] = arm * between(table, R.ground_effect_radius, u[12], own)
+    for rotor in range(4):
+        factor = between(table, R.rotors, u[rotor], 1.0)
+        v[P.thrust_factor_0 + rotor] *= factor
+        v[P.hover_share_0 + rotor] /= factor
 
 
 @called

@@ -79,6 +79,9 @@ W = first_rows(WRENCH)
 
 # The rows of a vehicle's parameters
 P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
+# Of those, what the wind acts through, and what switches the terms of aerodynamics.py off
+FELT = [*range(P.drag_x, P.drag_z + 1), *range(P.rotor_drag_x, P.rate_damping_x)]
+STILL = np.array([[0.0]] * (P.thrust_factor_0 - P.rotor_drag_x) + [[1.0]] * 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +160,7 @@ class QuadcopterState:
         assert self.vehicles is not None and self.wrench is not None
         force = np.einsum("nji,jn->ni", self.rotation, self.wrench[FORCE_WORLD])
         force += self.wrench[FORCE_BODY].T
-        squares = np.square(self.rotor_speeds).sum(axis=1)
-        force[:, 2] += self.vehicles[P.thrust_coefficient] * squares
+        force[:, 2] += thrusts_far_from_ground(self.array, self.vehicles)
         return np.asarray(force / self.vehicles[P.mass][:, None])
 
     @property
@@ -202,16 +204,63 @@ def rotation_matrices(quaternions: FloatArray) -> FloatArray:
 def drag_forces(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> FloatArray:
     """Return the drag of n vehicles, (3, n), world frame, N.
 
-    It is -R diag(d) Rᵀ (v - wind) (Faessler, Franchi and Scaramuzza, RA-L 2018).
+    It is -R diag(d + k Σω) Rᵀ (v - wind), with the sum Σω of the rotor speeds (Faessler, Franchi
+    and Scaramuzza, RA-L 2018).
 
     :param state: (STATE_SIZE, n).
     :param vehicles: parameters, (len(PARAMETER_NAMES), n).
     :param wind: velocity of the air, (3, n), world frame, m/s.
     """
+    by_rotors = vehicles[P.rotor_drag_x : P.rotor_drag_z + 1] * state[ROTOR_SPEEDS].sum(axis=0)
+    in_body = (vehicles[P.drag_x : P.drag_z + 1] + by_rotors) * _airspeeds(state, wind)
+    return np.asarray(-np.einsum("nij,jn->in", rotation_matrices(state[QUATERNION].T), in_body))
+
+
+def _airspeeds(state: FloatArray, wind: FloatArray) -> FloatArray:
+    """Return the airspeeds of n vehicles, (3, n), body frame, m/s."""
     rotation = rotation_matrices(state[QUATERNION].T)
-    airspeed = state[VELOCITY] - wind
-    in_body = vehicles[P.drag_x : P.drag_z + 1] * np.einsum("nji,jn->in", rotation, airspeed)
-    return np.asarray(-np.einsum("nij,jn->in", rotation, in_body))
+    return np.asarray(np.einsum("nji,jn->in", rotation, state[VELOCITY] - wind))
+
+
+def air_wrenches(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> FloatArray:
+    """Return the wrench of the air on n vehicles, (WRENCH_SIZE, n): drag, and what
+    :mod:`.aerodynamics` lists. The yaw reaction of rotors that speed up and the ground effect are
+    not included.
+
+    The arguments are those of :func:`drag_forces`.
+    """
+    wrench = np.zeros((WRENCH_SIZE, state.shape[1]))
+    wrench[FORCE_WORLD] = drag_forces(state, vehicles, wind)
+    vx, vy, _ = _airspeeds(state, wind)
+    wrench[W.force_body + 2] = vehicles[P.translational_lift] * (vx**2 + vy**2)
+    total = state[ROTOR_SPEEDS].sum(axis=0)
+    momentum = rotor_momenta(vehicles, state[ROTOR_SPEEDS])
+    roll_rate, pitch_rate, _ = state[BODY_RATES]
+    roll = vehicles[P.airspeed_moment_roll] * total * vy - momentum * pitch_rate
+    pitch = momentum * roll_rate - vehicles[P.airspeed_moment_pitch] * total * vx
+    damping = vehicles[P.rate_damping_x : P.rate_damping_z + 1]
+    wrench[TORQUE_BODY] = np.stack([roll, pitch, 0.0 * roll]) - damping * state[BODY_RATES]
+    return wrench
+
+
+def rotor_momenta(vehicles: FloatArray, speeds: FloatArray) -> FloatArray:
+    """Return the angular momenta of the rotors about body z, (n,), N m s, at speeds (4, n)."""
+    spins = -np.sign(vehicles[P.yaw_arm_0 : P.yaw_arm_0 + 4])
+    return np.asarray(vehicles[P.rotor_inertia] * (spins * speeds).sum(axis=0))
+
+
+def ground_effects(state: FloatArray, vehicles: FloatArray) -> FloatArray:
+    """Return the factors of the thrust of n vehicles near the ground, (n,)."""
+    radius = vehicles[P.ground_effect_radius]
+    height = np.maximum(state[X.position + 2], np.maximum(0.5 * radius, 1e-9))
+    return np.asarray(1.0 / (1.0 - (radius / (4.0 * height)) ** 2))
+
+
+def thrusts_far_from_ground(state: FloatArray, vehicles: FloatArray) -> FloatArray:
+    """Return the sums of the rotor thrusts of n vehicles without ground effect, (n,), N."""
+    factors = vehicles[P.thrust_factor_0 : P.thrust_factor_0 + 4]
+    squares = (factors * np.square(state[ROTOR_SPEEDS])).sum(axis=0)
+    return np.asarray(vehicles[P.thrust_coefficient] * squares)
 
 
 def make_wrench(

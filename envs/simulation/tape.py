@@ -200,6 +200,7 @@ class FlightTape:
             self._grad_actions,
             self.physics_step,
             self.substeps,
+            batch.in_air,
         )
         result: FloatArray = self._grad_actions[step]
         return result
@@ -209,7 +210,7 @@ class FlightTape:
 def step_vjp(
     control, leads, step, lengths, states, actions, queue, streams, wrench, wind, vehicles, scaling,
     moves, for_px4, ages, integrals, integral_numbers, grad_observation, grad_frames, grad_integral,
-    gradient, grad_actions, physics_step, substeps,
+    gradient, grad_actions, physics_step, substeps, in_air,
 ):  # fmt: skip
     """Vector-Jacobian product of a control step and the observation after it, see FlightTape.
 
@@ -244,7 +245,7 @@ def step_vjp(
             count = min(LANES, n - first)
             for lane in range(LANES):
                 b.row[lane] = first + min(lane, count - 1)
-            load_vehicles(b, vehicles, first, physics_step)
+            load_vehicles(b, vehicles, first, physics_step, in_air)
             load_rows(gradient, first, own)
             if step + 1 < len(actions):
                 load_scaling(b, scaling)
@@ -280,7 +281,7 @@ def step_vjp(
                 limit_speeds(b, b.wanted_speeds, lane)
                 if step >= lengths[i]:
                     own[:, lane] = 0.0
-            flight_vjp(b, substep_states, own, grad_wanted, physics_step, substeps)
+            flight_vjp(b, substep_states, own, grad_wanted, physics_step, substeps, in_air)
             limits_vjp(b, grad_wanted)
             save_rows(own, first, count, gradient)
             for lane in range(count):

@@ -170,6 +170,8 @@ def sample_from_distribution(i, streams, table, vehicles):
     for axis in range(3):
         nominal = v[P.drag_x + axis] * mass_ratio / mass
         v[P.drag_x + axis] = mass * between(table, D.drag, u[9], nominal)
+        v[P.rotor_drag_x + axis] *= mass_ratio
+    v[P.translational_lift] *= mass_ratio
     v[P.mass] = mass
     v[P.hover_thrust] = hover
     v[P.thrust_middle] = hover * (most + least) / 2.0
@@ -186,13 +188,15 @@ def sample_from_distribution(i, streams, table, vehicles):
     x = table[D.size_deviation] * (normal - 1.0)
     size = mass_ratio ** (1.0 / 3.0) * (1.0 + x if x >= 0.0 else 1.0 / (1.0 - x))
     v[P.collision_radius] *= size
+    v[P.ground_effect_radius] *= size
     ratio = between(table, D.moment_thrust_ratio, u[4], 1.0)
     for rotor in range(4):
         v[P.roll_arm_0 + rotor] *= size
         v[P.pitch_arm_0 + rotor] *= size
         v[P.yaw_arm_0 + rotor] = math.copysign(ratio, v[P.yaw_arm_0 + rotor])
 
-    # Inertia: the ratios of its axes, then its size by Ixx.
+    # Inertia: the ratios of its axes, then its size by Ixx. Moments of the air grow with it.
+    before = v[P.ixx], v[P.iyy], v[P.izz]
     if table[D.inertia_ratios] != 0.0:
         for axis in range(3):
             v[P.ixx + axis] = table[D.inertia_ratios + axis]
@@ -200,6 +204,11 @@ def sample_from_distribution(i, streams, table, vehicles):
     factor = torque / between(table, D.torque_to_inertia, u[2], 1.0) / v[P.ixx]
     for axis in range(3):
         v[P.ixx + axis] *= factor
+        growth = v[P.ixx + axis] / before[axis]
+        v[P.rate_damping_x + axis] *= growth
+        if axis < 2:
+            v[P.airspeed_moment_roll + axis] *= growth
+    v[P.rotor_inertia] *= v[P.izz] / before[2]
 
 
 @called

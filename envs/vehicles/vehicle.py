@@ -66,6 +66,22 @@ PARAMETER_NAMES = (
     "hover_share_1",
     "hover_share_2",
     "hover_share_3",
+    # Those of simulation/aerodynamics.py come last.
+    "rotor_drag_x",
+    "rotor_drag_y",
+    "rotor_drag_z",
+    "translational_lift",
+    "airspeed_moment_roll",
+    "airspeed_moment_pitch",
+    "rate_damping_x",
+    "rate_damping_y",
+    "rate_damping_z",
+    "rotor_inertia",
+    "ground_effect_radius",
+    "thrust_factor_0",
+    "thrust_factor_1",
+    "thrust_factor_2",
+    "thrust_factor_3",
 )
 # A name is a part of file names, and of what reports and exported files say.
 # Of blanks, it may hold the space alone, since others end a line.
@@ -74,6 +90,8 @@ NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Limits = tuple[NonNegative, Quantity]
 # Below, nothing spins up or falls within a flight.
 Rate = Annotated[float, Field(ge=0.01, le=LARGEST)]
+Moment = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+ThrustFactor = Annotated[float, Field(ge=0.1, le=10.0)]
 Coordinate = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Place = tuple[Coordinate, Coordinate]
 # Radii of gyration by the rotors' distance from the centre; beyond, an inertia has another unit.
@@ -127,6 +145,24 @@ class Vehicle(Frozen):
     """euler: Eq. 4.1 as printed; exact: the exponential, and the thrust at the middle of a step"""
     drag: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
     """d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"""
+    rotor_drag: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    """k of the drag -k Σω (v - wind) along each body axis, with the sum of the rotor speeds, kg/rad
+    """
+    translational_lift: NonNegative = 0.0
+    """force along body z by the square of the airspeed across it, kg/m"""
+    airspeed_moment: tuple[Moment, Moment] = (0.0, 0.0)
+    """moment about x (roll) by Σω and the airspeed along y, and about y (pitch) by that along x,
+    kg m/rad; positive: it turns the thrust against the airspeed, so the nose rises in forward
+    flight
+    """
+    rate_damping: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    """d of the moment -d ω about each body axis, N m s"""
+    rotor_inertia: NonNegative = 0.0
+    """moment of inertia of a rotor about its axis, kg m^2: gyroscopic moment and yaw reaction"""
+    ground_effect_radius: NonNegative = 0.0
+    """R of the ground effect 1 / (1 - (R / 4z)^2) on the thrust, a rotor's radius or more, m"""
+    thrust_factors: tuple[ThrustFactor, ThrustFactor, ThrustFactor, ThrustFactor] = (1.0,) * 4
+    """factor of the thrust and drag moment of each rotor at its speed"""
     gravity: Rate = GRAVITY
     """g, m/s^2"""
     thrust_limits: Limits = _NO_LIMITS
@@ -230,6 +266,11 @@ class Vehicle(Frozen):
                 f"inertia {list(self.inertia)}: has nothing in common with a mass of {self.mass:g} "
                 f"kg and rotors {self.arm_length:g} m from the centre; is it in kg m²?"
             )
+        if self.rotor_inertia > self.inertia[2]:
+            raise ValueError(
+                f"rotor_inertia {self.rotor_inertia:g}: exceeds the vehicle's Izz "
+                f"{self.inertia[2]:g}; is it in kg m²?"
+            )
         if not 1.0 < self.hover_rotor_speed < LARGEST:
             raise ValueError(
                 f"thrust_coefficient {self.thrust_coefficient:g}: rotors would hover at "
@@ -240,7 +281,8 @@ class Vehicle(Frozen):
             raise CannotHover(
                 f"rotor_positions: hover about this centre of mass takes {shares.min():.3g} to "
                 f"{shares.max():.3g} of m g / 4 of its rotors, whose thrust_limits are "
-                f"[{low:.4g}, {high:.4g}]; move it nearer to the middle of the rotors"
+                f"[{low:.4g}, {high:.4g}]; move it nearer to the middle of the rotors, or give "
+                "thrust_factors nearer to 1"
             )
         return self
 
@@ -251,6 +293,12 @@ class Vehicle(Frozen):
             raise ValueError(
                 f"control_step {self.control_step}: must be a whole multiple of physics_step "
                 f"{self.physics_step}, at most {MAX_SUBSTEPS} times"
+            )
+        damping = max(np.divide(self.rate_damping, self.inertia))
+        if damping * self.physics_step > 1.0:
+            raise ValueError(
+                f"rate_damping {list(self.rate_damping)}: divided by the inertia it is "
+                f"{damping:.3g} 1/s, which times physics_step may not exceed 1; is it in N m s?"
             )
         gain = max(self.motor_gain_up, self.motor_gain_down)
         most = LARGEST_STEP[self.motor_integration]
@@ -297,16 +345,18 @@ class Vehicle(Frozen):
         changes: StrDict = {name: getattr(self, name) for name in _FOUND}
         changes["rotor_positions"] = positions.tolist()
         changes["rotor_directions"] = other.rotor_directions
-        for name in ("inertia", "drag"):
-            values = getattr(self, name)
-            turned = turn.axes @ np.diag(values) @ turn.axes.T
-            if abs(turned[0, 1]) > 0.02 * min(values[:2]):
+        changes["thrust_factors"] = [self.thrust_factors[k] for k in turn.order]
+        # The moments by airspeed turn as the diagonal of a matrix does, like the others.
+        for name in ("inertia", "drag", "rotor_drag", "rate_damping", "airspeed_moment"):
+            values = np.array(getattr(self, name))
+            turned = turn.axes @ np.diag([*values, 0.0][:3]) @ turn.axes.T
+            if abs(turned[0, 1]) > 0.02 * np.abs(values[:2]).min():
                 raise ConfigError(
                     f"rotor_layout: {self.name} has to be turned by "
                     f"{math.degrees(turn.angle):.0f}° to the layout of {other.name}, "
                     f"but its {name} differs in x and y"
                 )
-            changes[name] = turned.diagonal().tolist()
+            changes[name] = turned.diagonal()[: len(values)].tolist()
         return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
@@ -316,14 +366,19 @@ class Vehicle(Frozen):
 
     @property
     def mixer(self) -> FloatArray:
-        """[ΣF; Mx; My; Mz] = mixer · F, shape (4, 4), from rotor thrusts in N.
+        """[ΣF; Mx; My; Mz] = mixer · F, shape (4, 4), from rotor thrusts in N, before the
+        ``thrust_factors``.
 
         Eq. 2.7 prints this for a plus layout; ITM's rotors form an X, so that each acts on roll and
         pitch.
         """
+        return np.stack([np.ones(4), *self.rotor_arms]) * self.thrust_factors
+
+    @property
+    def rotor_arms(self) -> FloatArray:
+        """Moments about each axis for each rotor's own thrust, (3, 4), m."""
         x, y = np.array(self.rotor_positions).T
-        yaw = self.moment_thrust_ratio * np.array(self.rotor_directions)
-        return np.stack([np.ones(4), y, -x, yaw])
+        return np.stack([y, -x, self.moment_thrust_ratio * np.array(self.rotor_directions)])
 
     @property
     def mixer_inverse(self) -> FloatArray:
@@ -350,7 +405,7 @@ class Vehicle(Frozen):
 
     @property
     def hover_thrusts(self) -> FloatArray:
-        """Thrusts of the rotors in hover, (4,), N."""
+        """Thrusts of the rotors in hover, (4,), N, before the ``thrust_factors``."""
         return self.hover_shares * self.hover_thrust
 
     @property
@@ -459,8 +514,15 @@ class Vehicle(Frozen):
                 self.saturation == "shared",
                 self.collision_radius,
                 self.delay,
-                *self.mixer[1:].flat,
+                *self.rotor_arms.flat,
                 *self.hover_shares,
+                *self.rotor_drag,
+                self.translational_lift,
+                *self.airspeed_moment,
+                *self.rate_damping,
+                self.rotor_inertia,
+                self.ground_effect_radius,
+                *self.thrust_factors,
             ]
         )
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.state import (
+    FELT,
     FORCE_WORLD,
     WRENCH_SIZE,
-    P,
     QuadcopterState,
     drag_forces,
 )
@@ -80,7 +80,7 @@ class GeometricExpert(Expert):
     @staticmethod
     def _to_compensate(state: QuadcopterState, wrench: FloatArray) -> FloatArray:
         """Return the external wrench without a part of the drag from the vehicles' own motion."""
-        if state.vehicles is None or not state.vehicles[P.drag_x : P.drag_z + 1].any():
+        if state.vehicles is None or not state.vehicles[FELT].any():
             return wrench
         # The drag in air that moves with the reference is caused by velocity errors.
         air = state.target_velocity.T

@@ -66,7 +66,8 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
     gravity = v[P.gravity]
     lag = command_lag(v, control_step)
     roll_pitch_arms = v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)
-    moments = np.abs(roll_pitch_arms).sum(axis=1) * v[P.thrust_half_range]
+    factors = v[P.thrust_factor_0 : P.thrust_factor_0 + 4]
+    moments = np.abs(roll_pitch_arms * factors).sum(axis=1) * v[P.thrust_half_range]
     turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
     rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
 
@@ -118,6 +119,8 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
     # [ΣF; Mx; My; Mz] = mixer · F: ones, then the arms of the rotors about each axis.
     arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
     mixers = np.concatenate([np.ones_like(arms[:1]), arms])
+    # Commanded thrusts: those that the rotors give, divided by their factors
+    mixers *= v[P.thrust_factor_0 : P.thrust_factor_0 + 4]
     inverse = np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0)
     # A randomized centre of mass may lie outside the rotors, where a share would be negative.
     inverse[:, 0] = np.maximum(inverse[:, 0], 0.01)
