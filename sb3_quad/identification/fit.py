@@ -6,6 +6,7 @@ the rotors. Intervals follow from leaving out one block of the flights at a time
 the equations linearised at the optimum.
 """
 
+from copy import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -203,41 +204,50 @@ def fit_vehicle(
     """
     require("scipy.optimize", "fit", "fitting a vehicle")
     report = show or (lambda done, total, text: None)
-    report(0, 5, "regressions")
+    report(0, 6, "regressions")
     guess = first_guess(logs, start)
     keys, held = keys_for(logs, guess)
-    short, long = (SHORT, LONG) if all(log.has_motion for log in logs) else (SHORT_RATES, LONG_RATES)
-    report(1, 5, "short horizons")
+    has_motion = all(log.has_motion for log in logs)
+    short = SHORT if has_motion else SHORT_RATES
+    long = LONG if has_motion else LONG_RATES
+    report(1, 6, "short horizons")
     model = Model(logs, guess, keys, short)
     vector = model.solve(_scaled_moments(model), 12)
-    report(2, 5, "all horizons")
+    report(2, 6, "all horizons")
     model = Model(logs, guess, keys, long)
     for _ in range(2):
         model.weigh(vector)
         vector = model.solve(vector, 8)
-    report(3, 5, "intervals")
-    kept, widths, reasons = _told(model, vector)
-    best = model.scaling.guess(vector)
-    # A vehicle's delay is a whole number of control steps, and its lag makes up for the rest.
-    steps = round(max(best.delay, 0.0) / start.control_step)
-    fixed = {key: value(guess, key) for key in reasons} | {DELAY: steps * start.control_step}
+    report(3, 6, "intervals")
+    kept, reasons = _told(model, vector)
+    held |= reasons
+    known = {key: value(guess._replace(vehicle=start), key) for key in reasons}
+    model = _again(model, with_values(model.scaling.guess(vector), known), kept)
+    report(4, 6, "what the logs tell")
+    vector = model.solve(np.zeros(len(kept)), 8)
+    found = model.scaling.values(vector).tolist()
+    widths = model.scaling.widths(vector, jackknife(*model.equations(vector))).tolist()
     estimates = []
-    if DELAY in kept:
-        estimates.append(Estimate(DELAY, best.delay, widths[kept.index(DELAY)]))
-        kept.remove(DELAY)
-    report(4, 5, "what the logs tell")
-    final = Model(logs, with_values(best, fixed), kept, long)
-    final.sizes = model.sizes
-    vector = final.solve(np.zeros(len(kept)), 8)
-    fitted = final.scaling.guess(vector)
-    widths = final.scaling.widths(vector, jackknife(*final.equations(vector)))
-    for key, width in zip(kept, widths.tolist(), strict=True):
-        number = value(fitted, key)
+    for key, number, width in zip(kept, found, widths, strict=True):
         estimates.append(Estimate(key, number, max(width, LEAST_WIDTH * abs(number))))
-    for key, reason in (held | reasons).items():
-        estimates.append(Estimate(key, value(guess, key), np.nan, reason))
-    report(5, 5, "done")
+    for key, reason in held.items():
+        estimates.append(Estimate(key, value(guess._replace(vehicle=start), key), np.nan, reason))
+    # The delay of a vehicle is a whole number of control steps, and its lag makes up for the rest.
+    report(5, 6, "with whole steps of delay")
+    best = model.scaling.guess(vector)
+    steps = round(best.delay / start.control_step)
+    kept.remove(DELAY)
+    model = _again(model, best._replace(delay=steps * start.control_step), kept)
+    fitted = model.scaling.guess(model.solve(np.zeros(len(kept)), 5))
+    report(6, 6, "done")
     return Fit(_as_file(start, fitted, logs, steps, name), fitted.curve, estimates)
+
+
+def _again(model: Model, start: Guess, keys: Sequence[Key]) -> Model:
+    """Return a model of the same errors from another start."""
+    again = copy(model)
+    again.scaling = Scaling(start, keys)
+    return again
 
 
 def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
@@ -304,36 +314,28 @@ def jackknife(squares: FloatArray, products: FloatArray) -> FloatArray:
     return np.asarray(t.ppf(0.975, count - 1) * spread)
 
 
-def _told(model: Model, vector: FloatArray) -> tuple[list[Key], FloatArray, dict[Key, str]]:
-    """Return the parameters that the logs tell, half of their intervals, and why others are not.
+def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
+    """Return the parameters that the logs tell, and why they do not tell the others.
 
     The least certain one is held first, which makes the others more certain.
     """
     squares, products = model.equations(vector)
     scaling = model.scaling
     values = scaling.values(vector)
+    # A zero must be told from what was found.
+    allowed = np.maximum(LARGEST_WIDTH * np.abs(values), 1e-30)
+    allowed[[key[0] in ("curve", "delay") for key in scaling.keys]] = np.inf
     reasons = {}
     kept = np.arange(len(vector))
     while True:
-        narrow = squares[:, kept][:, :, kept], products[:, kept]
-        widths = scaling.widths(vector, _spread(jackknife(*narrow), kept, len(vector)))[kept]
-        allowed = []
-        for k in kept:
-            key = scaling.keys[k]
-            free = key[0] in ("curve", "delay")
-            # A linear parameter whose start is 0 must be told from 0.
-            allowed.append(np.inf if free else max(LARGEST_WIDTH * abs(values[k]), 1e-30))
-        worst = np.argmax(widths / allowed)
+        half = np.zeros(len(vector))
+        half[kept] = jackknife(squares[:, kept][:, :, kept], products[:, kept])
+        widths = scaling.widths(vector, half)
+        worst = int(np.argmax(widths / allowed))
         if widths[worst] <= allowed[worst]:
-            return [scaling.keys[k] for k in kept], widths, reasons
-        reasons[scaling.keys[kept[worst]]] = f"its interval would be ± {widths[worst]:.2g}"
-        kept = np.delete(kept, worst)
-
-
-def _spread(values: FloatArray, places: FloatArray, size: int) -> FloatArray:
-    whole = np.zeros(size)
-    whole[places] = values
-    return whole
+            return [scaling.keys[k] for k in kept], reasons
+        reasons[scaling.keys[worst]] = f"its interval would be ± {widths[worst]:.2g}"
+        kept = kept[kept != worst]
 
 
 def _as_file(

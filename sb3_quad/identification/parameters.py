@@ -19,6 +19,7 @@ AXES = ("x", "y", "z")
 LEAST_RATE = 0.05
 # The most that the logarithm of a positive parameter may change
 LARGEST_CHANGE = 2.5
+LARGEST_DAMPING = 3.0  # times the typical one
 FASTEST = LARGEST_STEP["exact"] / MAX_PHYSICS_STEP  # 1/s
 
 
@@ -140,6 +141,9 @@ class Scaling:
         is_linear = self.sizes > 0.0
         self.least = np.where(is_linear, linear, -LARGEST_CHANGE) - 1e-9
         self.most = np.where(is_linear, np.inf, LARGEST_CHANGE)
+        # More would be the controller's damping, which the commands contain.
+        damped = [key[0] == "rate_damping" for key in keys]
+        self.most[damped] = linear[damped] + LARGEST_DAMPING
         self.low = low
         self.high = np.array([FASTEST if key[0] == "motor_gain_up" else np.inf for key in keys])
 
