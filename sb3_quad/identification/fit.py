@@ -122,8 +122,11 @@ class Model:
             if self.force is not None:
                 found[4].append(flown[:, MOTION_SIZE:] - self.force[rows, None])
         parts = [np.stack(one, axis=1) if one else np.zeros((0, 0, 0)) for one in found]
-        # The first body rate of a window is as noisy as the others: only changes count.
-        parts[3] = parts[3] - parts[3].mean(axis=1, keepdims=True)
+        # The first body rate of a window is as noisy as the others: only changes count. Where the
+        # airspeed is unknown, so are the moments of the air, which change slowly.
+        times = np.array(windows.ends, float)
+        slow = np.vander(times / times[-1], 1 if self.has_motion else 2)
+        parts[3] -= np.einsum("hk,wkc->whc", slow @ np.linalg.pinv(slow), parts[3])
         return parts
 
     def residuals(self, vector: FloatArray) -> FloatArray:
@@ -160,7 +163,7 @@ class Model:
         count = len(vector)
         solution = least_squares(
             lambda x: self.residuals(x).ravel(),
-            vector,
+            np.clip(vector, self.scaling.least, self.scaling.most),
             jac=lambda x: self.slopes(x).reshape(-1, count),
             bounds=(self.scaling.least, self.scaling.most),
             loss="soft_l1",

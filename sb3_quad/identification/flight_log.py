@@ -39,6 +39,7 @@ LONGEST_GAP = 0.05
 LEAST_MOTION = 0.2
 # Products of what is measured and what it should be, by the squares of the larger one
 LEAST_AGREEMENT = 0.1
+AVERAGED = 0.1  # s
 # Clock offsets that are tried, s
 OFFSETS = np.arange(-0.1, 0.1005, 0.001)
 # The least that a log needs: rotors that spin up, and the longest horizon, s
@@ -279,7 +280,7 @@ def _fill_motion(
         motion[:, POSITION] = _resampled(series["position"], grid)
         flying &= motion[:, 2] > LEAST_HEIGHT
         speeds = np.gradient(motion[:, POSITION], step, axis=0)
-        _refuse_unlike(path, "velocity", velocity[flying], speeds[flying])
+        _refuse_unlike(path, "velocity", velocity[flying], speeds[flying], step)
     else:
         motion[:, POSITION] = np.cumsum(velocity, axis=0) * step
 
@@ -287,7 +288,7 @@ def _fill_motion(
         return _resampled(series["gyro"], grid + behind)[flying] - rates[flying]
 
     offset = float(min(OFFSETS, key=lambda behind: float(np.square(gap(behind)).sum())))
-    _refuse_unlike(path, "gyro", gap(offset) + rates[flying], rates[flying])
+    _refuse_unlike(path, "gyro", gap(offset) + rates[flying], rates[flying], step)
     force = np.gradient(velocity, step, axis=0)
     force[:, 2] += GRAVITY
     if flying.any():
@@ -327,14 +328,19 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
     return replace(log, flying=flying)
 
 
-def _refuse_unlike(path: Path, what: str, measured: FloatArray, other: FloatArray) -> None:
+def _refuse_unlike(
+    path: Path, what: str, measured: FloatArray, other: FloatArray, step: float
+) -> None:
     """Refuse columns (n, 3) that have another unit, sign or axis than what others say.
 
     :raises ConfigError: the message names the column.
     """
-    for axis, own, expected in zip("xyz", measured.T, other.T, strict=True):
+    # Means over blocks: what follows from positions and attitudes is noisy.
+    block = round(AVERAGED / step)
+    count = len(measured) // block
+    means = [rows[: count * block].reshape(count, block, 3).mean(axis=1) for rows in (measured, other)]
+    for axis, own, expected in zip("xyz", means[0].T, means[1].T, strict=True):
         larger = max(own @ own, expected @ expected)
-        # What follows from an attitude is noisy.
         if own @ expected < LEAST_AGREEMENT * larger and larger > len(own) * LEAST_MOTION**2:
             raise ConfigError(
                 f"{path}: {what} {axis} contradicts the motion; check units, axes and the order of "
