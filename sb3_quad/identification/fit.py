@@ -15,7 +15,7 @@ import numpy as np
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, StrDict
-from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, VELOCITY
+from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
 from sb3_quad.identification.curve import Curve, refuse_other_order, regress
 from sb3_quad.identification.flight_log import MOTION_SIZE, Log
@@ -39,6 +39,7 @@ LONG = (0.05, 0.1, 0.2, 0.3, 0.5)
 SHORT_RATES = (0.02, 0.04, 0.06, 0.08, 0.1)
 LONG_RATES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14, 0.16, 0.18, 0.2)
 WARM_UP = 0.25
+SMOOTHED = 0.1
 MOST_WINDOWS = 1500
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
@@ -52,8 +53,10 @@ BLOCKS = 20
 # Half an interval, as a part of a positive parameter or of a typical linear one, beyond which the
 # logs do not tell it
 LARGEST_WIDTH = 0.4
-# No interval is narrower than this part of its value: clocks and sampling are not known better.
-LEAST_WIDTH = 0.01
+# No interval is narrower than this part of its value, or this many seconds of a delay: simulated
+# logs with noise show such errors beyond the jackknife's intervals.
+LEAST_WIDTH = 0.03
+LEAST_DELAY_WIDTH = 0.0015
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,10 @@ class Model:
         # Windows of body rates alone share no sample.
         stride = ends[-1] if not self.has_motion else max(1, round(rows / MOST_WINDOWS))
         self.windows = Windows(logs, start.vehicle, ends, stride, WARM_UP)
+        if self.has_motion:
+            # The noise of where a window begins would grow with some parameters, and bias them.
+            smooth = np.concatenate([_smoothed(log) for log in logs])
+            self.windows.start = smooth[self.windows.rows]
         self.force = None
         if all(log.force is not None for log in logs):
             self.force = np.concatenate([log.force for log in logs])
@@ -232,7 +239,8 @@ def fit_vehicle(
     widths = model.scaling.widths(vector, jackknife(*model.equations(vector))).tolist()
     estimates = []
     for key, number, width in zip(kept, found, widths, strict=True):
-        estimates.append(Estimate(key, number, max(width, LEAST_WIDTH * abs(number))))
+        least = LEAST_DELAY_WIDTH if key == DELAY else LEAST_WIDTH * abs(number)
+        estimates.append(Estimate(key, number, max(width, least)))
     for key, reason in held.items():
         estimates.append(Estimate(key, value(guess._replace(vehicle=start), key), np.nan, reason))
     # The delay of a vehicle is a whole number of control steps, and its lag makes up for the rest.
@@ -244,6 +252,18 @@ def fit_vehicle(
     fitted = model.scaling.guess(model.solve(np.zeros(len(kept)), 5))
     report(6, 6, "done")
     return Fit(_as_file(start, fitted, logs, steps, name), fitted.curve, estimates)
+
+
+def _smoothed(log: Log) -> FloatArray:
+    """Return the motion of a log with position, attitude and velocity smoothed, (n, 13)."""
+    from scipy.signal import savgol_filter
+
+    motion = log.motion.copy()
+    slow = slice(0, VELOCITY.stop)
+    size = 2 * round(0.5 * SMOOTHED / log.step) + 1
+    motion[:, slow] = savgol_filter(motion[:, slow], size, 2, axis=0)
+    motion[:, QUATERNION] /= np.linalg.norm(motion[:, QUATERNION], axis=1, keepdims=True)
+    return motion
 
 
 def _again(model: Model, start: Guess, keys: Sequence[Key]) -> Model:

@@ -7,6 +7,7 @@ force lies along z.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ LONGEST_GAP = 0.05
 LEAST_MOTION = 0.2
 # Products of what is measured and what it should be, by the squares of the larger one
 LEAST_AGREEMENT = 0.1
+WORTH_A_SHIFT = 0.998
 AVERAGED = 0.1  # s
 # Clock offsets that are tried, s
 OFFSETS = np.arange(-0.1, 0.1005, 0.001)
@@ -78,6 +80,13 @@ class Log:
         """
         edges = self.begin + self.offset - delay + self.step * np.arange(len(self.flying) + 1)
         return _held_means(self.commands, edges)
+
+    @cached_property
+    def mean_velocity(self) -> FloatArray:
+        """Mean velocity in the air, (3,), body axes, m/s."""
+        motion = self.motion[self.flying]
+        rotation = rotation_matrices(motion[:, QUATERNION])
+        return np.asarray(np.einsum("nji,nj->i", rotation, motion[:, VELOCITY]) / len(motion))
 
     def part(self, rows: slice) -> "Log":
         """Return a log of which only some rows count."""
@@ -287,7 +296,11 @@ def _fill_motion(
     def gap(behind: float) -> FloatArray:
         return _resampled(series["gyro"], grid + behind)[flying] - rates[flying]
 
-    offset = float(min(OFFSETS, key=lambda behind: float(np.square(gap(behind)).sum())))
+    costs = np.array([np.square(gap(behind)).sum() for behind in OFFSETS])
+    # Noise alone must not move the clock.
+    unmoved = np.square(gap(0.0)).sum()
+    offset = float(OFFSETS[costs.argmin()]) if costs.min() < WORTH_A_SHIFT * unmoved else 0.0
+
     _refuse_unlike(path, "gyro", gap(offset) + rates[flying], rates[flying], step)
     force = np.gradient(velocity, step, axis=0)
     force[:, 2] += GRAVITY

@@ -104,14 +104,18 @@ def log_thrusts(
 ) -> FloatArray:
     """Return the commanded thrusts of all logs in the order of a vehicle's rotors, (n, 4), N.
 
-    The motors of each log are calibrated against each other, so that the mean commands yield no
-    moment.
+    The motors of each log are calibrated against each other, so that the mean moment of the
+    commands balances that of the air.
     """
     found = []
+    still = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
     for log in logs:
         thrusts = curve.thrust(log.mean_commands(delay))[:, rotor_columns(log, vehicle)]
         mean = thrusts[log.flying].mean(axis=0)
-        found.append(thrusts * (vehicle.hover_shares * mean.mean() / mean))
+        x, y, _ = log.mean_velocity * 4.0 * vehicle.hover_rotor_speed
+        roll, pitch = vehicle.airspeed_moment
+        wanted = still.mixer_inverse @ [mean.sum(), -roll * y, pitch * x, 0.0]
+        found.append(thrusts * wanted / mean)
     return np.concatenate(found)
 
 
@@ -133,11 +137,12 @@ def open_loop(
     """
     step = vehicle.control_step
     curve = curve or fit_curve(logs, vehicle)
-    # The motors are calibrated already.
     ends = [round(horizon / step) for horizon in HORIZONS]
     windows = Windows(logs, vehicle, ends, stride)
     start = windows.start
     thrusts = log_thrusts(logs, vehicle, curve)
+    # They are calibrated already.
+    vehicle = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
     for end, flown in zip(ends, windows.fly(vehicle, thrusts), strict=True):
         time = end * step
         stays = start.copy()
