@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.state import QUATERNION, VELOCITY, rotation_matrices
 from sb3_quad.envs.vehicles.layout import ORDERS
@@ -58,12 +59,11 @@ def specific_force(log: Log) -> FloatArray:
 
 def lagged(values: FloatArray, gain: float, step: float) -> FloatArray:
     """Return the response of a first-order lag to values, (n, columns), that begins at rest."""
-    from scipy.signal import lfilter, lfilter_zi
-
+    signal = require("scipy.signal", "fit", "the thrust of motors over their commands")
     kept = np.exp(-gain * step)
     ba = [1.0 - kept], [1.0, -kept]
-    begin = lfilter_zi(*ba)[:, None] * values[:1]
-    return np.asarray(lfilter(*ba, values, axis=0, zi=begin)[0])
+    begin = signal.lfilter_zi(*ba)[:, None] * values[:1]
+    return np.asarray(signal.lfilter(*ba, values, axis=0, zi=begin)[0])
 
 
 def fit_curve(logs: Sequence[Log], vehicle: Vehicle) -> Curve:
