@@ -123,7 +123,7 @@ class BatchEnv:
         """Return the true state of all rows, free of noise.
 
         It is a live view: the next step changes it, except for the velocity, acceleration and
-        heading of a reference, which stay as they were at this call. If there are gusts or drag,
+        heading of a reference, which stay as they were at this call. If there are gusts or air,
         its wrench includes them and is a copy.
         """
         return self.batch.true_state()
@@ -207,7 +207,8 @@ class BatchEnv:
         """Set the velocity of the air until you set another; if ``randomize`` samples a wind, until
         the next episode.
 
-        It acts through drag only, and a warning says so if no vehicle here has ``drag``.
+        It acts through drag and the terms of :mod:`~sb3_quad.envs.simulation.aerodynamics`, and a
+        warning says so if no vehicle here has any.
 
         :param velocity: (3,) for all these rows or (rows, 3), world frame, m/s.
         :raises ConfigError: a wrong shape, or a number that is not finite.

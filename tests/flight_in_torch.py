@@ -115,6 +115,13 @@ class Vehicles:
         self.shared = some(P.shared_saturation)
         self.arms = some(P.roll_arm_0, 12).reshape(n, 3, 4)
         self.delay = some(P.delay)[:, 0].long()
+        self.rotor_drag = some(P.rotor_drag_x, 3)
+        self.translational_lift = some(P.translational_lift)
+        self.airspeed_moment = some(P.airspeed_moment_roll, 2)
+        self.rate_damping = some(P.rate_damping_x, 3)
+        self.rotor_inertia = some(P.rotor_inertia)
+        self.ground_radius = some(P.ground_effect_radius)
+        self.thrust_factors = some(P.thrust_factor_0, 4)
 
     def commanded_speeds(self, actions):
         """Return the rotor speeds that actions command, (n, 4) (Eqs. 3.18 and 2.4)."""
@@ -136,13 +143,20 @@ class Vehicles:
         share = th.where(self.exact, x / (1 + x / 2 + x**2 / 12), x)
         speeds = old + share * (wanted_speeds - old)
         thrust = self.lift * speeds * th.where(self.exact, old, speeds)
+        height = th.maximum(state.position[:, 2:], 0.5 * self.ground_radius)
+        near = self.ground_radius / (4.0 * height)
+        thrust = thrust * self.thrust_factors / (1.0 - near.square())
 
         # Newton, in the world frame
         to_world = rotation(state.quaternion)
         to_body = to_world.transpose(1, 2)
         up = th.tensor([0.0, 0.0, 1.0], dtype=th.float64)
         in_body = wrench[:, FORCE_BODY] + thrust.sum(dim=1, keepdim=True) * up
-        in_body = in_body - self.drag * turn(to_body, state.velocity - wind)
+        air = turn(to_body, state.velocity - wind)
+        turning = speeds.sum(dim=1, keepdim=True)
+        in_body = in_body - (self.drag + self.rotor_drag * turning) * air
+        lift = self.translational_lift * air[:, :2].square().sum(dim=1, keepdim=True)
+        in_body = in_body + lift * up
         force = wrench[:, FORCE_WORLD] + turn(to_world, in_body)
         velocity = state.velocity + dt * (force / self.mass - self.gravity * up)
 
@@ -150,7 +164,14 @@ class Vehicles:
         rates = state.body_rates
         torque = wrench[:, TORQUE_BODY] + turn(to_body, wrench[:, TORQUE_WORLD])
         torque = torque + turn(self.arms, thrust)
-        torque = torque - th.linalg.cross(rates, self.inertia * rates)
+        # A rotor turns against the yaw moment of its drag. What rotors and body have turns along.
+        spins = -self.rotor_inertia * self.arms[:, 2].sign()
+        before, after = ((spins * each).sum(dim=1, keepdim=True) * up for each in (old, speeds))
+        torque = torque - th.linalg.cross(rates, self.inertia * rates + after)
+        torque = torque + (before - after) / dt - self.rate_damping * rates
+        roll, pitch = (turning * self.airspeed_moment).unbind(dim=1)
+        by_air = [roll * air[:, 1], -pitch * air[:, 0], th.zeros_like(roll)]
+        torque = torque + th.stack(by_air, dim=1)
         rates = rates + dt * torque / self.inertia
 
         # PyBullet's limits, in the world frame. Their derivative is taken as 1.

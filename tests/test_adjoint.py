@@ -164,6 +164,13 @@ RANDOM = {
     "gusts": st.just({"std": [0, 0.2], "unit": "weight", "time_constant": 0.1}),
     "wind": st.just([0, 5]),
     "wind_gusts": st.just({"std": [0, 2]}),
+    "rotors": st.just([0.85, 1.15]),
+    "rotor_drag": st.just([0.1, 1.0]),
+    "translational_lift": st.just([0, 0.1]),
+    "airspeed_moment": st.just([-5, 15]),
+    "rate_damping": st.just([0, 8]),
+    "rotor_inertia": st.just([0, 0.05]),
+    "ground_effect_radius": st.just([20, 200]),
 }
 SEEN = {
     "features": st.just("px4"),
@@ -195,6 +202,24 @@ DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
     steps=st.integers(1, 50),
     substeps=st.sampled_from([2, 4]),
     seed=st.integers(0, 2**31),
+)
+@example(
+    # Every term of the air, near and far from where the ground effect ends
+    vehicle={"vehicle": "cf21B_500"},
+    randomize={
+        "rotors": [0.85, 1.15],
+        "rotor_drag": [0.1, 1.0],
+        "translational_lift": [0, 0.1],
+        "airspeed_moment": [-5, 15],
+        "rate_damping": [0, 8],
+        "rotor_inertia": [0, 0.05],
+        "ground_effect_radius": [200, 1000],
+        "wind": [0, 5],
+    },
+    seen={},
+    steps=50,
+    substeps=4,
+    seed=3,
 )
 @example(
     # Where the integral stops and goes on depends on the noise.

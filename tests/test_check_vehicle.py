@@ -82,6 +82,7 @@ def test_the_geometric_expert_flies_them_with_gains_derived_or_found(name):
         ({"motor_gain": 0.033}, "motor_gain"),
         ({"motor_gain": 300.0}, "motor_gain"),
         ({"moment_thrust_ratio": 1.27}, "moment_thrust_ratio"),
+        ({"airspeed_moment": (0.0, -1e-3)}, "airspeed_moment"),
     ],
 )
 def test_warnings_are_about_units(changes, key):
@@ -103,13 +104,25 @@ def written(path, **changes):
 
 def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, capsys):
     limits = {"thrust_limits": None, "rotor_thrust_limits": [2.0, 6.0]}
-    own = written(tmp_path / "own.yaml", name="own", mass=1.5, **limits)
+    air = {
+        "rotor_drag": [1e-4, 1e-4, 2e-4],
+        "translational_lift": 0.015,
+        "rate_damping": [0.02, 0.03, 0.04],
+        "airspeed_moment": [1e-5, 2e-5],
+        "rotor_inertia": 1e-5,
+        "ground_effect_radius": 0.2,
+        "thrust_factors": [1.0, 0.95, 1.0, 1.0],
+    }
+    own = written(tmp_path / "own.yaml", name="own", mass=1.5, **limits, **air)
     assert main(["check-vehicle", own, "-n", "8"]) == 0
     printed = capsys.readouterr().out
     vehicle = load_vehicle(own)
     assert f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed
     moments = ", ".join(f"{each:.1f}" for each in vehicle.greatest_moments / vehicle.inertia)
     assert f"{moments} rad/s²" in printed
+    assert f"{1e-5 * vehicle.hover_speed_sum / vehicle.inertia[0]:.3g}, " in printed
+    assert "0.01 m/s² upwards" in printed and "+33 % at 0.1 m" in printed
+    assert f"{0.04 / vehicle.inertia[2]:.3g} 1/s of roll, pitch and yaw" in printed
     assert f"{1000 / vehicle.motor_gain_up:.1f} ms up" in printed
     assert re.search(r"success, % +│ +\S+ \(.* 100\.0 \(", printed)
     assert "thesis" not in printed  # its figures are of another vehicle

@@ -164,6 +164,16 @@ BREEZY = {
     "motor_gain_down": 12.0,
     "motor_integration": "exact",
 }
+AIRY = {
+    **BREEZY,
+    "rotor_drag": (1e-4, 2e-4, 3e-5),
+    "translational_lift": 0.02,
+    "airspeed_moment": (2e-5, -1e-5),
+    "rate_damping": (0.02, 0.03, 0.05),
+    "rotor_inertia": 1e-4,
+    "ground_effect_radius": 3.0,
+    "thrust_factors": (0.95, 1.0, 1.05, 1.02),
+}
 WORLD = {"mass": 1.2, "motor_gain": 0.7, "thrust": 0.9}
 BATTERY = NamedLayout(rotor_order="px4", arm_length=0.24, center_of_mass=(-0.03, 0.01)).rotors()
 
@@ -172,13 +182,16 @@ def vehicle_called(name):
     """A shipped vehicle, or ITM in wind, in another world, or with its battery elsewhere."""
     if name in VEHICLES.names():
         return load_vehicle(name)
-    changes = {"breezy": BREEZY, "battery": {**BATTERY, "thrust_coefficient": 0.0}}.get(name, {})
+    changes = {
+        "airy": AIRY,
+        "battery": {**BATTERY, "thrust_coefficient": 0.0},
+    }.get(name, {})
     return load_vehicle("itm").model_copy(update=changes)
 
 
 @node
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["crazyflie", "breezy", "other world", "battery"])
+@pytest.mark.parametrize("name", ["crazyflie", "airy", "other world", "battery"])
 def test_given_actions_lead_to_where_python_flies(name, tmp_path):
     vehicle = vehicle_called(name)
     task = {"start_position": (0.0, 0.0, 5000.0), "max_distance": 1e6}
@@ -345,7 +358,7 @@ def moving(vehicle, rng):
     state = np.zeros(STATE_SIZE)
     hover = math.sqrt(vehicle.mass * vehicle.gravity / 4 / vehicle.thrust_coefficient)
     attitude = rng.normal(size=4)
-    state[X.position : X.position + 3] = rng.normal(size=3)
+    state[X.position : X.position + 3] = 2.0 + rng.uniform(size=3)
     state[X.quaternion : X.quaternion + 4] = attitude / np.linalg.norm(attitude)
     state[X.velocity : X.velocity + 3] = 3 * rng.normal(size=3)
     state[X.body_rates : X.body_rates + 3] = 8 * rng.normal(size=3)
@@ -354,7 +367,7 @@ def moving(vehicle, rng):
 
 
 @node
-@pytest.mark.parametrize("changes", [{}, BREEZY], ids=["itm", "breezy"])
+@pytest.mark.parametrize("changes", [{}, BREEZY, AIRY], ids=["itm", "breezy", "airy"])
 def test_the_page_differentiates_its_physics(changes, tmp_path):
     vehicle = load_vehicle("itm").model_copy(update=changes)
     rng = np.random.default_rng(3)

@@ -69,7 +69,14 @@ def test_the_motors_are_cut_as_the_firmware_does(forces, is_cut):
 
 def test_the_specific_force_is_what_accelerates_but_the_weight():
     vehicle = load_vehicle("rotorpy_crazyflie").model_copy(
-        update={"physics_step": 1e-6, "control_step": 1e-6}
+        update={
+            "physics_step": 1e-6,
+            "control_step": 1e-6,
+            "rotor_drag": (1e-6, 2e-6, 3e-6),
+            "translational_lift": 1e-3,
+            "ground_effect_radius": 20.0,
+            "thrust_factors": (1.0, 0.9, 1.1, 1.0),
+        }
     )
     assert any(vehicle.drag)
     settings = FlightSettings(task="state_recovery", vehicle=vehicle, randomize={"wind": [2, 4]})

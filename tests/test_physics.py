@@ -71,10 +71,21 @@ class BulletReference:
             thrust = vehicle.lift * self.speeds * (before if exact else self.speeds)
             lift, *moments = vehicle.mixer @ thrust
             centre, attitude = pybullet.getBasePositionAndOrientation(body, **client)
-            airspeed = self.rotation(attitude).T @ (
-                np.array(pybullet.getBaseVelocity(body, **client)[0]) - wind
-            )
-            force = wrench[3:6] + np.array([0.0, 0.0, lift]) - np.array(vehicle.drag) * airspeed
+            r = self.rotation(attitude)
+            velocity, rates = pybullet.getBaseVelocity(body, **client)
+            airspeed, rates = r.T @ (np.array(velocity) - wind), r.T @ rates
+            radius, total = vehicle.ground_effect_radius, self.speeds.sum()
+            near = 1 / (1 - (radius / (4 * max(centre[2], radius / 2, 1e-9))) ** 2)
+            lift, moments = lift * near, near * np.array(moments)
+            lift += vehicle.translational_lift * (airspeed[0] ** 2 + airspeed[1] ** 2)
+            drag = np.array(vehicle.drag) + total * np.array(vehicle.rotor_drag)
+            force = wrench[3:6] + np.array([0.0, 0.0, lift]) - drag * airspeed
+            roll, pitch = total * np.array(vehicle.airspeed_moment)
+            moments += np.array([roll * airspeed[1], -pitch * airspeed[0], 0.0])
+            moments -= np.array(vehicle.rate_damping) * rates
+            spins = -vehicle.rotor_inertia * np.array(vehicle.rotor_directions)
+            moments -= np.cross(rates, [0.0, 0.0, spins @ self.speeds])
+            moments[2] -= spins @ (self.speeds - before) / vehicle.physics_step
             pybullet.applyExternalForce(
                 body, -1, wrench[:3], centre, pybullet.WORLD_FRAME, **client
             )
@@ -148,6 +159,20 @@ def worst_difference(vehicle, folder, state, actions, wrench, wind=(0.0, 0.0, 0.
     return np.abs(flown - expected).max(axis=0)
 
 
+def air(size, random):
+    """Fields of the terms of aerodynamics.py."""
+    each = random.uniform
+    return {
+        "rotor_drag": [size**2 * each(0, 2e-4) for _ in range(3)],
+        "translational_lift": size**2 * each(0, 0.02),
+        "airspeed_moment": [size**5 * each(-1e-5, 3e-5) for _ in range(2)],
+        "rate_damping": [size**5 * each(0, 0.05) for _ in range(3)],
+        "rotor_inertia": size**5 * each(0, 2e-4),
+        "ground_effect_radius": size * each(0, 40),
+        "thrust_factors": [each(0.9, 1.1) for _ in range(4)],
+    }
+
+
 @st.composite
 def vehicles(draw):
     size = draw(st.floats(0.3, 3.0))
@@ -174,6 +199,7 @@ def vehicles(draw):
         gravity=draw(st.floats(1.6, 12.0)),
         thrust_limits=(least, draw(st.floats(1.2, 1.5)) + off),
         delay=draw(st.integers(0, 3)),
+        **draw(st.just({}) | st.builds(air, st.just(size), st.randoms())),
         collision_radius=0.1,
     )
 

@@ -35,6 +35,13 @@ RANDOMIZE = {
     "gusts": {"std": [0, 1], "time_constant": 0.5},
     "wind": [0, 5],
     "wind_gusts": {"std": [0, 2], "time_constant": 0.5},
+    "rotors": [0.9, 1.1],
+    "rotor_drag": [0, 0.5],
+    "translational_lift": [0, 0.05],
+    "airspeed_moment": [-2, 10],
+    "rate_damping": [0, 8],
+    "rotor_inertia": [0, 0.02],
+    "ground_effect_radius": [0, 80],
 }
 IN_WEIGHTS = {
     "mass": [0.8, 1.2],
@@ -132,6 +139,23 @@ def test_an_episode_is_random_within_the_ranges():
         [0.0, 0.25, 0.5], abs=0.02
     )
     inertia = batch.vehicles[[P.ixx, P.iyy, P.izz]]
+    turning = load_vehicle("itm").hover_speed_sum
+    v = batch.vehicles[:, changed]
+    air = {
+        P.rotor_drag_z: (turning / base[P.mass], 0.0, 0.5),
+        P.translational_lift: (1.0 / base[P.mass], 0.0, 0.05),
+        P.airspeed_moment_roll: (turning / base[P.ixx], -2.0, 10.0),
+        P.airspeed_moment_pitch: (turning / base[P.iyy], -2.0, 10.0),
+        P.rate_damping_z: (1.0 / base[P.izz], 0.0, 8.0),
+        P.rotor_inertia: (1.0 / base[P.izz], 0.0, 0.02),
+        P.ground_effect_radius: (1.0 / load_vehicle("itm").arm_length, 0.0, 80.0),
+        **{P.thrust_factor_0 + k: (1.0, 0.9, 1.1) for k in range(4)},
+    }
+    for row, (unit, low, high) in air.items():
+        slack = 0.02 * (high - low)
+        assert unit * v[row].min() == pytest.approx(low, abs=slack)
+        assert unit * v[row].max() == pytest.approx(high, abs=slack)
+    assert (abs(np.corrcoef(v[[*air]])[np.triu_indices(len(air), 1)]) < 0.1).all()
     assert (2 * inertia.max(axis=0) <= inertia.sum(axis=0) * (1 + 1e-12)).all()
     assert [*np.unique(batch.vehicles[P.delay, changed])] == [0, 1, 2, 3]
     force = np.linalg.norm(batch.wrench[W.force_world : W.force_world + 3], axis=0)
@@ -285,10 +309,21 @@ def test_a_distribution_goes_with_an_agent_and_a_vehicle_replaces_it():
 
 def test_wind_carries_away_what_has_drag_and_the_privileged_expert_holds_against_it():
     windy = {"drag": 0.4, "wind": 4.0}
+    airy = {
+        **windy,
+        "rotors": [0.85, 1.15],
+        "rotor_drag": 0.2,
+        "airspeed_moment": [-1, 4],
+        "translational_lift": 0.02,
+        "rate_damping": [0, 8],
+        "rotor_inertia": 0.01,
+        "ground_effect_radius": [0, 40],
+    }
     for randomize, expert, least, most in (
         ({"wind": 4.0}, GeometricExpert(), 0.0, 1e-3),
         (windy, GeometricExpert(), 0.1, 2.0),
         (windy, privileged_geometric(), 0.0, 1e-3),
+        (airy, privileged_geometric(), 0.0, 1e-3),
     ):
         errors = fly(
             expert, "target_tracking", 48, seed=3, max_episode_steps=900, randomize=randomize

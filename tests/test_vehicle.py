@@ -14,6 +14,7 @@ from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import ROTOR_SPEEDS
+from sb3_quad.envs.vehicles.layout import find_turn
 from sb3_quad.envs.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert
@@ -182,7 +183,7 @@ def shifted(vehicle: Vehicle, x: float, y: float = 0.0) -> Vehicle:
 def test_hover_about_another_centre_of_mass_takes_four_thrusts(
     vehicle: Vehicle, x: float, y: float
 ) -> None:
-    changes = {"thrust_limits": (0.0, 5.0)}
+    changes = {"thrust_limits": (0.0, 5.0), "thrust_factors": (0.9, 1.1, 1.0, 0.95)}
     moved = shifted(vehicle.model_copy(update=changes), x, y)
     weight = moved.mass * moved.gravity
     wrench = moved.mixer @ moved.hover_thrusts
@@ -199,7 +200,8 @@ def test_a_centre_of_mass_about_which_it_cannot_hover_is_refused() -> None:
 
 
 def test_episodes_begin_in_hover_about_any_centre_of_mass() -> None:
-    vehicle = shifted(ITM, -0.2, 0.1)
+    unequal = ITM.model_copy(update={"thrust_factors": (0.95, 1.05, 1.0, 0.9)})
+    vehicle = shifted(unequal, -0.15, 0.1)
     batch = QuadcopterBatch(3, FlightSettings(vehicle=vehicle, noise=0.0), seed=0)
     batch.reset()
     speeds = np.sqrt(vehicle.hover_thrusts / vehicle.lift)
@@ -241,6 +243,26 @@ def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(na
         QuadcopterBatch(3, FlightSettings(vehicle=name, rotor_layout="itm")).vehicle_list
         == [turned] * 3
     )
+
+
+def test_what_the_air_does_turns_with_the_layout() -> None:
+    changes = {
+        "rotor_drag": (1e-4, 2e-4, 3e-4),
+        "airspeed_moment": (1e-5, -2e-5),
+        "thrust_factors": (1.0, 0.9, 1.1, 1.2),
+    }
+    vehicle = ITM.model_copy(update={**changes, "inertia": (0.01, 0.01, 0.02)})
+    other = ITM.model_copy(
+        update={"rotor_directions": tuple(-sign for sign in ITM.rotor_directions)}
+    )
+    turned = vehicle.in_layout_of(other)
+    np.testing.assert_allclose(turned.rotor_drag, (2e-4, 1e-4, 3e-4))
+    np.testing.assert_allclose(turned.airspeed_moment, (-2e-5, 1e-5))
+    turn = find_turn(vehicle, other)
+    assert turned.thrust_factors == tuple(vehicle.thrust_factors[k] for k in turn.order)
+    plus = load_vehicle("hummingbird").model_copy(update={"airspeed_moment": (1e-5, 2e-5)})
+    with pytest.raises(ConfigError, match="airspeed_moment"):
+        plus.in_layout_of(ITM)
 
 
 def test_a_layout_that_cannot_be_had_is_refused() -> None:

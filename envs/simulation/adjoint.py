@@ -144,13 +144,12 @@ def _accelerate_vjp(b, before, after, gradient, grad_wanted, lane, dt, in_air):
 
     # The air: its force, and the gradients with respect to the airspeed in the body frame, the sum
     # of the rotor speeds, and the rotors' angular momentum before and after the step
-    airspeed = subtract(vector(before[X.velocity :], lane), vector(b.wind, lane))
     in_air_force = 0.0, 0.0, 0.0
     grad_v = 0.0, 0.0, 0.0
     by_total = by_old = by_momentum = by_height = 0.0
     ground, slope = 1.0, 0.0
     if in_air:
-        v = to_body(r, airspeed)
+        v = to_body(r, subtract(vector(before[X.velocity :], lane), vector(b.wind, lane)))
         speeds = after[X.rotor_speeds :]
         total, momentum = speed_sum(speeds, lane), rotor_momentum(b, speeds, lane)
         in_air_force = air_force(b, v, total, lane)
@@ -173,20 +172,20 @@ def _accelerate_vjp(b, before, after, gradient, grad_wanted, lane, dt, in_air):
         b.thrust[k, lane] = lift * new * (new + exact * (old - new))
         grad_new = gradient[X.rotor_speeds + k, lane]
         grad_new += grad_thrust * (2.0 * new * (1.0 - exact) + exact * old)
-        grad_old = grad_thrust * exact * new
         if in_air:
-            spin = -math.copysign(b.rotor_inertia[lane], b.arm[2, k, lane])
-            grad_new += by_total + spin * by_momentum
-            grad_old += spin * by_old
+            grad_new += by_total + b.spin[k, lane] * by_momentum
             by_height += grad_thrust * new * (new + exact * (old - new))
         speeding_up, slowing_down = b.motor[0, lane], b.motor[1, lane]
         factor = speeding_up if b.wanted_speeds[k, lane] > old else slowing_down
         grad_wanted[k, lane] += factor * grad_new
-        gradient[X.rotor_speeds + k, lane] = (1.0 - factor) * grad_new + grad_old
+        gradient[X.rotor_speeds + k, lane] = (1.0 - factor) * grad_new + grad_thrust * exact * new
+        if in_air:
+            gradient[X.rotor_speeds + k, lane] += b.spin[k, lane] * by_old
     if in_air:
         gradient[X.position + 2, lane] += slope * by_height
 
     # Recompute the force in the body frame: drag from the airspeed, and the thrusts.
+    airspeed = subtract(vector(before[X.velocity :], lane), vector(b.wind, lane))
     drag = vector(b.drag, lane)
     fx, fy, fz = subtract(vector(b.force_body, lane), multiply(drag, to_body(r, airspeed)))
     force = fx, fy, fz + total_thrust(b, lane)

@@ -8,15 +8,14 @@ angular momentum H of the rotors about the body's z axis:
 - translational lift h (vx² + vy²) along z (four times RotorPy's k_h; Svacha et al., ICUAS 2017);
 - a moment by airspeed, a Σ vy about x and -b Σ vx about y: positive numbers turn the thrust against
   the airspeed (RotorPy's k_flap, with the other sign);
-- damping -d ω (Mahony, Kumar and Corke, "Multirotor aerial vehicles", 2012);
+- damping -d ω, since rotors flap as the body turns (Pounds, Mahony and Corke, "Modelling and
+  control of a large quadrotor robot", 2010);
 - the rotors' moments: -ω × H e_z, and -dH/dt about z;
 - near the ground, thrust times 1 / (1 - (R / 4z)²) (Cheeseman and Bennett, "The effect of the
   ground on a helicopter rotor in forward flight", 1955), constant below z = R / 2.
 
 The functions compute one lane of a block whose ``air`` is loaded.
 """
-
-import math
 
 from sb3_quad.base.compiled import inlined
 from sb3_quad.envs.simulation.vectors import add, four, multiply, scaled, vector
@@ -34,13 +33,10 @@ def speed_sum(speeds, lane):
 
 @inlined
 def rotor_momentum(b, speeds, lane):
-    """Return H of rotor speeds, (4, LANES), N m s. A rotor turns against the yaw moment of its
-    drag.
-    """
-    spin = 0.0
-    for k in range(4):
-        spin -= math.copysign(speeds[k, lane], b.arm[2, k, lane])
-    return b.rotor_inertia[lane] * spin
+    """Return H of rotor speeds, (4, LANES), N m s."""
+    j0, j1, j2, j3 = four(b.spin, lane)
+    s0, s1, s2, s3 = four(speeds, lane)
+    return (j0 * s0 + j1 * s1) + (j2 * s2 + j3 * s3)
 
 
 @inlined
@@ -49,10 +45,10 @@ def ground_effect(radius, height):
     it, 1/m.
     """
     lowest = max(height, 0.5 * radius, _LOWEST)
-    ratio = radius / (4.0 * lowest)
-    factor = 1.0 / (1.0 - ratio * ratio)
-    slope = -2.0 * ratio * ratio * factor / lowest
-    return factor, slope if height > 0.5 * radius else 0.0
+    square = 16.0 * lowest * lowest
+    room = square - radius * radius
+    slope = -2.0 * radius * radius / (lowest * room)
+    return square / room, slope if height > 0.5 * radius else 0.0
 
 
 @inlined

@@ -95,7 +95,7 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         "thrust": 4,  # of each rotor, N
         **WRENCH,
         "wind": 3,  # velocity of the air
-        **dict.fromkeys(PARAMETER_NAMES, ()),
+        **dict.fromkeys(PARAMETER_NAMES[: P.rotor_drag_x], ()),
         # motor_factor of a rotor that speeds up, and of one that slows down
         "motor": 2,
         "velocity_gain": (),  # dt / m
@@ -121,6 +121,11 @@ _CONTENTS: dict[str, dict[str, Any]] = {
         **{f"observed_{name}": size for name, size in FEATURE_SIZES.items()},
     },
     "u4": {"word": WORDS, "stream": 4},
+    # Last, so that the places of all others are what they are without air; float64 once more.
+    "<f8": {
+        **dict.fromkeys(PARAMETER_NAMES[P.rotor_drag_x :], ()),
+        "spin": 4,  # moments of inertia of the rotors, with the sign of their direction about z
+    },
 }
 # Several consecutive quantities under one name: the first of them, and the shape of all
 _TOGETHER: dict[str, tuple[str, Any]] = {
@@ -377,10 +382,11 @@ def rotor_wrenches(actions, out, speeds, state, queue, vehicles, physics_step, i
     _load_commands(blocks[0], 0, 1, actions, queue)
     b = blocks[0]
     speeds[0] = b.rotor_speeds[:, 0]
+    b.ground_effect_radius[0] = 0.0
     for substep in range(len(out)):
         turn_rotors(b, 0)
         if in_air:
-            scale_thrusts(b, math.inf, 0)
+            scale_thrusts(b, 0.0, 0)
         speeds[substep + 1] = b.rotor_speeds[:, 0]
         out[substep, 0, 2] = total_thrust(b, 0)
         for axis in range(3):
@@ -453,6 +459,10 @@ def load_vehicles(b, vehicles, first, dt, in_air):
     load_rows(vehicles, first, b.vehicle)
     if in_air:
         load_rows(vehicles[P.rotor_drag_x :], first, b.air)
+        # A rotor turns against the yaw moment of its drag.
+        for lane in range(LANES):
+            for k in range(4):
+                b.spin[k, lane] = -math.copysign(b.rotor_inertia[lane], b.arm[2, k, lane])
     for lane in range(LANES):
         lift = b.thrust_coefficient[lane]
         exact = b.exact_motors[lane]

@@ -194,19 +194,24 @@ def _accelerate(b, lane, dt, in_air):
 
 
 @fast
-def accelerate(b, dt, in_air):
-    """Advance rotor speeds, velocities and body rates by a physics step, in place.
+def accelerate(b):
+    """Advance rotor speeds, velocities and body rates by a physics step without air, in place."""
+    for lane in range(LANES):
+        _accelerate(b, lane, 1.0, False)
 
-    :return: whether some velocity may exceed PyBullet's limit.
+
+@inner(fastmath=True, forceinline=False)
+def accelerate_in_air(b, dt):
+    """Advance them with the terms of :mod:`.aerodynamics`. It is not a part of its caller, which
+    would then fly more slowly without air.
     """
-    # Two loops: without air, each lane is spared its terms.
-    if in_air:
-        for lane in range(LANES):
-            _accelerate(b, lane, dt, True)
-    else:
-        for lane in range(LANES):
-            _accelerate(b, lane, dt, False)
-    # In a separate loop: a sum over lanes would keep the one above from being vectorised.
+    for lane in range(LANES):
+        _accelerate(b, lane, dt, True)
+
+
+@fast
+def _may_exceed(b):
+    """Return whether some velocity may exceed PyBullet's limit."""
     over = 0
     for lane in range(LANES):
         over += b.speed2[lane] > MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY
@@ -279,6 +284,10 @@ def move(b, dt):
 def fly(b, physics_step, substeps, in_air):
     """Compute the physics steps of one control step of a loaded block, in place."""
     for _ in range(substeps):
-        if accelerate(b, physics_step, in_air):
+        if in_air:
+            accelerate_in_air(b, physics_step)
+        else:
+            accelerate(b)
+        if _may_exceed(b):
             limit_velocities(b)
         move(b, physics_step)

@@ -20,7 +20,7 @@ from pydantic import (
 
 from sb3_quad.base.compiled import called
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import FloatArray, StrMapping
+from sb3_quad.base.types import FloatArray, StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.envs.simulation.state import first_rows, row_slices
 from sb3_quad.envs.vehicles.vehicle import Vehicle
@@ -301,7 +301,7 @@ class Randomization(Frozen):
         gain = (self.motor_gain or UNCHANGED).high
         up = gain * (self.motor_gain_up or UNCHANGED).high
         down = gain * (self.motor_gain_down or UNCHANGED).high
-        changes = {
+        changes: StrDict = {
             "thrust_limits": (
                 least * thrust.high * rotors.high / mass.low,
                 most * greatest / mass.high,
@@ -309,6 +309,9 @@ class Randomization(Frozen):
             "motor_gain_up": vehicle.motor_gain_up * up,
             "motor_gain_down": vehicle.motor_gain_down * down,
         }
+        if self.rate_damping is not None:
+            most = self.rate_damping.high / (self.inertia or UNCHANGED).low
+            changes["rate_damping"] = tuple(most * each for each in vehicle.inertia)
         return flyable(vehicle, changes, "randomize")
 
     def numbers(self, control_step: float) -> FloatArray:

@@ -251,29 +251,29 @@ def _randomize_air(u, table, v):
 
     :param u: 13 uniforms.
     """
-    turning = 4.0 * math.sqrt(v[P.hover_thrust] / v[P.thrust_coefficient])
-    drag = between(table, R.rotor_drag, u[4], -1.0)
+    mass = v[P.mass]
+    speeds = 4.0 * math.sqrt(v[P.hover_thrust] / v[P.thrust_coefficient])
+    _replace(v, P.translational_lift, mass, table, R.translational_lift, u[5])
+    _replace(v, P.rotor_inertia, v[P.izz], table, R.rotor_inertia, u[11])
+    _replace(v, P.ground_effect_radius, arm_length(v), table, R.ground_effect_radius, u[12])
     for axis in range(3):
-        if drag >= 0.0:
-            v[P.rotor_drag_x + axis] = drag * v[P.mass] / turning
         inertia = v[P.ixx + axis]
-        own = v[P.rate_damping_x + axis] / inertia
-        v[P.rate_damping_x + axis] = inertia * between(table, R.rate_damping, u[8 + axis], own)
+        _replace(v, P.rotor_drag_x + axis, mass / speeds, table, R.rotor_drag, u[4])
+        _replace(v, P.rate_damping_x + axis, inertia, table, R.rate_damping, u[8 + axis])
         if axis < 2:
             k = P.airspeed_moment_roll + axis
-            own = v[k] * turning / inertia
-            v[k] = between(table, R.airspeed_moment, u[6 + axis], own) * inertia / turning
-    own = v[P.translational_lift] / v[P.mass]
-    v[P.translational_lift] = v[P.mass] * between(table, R.translational_lift, u[5], own)
-    own = v[P.rotor_inertia] / v[P.izz]
-    v[P.rotor_inertia] = v[P.izz] * between(table, R.rotor_inertia, u[11], own)
-    arm = arm_length(v)
-    own = v[P.ground_effect_radius] / arm
-    v[P.ground_effect_radius] = arm * between(table, R.ground_effect_radius, u[12], own)
+            _replace(v, k, inertia / speeds, table, R.airspeed_moment, u[6 + axis])
     for rotor in range(4):
         factor = between(table, R.rotors, u[rotor], 1.0)
         v[P.thrust_factor_0 + rotor] *= factor
         v[P.hover_share_0 + rotor] /= factor
+
+
+@inner
+def _replace(v, parameter, unit, table, k, u):
+    """Replace a parameter by the number for u from the range at ``table[k]``, times its unit."""
+    if table[k + 2] != FIXED:
+        v[parameter] = unit * between(table, k, u, 0.0)
 
 
 @called

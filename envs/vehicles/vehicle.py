@@ -100,6 +100,7 @@ MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 CONTROL_STEP = 0.01  # s
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 _NO_LIMITS = (0.0, 0.0)
+_EQUAL = (1.0, 1.0, 1.0, 1.0)
 # Results of a search, which are valid for one vehicle only
 _FOUND = ("geometric_gains", "time_optimal")
 
@@ -161,7 +162,7 @@ class Vehicle(Frozen):
     """moment of inertia of a rotor about its axis, kg m^2: gyroscopic moment and yaw reaction"""
     ground_effect_radius: NonNegative = 0.0
     """R of the ground effect 1 / (1 - (R / 4z)^2) on the thrust, a rotor's radius or more, m"""
-    thrust_factors: tuple[ThrustFactor, ThrustFactor, ThrustFactor, ThrustFactor] = (1.0,) * 4
+    thrust_factors: tuple[ThrustFactor, ThrustFactor, ThrustFactor, ThrustFactor] = _EQUAL
     """factor of the thrust and drag moment of each rotor at its speed"""
     gravity: Rate = GRAVITY
     """g, m/s^2"""
@@ -294,7 +295,7 @@ class Vehicle(Frozen):
                 f"control_step {self.control_step}: must be a whole multiple of physics_step "
                 f"{self.physics_step}, at most {MAX_SUBSTEPS} times"
             )
-        damping = max(np.divide(self.rate_damping, self.inertia))
+        damping = self.damping_rates.max()
         if damping * self.physics_step > 1.0:
             raise ValueError(
                 f"rate_damping {list(self.rate_damping)}: divided by the inertia it is "
@@ -470,6 +471,26 @@ class Vehicle(Frozen):
     def hover_rotor_speed(self) -> float:
         """Speed of a rotor with the thrust ``hover_thrust``, rad/s."""
         return math.sqrt(self.hover_thrust / self.lift)
+
+    @property
+    def hover_speed_sum(self) -> float:
+        """Sum of the rotor speeds in hover, rad/s."""
+        return float(np.sqrt(self.hover_thrusts / self.lift).sum())
+
+    @property
+    def airspeed_turns(self) -> FloatArray:
+        """Angular acceleration of roll and pitch by 1 m/s of airspeed in hover, (2,), rad/s²."""
+        return self.hover_speed_sum * np.divide(self.airspeed_moment, self.inertia[:2])
+
+    @property
+    def rotor_drag_rates(self) -> FloatArray:
+        """``rotor_drag`` in hover by the mass, (3,), 1/s."""
+        return self.hover_speed_sum * np.divide(self.rotor_drag, self.mass)
+
+    @property
+    def damping_rates(self) -> FloatArray:
+        """``rate_damping`` by the inertia, (3,), 1/s."""
+        return np.divide(self.rate_damping, self.inertia)
 
     @property
     def hover_action(self) -> FloatArray:

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 # Rotor speed, rpm. Above it a unit must be wrong.
 FASTEST_HOVER = 95_000.0
+# Divergence of the hover, times the time from a command to its thrust. Here the geometric expert
+# begins to lose its targets.
+MOST_DIVERGENCE = 0.2
 # rpm per rad/s.
 RPM = 60.0 / (2.0 * math.pi)
 
@@ -116,10 +119,29 @@ def _parameters(vehicle: "Vehicle") -> list[list[str]]:
     return [line.split(" | ") for line in lines.splitlines()]
 
 
+def _divergence(vehicle: "Vehicle") -> float:
+    """Return the rate at which a hover diverges that no one controls, 1/s.
+
+    A tilt accelerates the vehicle by g, and its speed v turns it by f v, so the rates s solve
+    s (s + drag) (s + damping) + g f = 0, once for roll and once for pitch.
+    """
+    import numpy as np
+
+    drag = np.divide(vehicle.drag, vehicle.mass) + vehicle.rotor_drag_rates
+    fastest = 0.0
+    for k, d, f in zip(drag[[1, 0]], vehicle.damping_rates, vehicle.airspeed_turns, strict=False):
+        rates = np.roots([1.0, k + d, k * d, vehicle.gravity * f])
+        fastest = max(fastest, rates.real.max())
+    return fastest
+
+
 def warnings(vehicle: "Vehicle") -> list[str]:
     """Return a line for each value that is possible but unlikely, mostly due to a wrong unit."""
+    from sb3_quad.experts.geometric_gains import command_lag
+
     gains = (vehicle.motor_gain_up, vehicle.motor_gain_down)
     arm = vehicle.arm_length
+    lag = float(command_lag(vehicle.parameters(), vehicle.control_step))
     # The key, its values, the least and the greatest that are likely, what it is and advice.
     measured = (
         (
@@ -153,6 +175,13 @@ def warnings(vehicle: "Vehicle") -> list[str]:
             [vehicle.collision_radius / arm],
             (0.0, 2.0),
             "by the rotors' distance from the centre; is it in m?",
+        ),
+        (
+            "airspeed_moment",
+            [lag * _divergence(vehicle)],
+            (0.0, MOST_DIVERGENCE),
+            "divergence of the hover by the time from a command to its thrust; beyond, airspeed "
+            "turns the vehicle over before the experts act; is it in kg m/rad?",
         ),
     )
     lines = []

@@ -1,6 +1,6 @@
 /**
- * The physics of one control step, as envs/simulation/physics.py has them: rotors (Eqs. 2.4 and 4.1), external wrench,
- * drag, and PyBullet's integrator. All of it in double precision.
+ * The physics of one control step, as envs/simulation/{physics,aerodynamics}.py have them: rotors (Eqs. 2.4 and 4.1), external
+ * wrench, air, and PyBullet's integrator. All of it in double precision.
  *
  * @typedef {import("./vehicle.js").Parameters} Parameters
  *
@@ -50,6 +50,9 @@ const cut = (value) => Math.min(Math.max(value, -MAX_VELOCITY), MAX_VELOCITY);
 const r = new Float64Array(9);
 const rotors = new Float64Array(8);
 
+/** The factor of the thrust at a height, m. @param {number} radius @param {number} height */
+export const groundEffect = (radius, height) => 1 / (1 - (radius / (4 * Math.max(height, radius / 2, 1e-9))) ** 2);
+
 /**
  * Thrusts of the rotors in a physics step, N, and behind them their speeds after it, rad/s, (8,).
  * @param {Float64Array} s
@@ -60,16 +63,20 @@ const rotors = new Float64Array(8);
  * @param {Float64Array} out
  */
 export function drive(s, at, wanted, from, p, out) {
+  const ground = groundEffect(p.air.radius, s[at + X.position + 2]);
   for (let k = 0; k < 4; k++) {
     const old = s[at + X.rotor_speeds + k], missing = wanted[from + k] - old;
     const speed = old + missing * (missing > 0 ? p.up : p.down);
-    out[k] = p.lift * speed * (speed + p.exact * (old - speed));
+    out[k] = p.lift * p.air.factors[k] * ground * speed * (speed + p.exact * (old - speed));
     out[4 + k] = speed;
   }
 }
 
 /** The sum of a row of four with what `drive` wrote. @param {ArrayLike<number>} arm @param {Float64Array} driven */
 export const moment = (arm, driven) => arm[0] * driven[0] + arm[1] * driven[1] + (arm[2] * driven[2] + arm[3] * driven[3]);
+
+/** The angular momentum of the rotors about z, N m s, at speeds that begin at an index. @param {Float64Array} s @param {number} at @param {Parameters} p */
+export const momentumOf = (s, at, { air: { spins } }) => spins[0] * s[at] + spins[1] * s[at + 1] + (spins[2] * s[at + 2] + spins[3] * s[at + 3]);
 
 /**
  * One physics step of a state, in place.
@@ -81,24 +88,30 @@ export const moment = (arm, driven) => arm[0] * driven[0] + arm[1] * driven[1] +
  * @param {number} from where its wanted speeds begin
  */
 export function physicsStep(s, wanted, p, { force, torque, wind }, at = 0, from = 0) {
-  const { dt, drag, inertia, arms } = p, v = at + X.velocity, w = at + X.body_rates;
+  const { air, dt, drag, inertia, arms } = p, v = at + X.velocity, w = at + X.body_rates;
+  const before = momentumOf(s, at + X.rotor_speeds, p);
   drive(s, at, wanted, from, p, rotors);
   for (let k = 0; k < 4; k++) s[at + X.rotor_speeds + k] = rotors[4 + k];
   rotation(s, at, r);
   const ux = s[v] - wind[0], uy = s[v + 1] - wind[1], uz = s[v + 2] - wind[2];
-  const fx = -drag[0] * (r[0] * ux + r[3] * uy + r[6] * uz);
-  const fy = -drag[1] * (r[1] * ux + r[4] * uy + r[7] * uz);
+  const ax = r[0] * ux + r[3] * uy + r[6] * uz, ay = r[1] * ux + r[4] * uy + r[7] * uz;
+  const total = rotors[4] + rotors[5] + (rotors[6] + rotors[7]), momentum = momentumOf(rotors, 4, p);
+  const fx = -(drag[0] + air.drag[0] * total) * ax;
+  const fy = -(drag[1] + air.drag[1] * total) * ay;
   const thrust = rotors[0] + rotors[1] + (rotors[2] + rotors[3]);
-  const fz = thrust - drag[2] * (r[2] * ux + r[5] * uy + r[8] * uz);
+  const fz = thrust - (drag[2] + air.drag[2] * total) * (r[2] * ux + r[5] * uy + r[8] * uz) + air.lift * (ax * ax + ay * ay);
   const perForce = dt / p.mass;
   s[v] += perForce * (force[0] + r[0] * fx + r[1] * fy + r[2] * fz);
   s[v + 1] += perForce * (force[1] + r[3] * fx + r[4] * fy + r[5] * fz);
   s[v + 2] += perForce * (force[2] + r[6] * fx + r[7] * fy + r[8] * fz) - p.gravity * dt;
 
   const [ixx, iyy, izz] = inertia, wx = s[w], wy = s[w + 1], wz = s[w + 2];
-  s[w] += (dt / ixx) * (torque[0] - (izz - iyy) * wy * wz + moment(arms[0], rotors));
-  s[w + 1] += (dt / iyy) * (torque[1] - (ixx - izz) * wz * wx + moment(arms[1], rotors));
-  s[w + 2] += (dt / izz) * (torque[2] - (iyy - ixx) * wx * wy + moment(arms[2], rotors));
+  const roll = air.moment[0] * total * ay - momentum * wy - air.damping[0] * wx;
+  const pitch = momentum * wx - air.moment[1] * total * ax - air.damping[1] * wy;
+  const yaw = (before - momentum) / dt - air.damping[2] * wz;
+  s[w] += (dt / ixx) * (torque[0] - (izz - iyy) * wy * wz + roll + moment(arms[0], rotors));
+  s[w + 1] += (dt / iyy) * (torque[1] - (ixx - izz) * wz * wx + pitch + moment(arms[1], rotors));
+  s[w + 2] += (dt / izz) * (torque[2] - (iyy - ixx) * wx * wy + yaw + moment(arms[2], rotors));
   limitVelocities(s, at);
   move(s, at, dt);
 }

@@ -7,7 +7,7 @@
  */
 import { errorOf, rotation } from "./dynamics.js";
 import { AHEAD, part } from "./tables.js";
-import { armsOf, commandLag, hoverShares, hoverThrust, mixerInverse, thrustRange } from "./vehicle.js";
+import { armsOf, commandLag, factorsOf, hoverShares, hoverThrust, mixerInverse, thrustRange } from "./vehicle.js";
 
 const { sqrt, min, max, abs, atan2, sin, cos } = Math;
 
@@ -65,7 +65,8 @@ export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) 
 /** Gains for a vehicle whose file has none. @param {Vehicle} v @returns {Object<string, number>} */
 export function derivedGains(v) {
   const [low, high] = thrustRange(v);
-  const moment = armsOf(v).map((arm) => (arm.reduce((sum, each) => sum + abs(each), 0) * (high - low)) / 2);
+  const factors = factorsOf(v);
+  const moment = armsOf(v).map((arm) => (arm.reduce((sum, each, k) => sum + abs(each * factors[k]), 0) * (high - low)) / 2);
   const turn = min(moment[0] / v.inertia[0], moment[1] / v.inertia[1]), lag = commandLag(v), g = v.gravity;
   const hovers = hoverShares(v).map((share) => share * hoverThrust(v));
   const least = low / min(...hovers), most = max(high / max(...hovers), 1.01);

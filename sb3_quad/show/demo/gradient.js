@@ -8,7 +8,7 @@
  * @typedef {import("./vehicle.js").Vehicle} Vehicle
  * @typedef {import("./flight.js").Agent} Agent
  */
-import { cosineOf, drive, moment, physicsStep, rotation, sincOf } from "./dynamics.js";
+import { cosineOf, drive, groundEffect, moment, momentumOf, physicsStep, rotation, sincOf } from "./dynamics.js";
 import { geometric } from "./experts.js";
 import { MAX_DISTANCE, normals, NO_WRENCH } from "./flight.js";
 import { DEFAULT_STD, F, OBSERVATION_SIZE, STATE_SIZE, X } from "./tables.js";
@@ -362,21 +362,26 @@ function addByRotation(s, at, g, to) {
  * @param {Float64Array} g @param {import("./vehicle.js").Parameters} p
  */
 export function undo(s, at, wanted, byWanted, from, g, p) {
-  const { dt, lift, exact, arms, drag, inertia } = p;
+  const { air, dt, lift, exact, arms, inertia } = p;
   // What the step computed
   drive(s, at, wanted, from, p, driven);
   rotation(s, at, R);
   const w = s[at + Q], x = s[at + Q + 1], y = s[at + Q + 2], z = s[at + Q + 3];
   const vx = s[at + V], vy = s[at + V + 1], vz = s[at + V + 2];
-  const fx = -drag[0] * (R[0] * vx + R[3] * vy + R[6] * vz), fy = -drag[1] * (R[1] * vx + R[4] * vy + R[7] * vz);
+  const sx = R[0] * vx + R[3] * vy + R[6] * vz, sy = R[1] * vx + R[4] * vy + R[7] * vz, sz = R[2] * vx + R[5] * vy + R[8] * vz;
+  const total = driven[4] + driven[5] + (driven[6] + driven[7]), momentum = momentumOf(driven, 4, p);
+  const drag = p.drag.map((each, k) => each + air.drag[k] * total);
   const thrust = driven[0] + driven[1] + (driven[2] + driven[3]);
-  const fz = thrust - drag[2] * (R[2] * vx + R[5] * vy + R[8] * vz);
+  const fx = -drag[0] * sx, fy = -drag[1] * sy, fz = thrust - drag[2] * sz + air.lift * (sx * sx + sy * sy);
   const wx = s[at + W], wy = s[at + W + 1], wz = s[at + W + 2];
   const gx = inertia[2] - inertia[1], gy = inertia[0] - inertia[2], gz = inertia[1] - inertia[0];
   const ix = dt / inertia[0], iy = dt / inertia[1], iz = dt / inertia[2];
-  const hx = 0.5 * dt * (wx + ix * (moment(arms[0], driven) - gx * wy * wz));
-  const hy = 0.5 * dt * (wy + iy * (moment(arms[1], driven) - gy * wz * wx));
-  const hz = 0.5 * dt * (wz + iz * (moment(arms[2], driven) - gz * wx * wy)), h2 = hx * hx + hy * hy + hz * hz;
+  const roll = air.moment[0] * total * sy - momentum * wy - air.damping[0] * wx;
+  const pitch = momentum * wx - air.moment[1] * total * sx - air.damping[1] * wy;
+  const yaw = (momentumOf(s, at + M, p) - momentum) / dt - air.damping[2] * wz;
+  const hx = 0.5 * dt * (wx + ix * (moment(arms[0], driven) - gx * wy * wz + roll));
+  const hy = 0.5 * dt * (wy + iy * (moment(arms[1], driven) - gy * wz * wx + pitch));
+  const hz = 0.5 * dt * (wz + iz * (moment(arms[2], driven) - gz * wx * wy + yaw)), h2 = hx * hx + hy * hy + hz * hz;
   const sinc = sincOf(h2), aw = cosineOf(h2), ax = hx * sinc, ay = hy * sinc, az = hz * sinc;
   const nw = w * aw - x * ax - y * ay - z * az, nx = w * ax + x * aw + y * az - z * ay;
   const ny = w * ay - x * az + y * aw + z * ax, nz = w * az + x * ay - y * ax + z * aw;
@@ -395,14 +400,20 @@ export function undo(s, at, wanted, byWanted, from, g, p) {
   const common = 2 * (cx * hx + cy * hy + cz * hz) * sincSlope(h2) - cw * sinc;
   const bx = g[W] + 0.5 * dt * (cx * sinc + common * hx), by = g[W + 1] + 0.5 * dt * (cy * sinc + common * hy);
   const bz = g[W + 2] + 0.5 * dt * (cz * sinc + common * hz);
-  g[W] = bx - iy * gy * wz * by - iz * gz * wy * bz;
-  g[W + 1] = by - ix * gx * wz * bx - iz * gz * wx * bz;
-  g[W + 2] = bz - ix * gx * wy * bx - iy * gy * wx * by;
+  const tx = ix * bx, ty = iy * by, tz = iz * bz; // by the torque
+  g[W] = bx - gy * wz * ty - gz * wy * tz + momentum * ty - air.damping[0] * tx;
+  g[W + 1] = by - gx * wz * tx - gz * wx * tz - momentum * tx - air.damping[1] * ty;
+  g[W + 2] = bz - gx * wy * tx - gy * wx * ty - air.damping[2] * tz;
   // The velocity after the step, which moves the position; force and drag in body axes
   const ux = g[V] + dt * g[P], uy = g[V + 1] + dt * g[P + 1], uz = g[V + 2] + dt * g[P + 2], perForce = dt / p.mass;
   const dx = perForce * ux, dy = perForce * uy, dz = perForce * uz; // by the force in world axes
   const kx = R[0] * dx + R[3] * dy + R[6] * dz, ky = R[1] * dx + R[4] * dy + R[7] * dz, kz = R[2] * dx + R[5] * dy + R[8] * dz;
-  const mx = -drag[0] * kx, my = -drag[1] * ky, mz = -drag[2] * kz; // by the velocity in body axes
+  // By the velocity in body axes, the sum of the rotor speeds, and the rotors' angular momentum
+  const mx = -drag[0] * kx + 2 * air.lift * sx * kz - air.moment[1] * total * ty;
+  const my = -drag[1] * ky + 2 * air.lift * sy * kz + air.moment[0] * total * tx, mz = -drag[2] * kz;
+  const byDrag = air.drag[0] * sx * kx + air.drag[1] * sy * ky + air.drag[2] * sz * kz;
+  const byTotal = air.moment[0] * sy * tx - air.moment[1] * sx * ty - byDrag;
+  const byMomentum = wx * ty - wy * tx - tz / dt;
   g[V] = ux + R[0] * mx + R[1] * my + R[2] * mz;
   g[V + 1] = uy + R[3] * mx + R[4] * my + R[5] * mz;
   g[V + 2] = uz + R[6] * mx + R[7] * my + R[8] * mz;
@@ -416,11 +427,15 @@ export function undo(s, at, wanted, byWanted, from, g, p) {
   byR[7] = dz * fy + vz * my;
   byR[8] = dz * fz + vz * mz;
   addByRotation(s, at, g, 0);
+  const height = s[at + P + 2], ground = groundEffect(air.radius, height);
   for (let k = 0; k < 4; k++) {
-    const byThrust = kz + ix * arms[0][k] * bx + iy * arms[1][k] * by + iz * arms[2][k] * bz;
+    const byUnscaled = kz + arms[0][k] * tx + arms[1][k] * ty + arms[2][k] * tz;
+    const byThrust = byUnscaled * air.factors[k] * ground;
+    if (2 * height > air.radius) g[P + 2] -= (2 * (ground - 1) * byUnscaled * driven[k]) / height;
     const old = s[at + M + k], speed = driven[4 + k], share = wanted[from + k] > old ? p.up : p.down;
-    const bySpeed = g[M + k] + byThrust * lift * (2 * speed + exact * (old - 2 * speed));
-    g[M + k] = bySpeed * (1 - share) + byThrust * lift * speed * exact;
+    const bySpeed =
+      g[M + k] + byThrust * lift * (2 * speed + exact * (old - 2 * speed)) + byTotal + air.spins[k] * byMomentum;
+    g[M + k] = bySpeed * (1 - share) + byThrust * lift * speed * exact + (air.spins[k] * tz) / dt;
     byWanted[from + k] += bySpeed * share;
   }
 }

@@ -19,6 +19,13 @@
  * @property {number} [motor_gain_down] 1/s, of rotors that slow down
  * @property {"euler" | "exact"} [motor_integration] see physics.py
  * @property {Triple} [drag] along the body axes, N s/m
+ * @property {Triple} [rotor_drag] by the sum of the rotor speeds, kg/rad
+ * @property {number} [translational_lift] kg/m
+ * @property {[number, number]} [airspeed_moment] of roll and pitch, kg m/rad
+ * @property {Triple} [rate_damping] N m s
+ * @property {number} [rotor_inertia] kg m²
+ * @property {number} [ground_effect_radius] m
+ * @property {Quadruple} [thrust_factors]
  * @property {number} gravity m/s²
  * @property {[number, number]} thrust_limits of a rotor, in hover thrusts
  * @property {number} physics_step s
@@ -36,6 +43,15 @@
  * @property {number} thrust factor of the thrust of a command, as a tired battery has it
  * @property {number | null} delay control steps; null: the vehicle's own
  *
+ * @typedef {object} Air the terms of envs/simulation/aerodynamics.py
+ * @property {Triple} drag by the sum of the rotor speeds
+ * @property {number} lift
+ * @property {[number, number]} moment of roll and pitch
+ * @property {Triple} damping
+ * @property {number[]} spins moments of inertia of the rotors, with the sign of their direction about z
+ * @property {number} radius of the ground effect
+ * @property {Quadruple} factors of the rotors' thrusts
+ *
  * @typedef {object} Parameters what the dynamics read
  * @property {number} mass
  * @property {Triple} inertia
@@ -44,6 +60,7 @@
  * @property {number} down of one that slows down
  * @property {number} exact 1 where motors are integrated exactly, else 0
  * @property {Triple} drag
+ * @property {Air} air
  * @property {number} gravity
  * @property {number} middle thrust of action 0, N
  * @property {number} half thrust of action 1 less that, N
@@ -77,9 +94,25 @@ export function armsOf(v) {
   return /** @type {Quadruple[]} */ (rows);
 }
 
+/** Factors of the rotors' thrusts. @param {Vehicle} v @returns {Quadruple} */
+export const factorsOf = (v) => v.thrust_factors ?? [1, 1, 1, 1];
+
+/** What of the air acts on a vehicle. @param {Vehicle} v @returns {Air} */
+const airOf = (v) => ({
+  drag: v.rotor_drag ?? [0, 0, 0],
+  lift: v.translational_lift ?? 0,
+  moment: v.airspeed_moment ?? [0, 0],
+  damping: v.rate_damping ?? [0, 0, 0],
+  // A rotor turns against the yaw moment of its drag.
+  spins: v.rotor_directions.map((sign) => -sign * (v.rotor_inertia ?? 0)),
+  radius: v.ground_effect_radius ?? 0,
+  factors: factorsOf(v),
+});
+
 /** Rotor thrusts from [ΣF, Mx, My, Mz], (4, 4), by Gauss and Jordan. @param {Vehicle} v */
 export function mixerInverse(v) {
-  const rows = [[1, 1, 1, 1], ...armsOf(v)].map((row, i) => [...row, ...[0, 1, 2, 3].map((k) => (k === i ? 1 : 0))]);
+  const mixer = [[1, 1, 1, 1], ...armsOf(v)].map((row) => row.map((each, k) => each * factorsOf(v)[k]));
+  const rows = mixer.map((row, i) => [...row, ...[0, 1, 2, 3].map((k) => (k === i ? 1 : 0))]);
   for (let k = 0; k < 4; k++) {
     const best = rows.slice(k).reduce((far, row, j) => (Math.abs(row[k]) > Math.abs(rows[far][k]) ? k + j : far), k);
     [rows[k], rows[best]] = [rows[best], rows[k]];
@@ -121,6 +154,7 @@ export function parametersOf(v, world = CALM) {
     down,
     exact,
     drag: v.drag ?? [0, 0, 0],
+    air: airOf(v),
     gravity: v.gravity,
     middle: ((high + low) / 2) * world.thrust,
     half: ((high - low) / 2) * world.thrust,
