@@ -111,8 +111,11 @@ def refuse_other_order(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> None:
     :raises ConfigError: with the axis that answers the wrong way, and an order that would fit.
     """
     agreement = _agreement(log, vehicle.mixer, thrusts)
-    wrong = [axis for axis, value in zip(("roll", "pitch", "yaw"), agreement, strict=True)
-             if value < -0.25]
+    wrong = [
+        axis
+        for axis, value in zip(("roll", "pitch", "yaw"), agreement, strict=True)
+        if value < -0.25
+    ]
     if not wrong:
         return
     hints = []

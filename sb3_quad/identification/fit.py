@@ -6,8 +6,8 @@ the rotors. Intervals follow from leaving out one block of the flights at a time
 the equations linearised at the optimum.
 """
 
-from copy import copy
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ from sb3_quad.identification.parameters import (
     DELAY,
     FASTEST,
     FIELDS,
+    LARGEST_CHANGE,
     Guess,
     Key,
     Scaling,
@@ -349,7 +350,13 @@ def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
     allowed = np.maximum(LARGEST_WIDTH * np.abs(values), 1e-30)
     allowed[[key[0] in ("curve", "delay") for key in scaling.keys]] = np.inf
     reasons = {}
-    kept = np.arange(len(vector))
+    # A value that runs away says nothing.
+    limits = np.minimum(scaling.high, scaling.begin * np.exp(0.99 * LARGEST_CHANGE))
+    is_free = scaling.sizes == 0.0
+    far = is_free & ((values > 0.98 * limits) | (vector < -0.99 * LARGEST_CHANGE))
+    for k in np.flatnonzero(far):
+        reasons[scaling.keys[k]] = f"it would run to {values[k]:.2g}"
+    kept = np.flatnonzero(~far)
     while True:
         half = np.zeros(len(vector))
         half[kept] = jackknife(squares[:, kept][:, :, kept], products[:, kept])
@@ -361,9 +368,7 @@ def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
         kept = kept[kept != worst]
 
 
-def _as_file(
-    start: Vehicle, fitted: Guess, logs: Sequence[Log], delay: int, name: str
-) -> Vehicle:
+def _as_file(start: Vehicle, fitted: Guess, logs: Sequence[Log], delay: int, name: str) -> Vehicle:
     """Return the vehicle with what was fitted, and with the limits of its commands.
 
     :raises ConfigError: no vehicle can be like this.

@@ -45,7 +45,9 @@ def estimate_table(fit: Fit, start: Vehicle) -> Table:
         known = "" if field == "curve" else f"{value(before, estimate.key):.4g}"
         text = f"held: {estimate.reason}" if estimate.reason else f"± {estimate.width:.2g}"
         name = label(estimate, fit.curve.kind)
-        rows.append([name, known, f"{estimate.value:.4g}", unit(estimate.key, fit.curve.kind), text])
+        rows.append(
+            [name, known, f"{estimate.value:.4g}", unit(estimate.key, fit.curve.kind), text]
+        )
     heads = ("parameter", "start", "fitted", "unit", "95 % interval")
     return Table(heads, rows, fit.vehicle.name, align="left")
 
@@ -152,4 +154,3 @@ def split(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
         fitted.append(log.part(slice(0, edge)))
         judged.append(log.part(slice(edge, None)))
     return fitted, judged
-

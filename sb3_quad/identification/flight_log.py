@@ -182,9 +182,23 @@ def on_grid(recording: Recording, step: float) -> Log:
     if "accelerometer" in series:
         force = _resampled(series["accelerometer"], grid + offset, step)[:, 2]
     for name in known:
-        flying &= _without_gaps(series[name][0], grid + offset * (name in ("gyro", "accelerometer")))
-    log = Log(path, recording.format.order, kind, step, begin, commands, motion, force,
-              has_motion, flying, offset, tuple(notes))
+        flying &= _without_gaps(
+            series[name][0], grid + offset * (name in ("gyro", "accelerometer"))
+        )
+    log = Log(
+        path,
+        recording.format.order,
+        kind,
+        step,
+        begin,
+        commands,
+        motion,
+        force,
+        has_motion,
+        flying,
+        offset,
+        tuple(notes),
+    )
     return _in_the_air(log, "position" in series)
 
 
@@ -199,7 +213,9 @@ def _cleaned(path: Path, name: str, one: Series, notes: list[str]) -> Series:
     if good.sum() < max(2, 0.5 * len(time)):
         raise ConfigError(f"{path}: {name}: {good.sum()} of {len(time)} rows hold numbers")
     if not good.all():
-        notes.append(f"{name}: {(~good).sum()} of {len(time)} rows hold no number, and are left out")
+        notes.append(
+            f"{name}: {(~good).sum()} of {len(time)} rows hold no number, and are left out"
+        )
     time = time[good]
     values = values[good]
     falling = np.flatnonzero(np.diff(time) < 0.0)
@@ -330,7 +346,9 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
         return replace(log, flying=np.zeros_like(flying))
     least = commands[flying].mean(axis=0)
     if least.min() <= 0.0:
-        raise ConfigError(f"{log.path}: motor M{least.argmin() + 1} gets {least.min():.3g} on average")
+        raise ConfigError(
+            f"{log.path}: motor M{least.argmin() + 1} gets {least.min():.3g} on average"
+        )
     if log.force is not None:
         mean_force = log.force[flying].mean()
         if not 0.6 * GRAVITY < mean_force < 1.6 * GRAVITY:
@@ -351,7 +369,9 @@ def _refuse_unlike(
     # Means over blocks: what follows from positions and attitudes is noisy.
     block = round(AVERAGED / step)
     count = len(measured) // block
-    means = [rows[: count * block].reshape(count, block, 3).mean(axis=1) for rows in (measured, other)]
+    means = [
+        rows[: count * block].reshape(count, block, 3).mean(axis=1) for rows in (measured, other)
+    ]
     for axis, own, expected in zip("xyz", means[0].T, means[1].T, strict=True):
         larger = max(own @ own, expected @ expected)
         if own @ expected < LEAST_AGREEMENT * larger and larger > len(own) * LEAST_MOTION**2:
