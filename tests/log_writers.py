@@ -1,7 +1,7 @@
 """Logs of other programs, written from a table of a flight, to be read back.
 
-A table has the columns t (s), ``share`` 1 to 4 of the stack's motors, ``gyro`` x to z (rad/s), ``acc``
-x to z (m/s²), body axes x forward, y left, z up.
+A table has the columns t (s), ``share`` 1 to 4 of the stack's motors, ``gyro`` x to z (rad/s),
+``acc`` x to z (m/s²), body axes x forward, y left, z up.
 """
 
 import struct

@@ -121,8 +121,8 @@ def read_logs(paths: Iterable[StrPath] | StrPath, step: float | None = None) -> 
     :param paths: files; of a folder, all files but YAML in it.
     :param step: from row to row, s; None: 0.01, or 0.005 if all are sampled faster than 150 Hz.
     :return: those that fly at all.
-    :raises ConfigError: no log there that flies, or one that cannot be read, lacks what it needs, or
-        contradicts itself.
+    :raises ConfigError: no log there that flies, or one that cannot be read, lacks what it needs,
+        or contradicts itself.
     """
     files: list[Path] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
@@ -330,7 +330,7 @@ def _fill_motion(
 def _in_the_air(log: Log, knows_height: bool) -> Log:
     """Return a log whose rows count only in the air, with commands.
 
-    :raises ConfigError: a motor gets nothing; its accelerometer shows other than gravity in the mean.
+    :raises ConfigError: a motor gets nothing; its accelerometer shows other than gravity.
     """
     commands = log.mean_commands()
     time, _ = log.commands
@@ -353,8 +353,8 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
         mean_force = log.force[flying].mean()
         if not 0.6 * GRAVITY < mean_force < 1.6 * GRAVITY:
             raise ConfigError(
-                f"{log.path}: the accelerometer shows {mean_force:.3g} m/s² along z in flight, where "
-                f"{GRAVITY:g} is likely; check its unit, axes and sign"
+                f"{log.path}: the accelerometer shows {mean_force:.3g} m/s² along z in flight, "
+                f"where {GRAVITY:g} is likely; check its unit, axes and sign"
             )
     return replace(log, flying=flying)
 
@@ -369,12 +369,11 @@ def _refuse_unlike(
     # Means over blocks: what follows from positions and attitudes is noisy.
     block = round(AVERAGED / step)
     count = len(measured) // block
-    means = [
-        rows[: count * block].reshape(count, block, 3).mean(axis=1) for rows in (measured, other)
-    ]
+    pair = np.stack([measured, other])[:, : count * block]
+    means = pair.reshape(2, count, block, 3).mean(axis=2)
     for axis, own, expected in zip("xyz", means[0].T, means[1].T, strict=True):
         larger = max(own @ own, expected @ expected)
-        if own @ expected < LEAST_AGREEMENT * larger and larger > len(own) * LEAST_MOTION**2:
+        if own @ expected < LEAST_AGREEMENT * larger and larger > count * LEAST_MOTION**2:
             raise ConfigError(
                 f"{path}: {what} {axis} contradicts the motion; check units, axes and the order of "
                 "columns"

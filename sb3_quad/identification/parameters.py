@@ -116,7 +116,7 @@ def value(guess: Guess, key: Key) -> float:
 
 def unit(key: Key, kind: str) -> str:
     """Return the unit of a parameter."""
-    field, element = key
+    field, _ = key
     if field == "curve":
         return {"rotor_speed": "N s²", "thrust": "1"}.get(kind, "N")
     return "s" if field == "delay" else FIELDS[field].unit

@@ -1,7 +1,7 @@
 """Logs of flight controllers, as they come, as time series in SI units.
 
-The content of a file decides what it is: PX4's ULog, Betaflight's blackbox, the log that a Crazyflie
-writes to its µSD card, or a CSV file of these, of NanoBench or with the plain columns.
+The content of a file decides what it is: PX4's ULog, Betaflight's blackbox, the log that a
+Crazyflie writes to its µSD card, or a CSV file of these, of NanoBench or with the plain columns.
 """
 
 import struct
