@@ -30,9 +30,10 @@ def write_ulog(path, table):
     for number, name in enumerate(formats):
         parts.append(message("A", struct.pack("<BH", 0, number) + name.encode()))
     arrays = (table[GYRO] * FLIP, table[ACC] * FLIP, table[SHARES])
+    arrays = [values.to_numpy() for values in arrays]
     for row, time in enumerate(table["t"]):
         for number, values in enumerate(arrays):
-            numbers = values.to_numpy()[row]
+            numbers = values[row]
             stamp = struct.pack("<HQ", number, round(1e6 * time))
             parts.append(message("D", stamp + struct.pack(f"<{len(numbers)}f", *numbers)))
     path.write_bytes(b"".join(parts))
@@ -90,11 +91,10 @@ def write_usd(path, table):
     names += [f"motor.m{k}(I)" for k in (1, 2, 3, 4)]
     parts = [struct.pack("<BHHH", 0xBC, 2, 1, 0xFFFF), b"fixedFrequency\0"]
     parts += [struct.pack("<H", len(names)), *(name.encode() + b"\0" for name in names)]
-    for row in range(len(table)):
-        one = table.iloc[row]
-        motors = [round(65535 * share) for share in one[SHARES]]
-        numbers = [*(one[ACC] / 9.80665), *np.degrees(one[GYRO]), *motors]
-        parts.append(struct.pack("<HQ6f4I", 0xFFFF, round(1e6 * one["t"]), *numbers))
+    floats = np.hstack([table[ACC] / 9.80665, np.degrees(table[GYRO])])
+    motors = np.round(65535 * table[SHARES].to_numpy()).astype(int)
+    for time, row, shares in zip(table["t"], floats, motors, strict=True):
+        parts.append(struct.pack("<HQ6f4I", 0xFFFF, round(1e6 * time), *row, *shares))
     path.write_bytes(b"".join(parts) + bytes(4))
 
 

@@ -83,7 +83,7 @@ def test_our_own_log_flown_again_is_nearly_the_same_flight(folder):
     # The calibration of motors and markers, which need none here, costs a little.
     for _, predictions, end in open_loop(read_logs(folder, STEP), VEHICLE):
         simulated, _, stays = (errors(prediction, end) for prediction in predictions)
-        assert (simulated < 0.35 * stays).all()
+        assert (simulated < 0.7 * stays).all()
 
 
 @pytest.mark.parametrize("late", [0, 3])

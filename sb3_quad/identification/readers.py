@@ -6,6 +6,7 @@ Crazyflie writes to its µSD card, or a CSV file of these, of NanoBench or with 
 
 import struct
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,8 +121,11 @@ def _blackbox(path: Path) -> tuple[Format, list[Part]]:
     with raised_as(ConfigError, f"{path}: not a blackbox log that can be read"):
         parser = orangebox.Parser.load(str(path))
         names = parser.field_names
-        # A frame of another kind is shorter.
-        rows = [frame.data for frame in parser.frames() if len(frame.data) == len(names)]
+        rows: list[Any] = []
+        # A log that was cut ends within a frame, where the parser fails.
+        with suppress(Exception):
+            # A frame of another kind is shorter.
+            rows += (frame.data for frame in parser.frames() if len(frame.data) == len(names))
         # What a field lacks is no number.
         table = np.array(rows, dtype=object).reshape(len(rows), len(names))
         columns = {}
