@@ -79,7 +79,11 @@ def write_vehicle(path: StrPath, fit: Fit, start: Vehicle, logs: Sequence[Log]) 
     comments["delay"] = f"control steps; fitted {delays[0].value:.4f} ± {delays[0].width:.2g} s"
     content.setdefault("delay", fit.vehicle.delay)
     for field, entry in content.items():
-        text = yaml.safe_dump({field: _rounded(entry)}, default_flow_style=None, width=1000).strip()
+        # Lists of numbers take a line.
+        style = None if isinstance(entry, list) else False
+        text = yaml.safe_dump(
+            {field: _rounded(entry)}, default_flow_style=style, width=1000
+        ).strip()
         comment = comments.get(field)
         lines.append(f"{text:<44} # {comment}" if comment else text)
     write_text(path, "\n".join(lines) + "\n")
