@@ -24,7 +24,7 @@ from sb3_quad.envs.simulation.state import X
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SHORT = ("--timesteps", "100")  # a single rollout
 # Scripts with what makes them short, and a part of what they print. Others have tests below, or in
-# test_zoo.py, test_real_flights.py, test_crazyflie_app.py and test_pretrained.py.
+# test_zoo.py, test_crazyflie_app.py and test_pretrained.py.
 SCRIPTS = {
     "two_stages.py": (("--timesteps", "100", "100"), "agent, target_tracking: success"),
     "own_expert.py": (SHORT, "agent: success"),

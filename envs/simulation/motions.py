@@ -80,15 +80,18 @@ def read_series(path: Path, least: list[str], most: list[str]) -> tuple[FloatArr
     return times, numbers[:, 1:]
 
 
-def read_table(path: Path) -> "pd.DataFrame":
+def read_table(path: Path, most: int = LARGEST_TABLE, skipped: int | None = None) -> "pd.DataFrame":
     """Return the numbers of a CSV file by the names of the columns in its first line.
 
+    :param most: the largest size, in bytes.
+    :param skipped: lines above that line. If they are given, columns may hold other things than
+        numbers, which become NaN.
     :raises ConfigError: a file that cannot be read, or holds something else; a column given twice.
     """
     # Other references do not wait for it.
     import pandas as pd
 
-    content = read_bytes(path, LARGEST_TABLE)
+    content = b"".join(read_bytes(path, most).splitlines(True)[skipped or 0 :])
     # Pandas takes a kilobyte for each column.
     ends = np.flatnonzero(np.frombuffer(content, np.uint8) == ord("\n"))
     longest = np.diff(ends, prepend=-1, append=len(content)).max()
@@ -96,7 +99,14 @@ def read_table(path: Path) -> "pd.DataFrame":
         raise ConfigError(f"{path}: has a row of more than {LONGEST_ROW:,} bytes")
     with raised_as(ConfigError, f"{path}: not a table of numbers"):
         names = content.partition(b"\n")[0].decode("utf-8-sig").split(",")
-        frame = pd.read_csv(io.BytesIO(content), dtype=np.float64, skipinitialspace=True)
+        frame = pd.read_csv(
+            io.BytesIO(content),
+            dtype=np.float64 if skipped is None else None,
+            skipinitialspace=True,
+            low_memory=False,
+        )
+        for name in frame.select_dtypes(exclude="number"):
+            frame[name] = pd.to_numeric(frame[name], errors="coerce")
     # Pandas would take surplus numbers in the rows for an index, and shift all columns.
     if not isinstance(frame.index, pd.RangeIndex):
         raise ConfigError(f"{path}: its rows have more numbers than its first line has names")

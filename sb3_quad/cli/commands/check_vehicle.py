@@ -46,8 +46,8 @@ FLAGS: Flags = {
         480,
         "episodes of each task and expert, with the true state (480)",
     ),
-    "--flights FOLDER": (
-        "fly the motor commands of these logs instead (CSV; columns: docs/vehicles.md)"
+    "--flights LOGS": (
+        "fly the motor commands of this log or folder instead (formats: docs/your_vehicle.md)"
     ),
     "--seed N": (NonNegativeInt, 0, "seed of the episodes, which no search or training uses (0)"),
 }
@@ -86,7 +86,8 @@ def run(options: Namespace) -> int:
         if own.vehicles is not None and (notice := unlike_trained(name, own, vehicle)):
             print("unusual:", notice)
     if options.flights is not None:
-        from sb3_quad.evaluation.real_flights import error_table, read_logs
+        from sb3_quad.identification.flight_log import read_logs
+        from sb3_quad.identification.open_loop import error_table
 
         console().print(error_table(read_logs(options.flights, vehicle.control_step), vehicle))
     elif options.n_episodes:

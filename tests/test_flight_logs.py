@@ -1,0 +1,302 @@
+"""Logs of real flights: read, flown open loop, and fitted.
+
+Logs that our own simulator wrote give back the parameters it flew with.
+"""
+
+import sys
+from contextlib import suppress
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from log_writers import write_blackbox, write_plain, write_ulog, write_usd
+
+from sb3_quad import GeometricExpert, QuadcopterVecEnv, load_vehicle
+from sb3_quad.base.errors import ConfigError, MissingExtra
+from sb3_quad.cli import main
+from sb3_quad.envs.simulation.state import QUATERNION
+from sb3_quad.identification import fit_vehicle, read_logs
+from sb3_quad.identification.curve import refuse_other_order
+from sb3_quad.identification.flight_log import THRUST_BY_VOLTAGE, motor_thrusts, rotated_by
+from sb3_quad.identification.open_loop import errors, open_loop
+
+CAPTURE_COLUMNS = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
+GYRO_COLUMNS = ["gyro_x", "gyro_y", "gyro_z"]
+THRUSTS = ["thrust_m1", "thrust_m2", "thrust_m3", "thrust_m4"]
+STEP = 0.01
+VEHICLE = load_vehicle("crazyflie_nanobench")
+
+
+def flown(seed, seconds=8.0):
+    """Return a log of flights to targets, as a table with thrusts in N."""
+    env = QuadcopterVecEnv(
+        1,
+        "target_tracking",
+        vehicle=VEHICLE,
+        noise=0.0,
+        reference={"curve": "figure_eight", "speed": 2.0},
+        seed=seed,
+    )
+    expert = GeometricExpert(VEHICLE)
+    env.reset()
+    rows = []
+    for now in range(round(seconds / STEP)):
+        state = env.true_state()
+        actions = expert.actions(state)
+        thrusts = VEHICLE.action_to_thrust(actions)
+        parts = (state.position, state.quaternion, state.velocity, state.body_rates, thrusts)
+        rows.append(np.concatenate([[now * STEP], *(part[0] for part in parts)]))
+        env.step(actions)
+    return pd.DataFrame(rows, columns=["t", *CAPTURE_COLUMNS, *GYRO_COLUMNS, *THRUSTS])
+
+
+def turning(seconds=6.0, turn=3.0):
+    """Return a log at 100 Hz of a vehicle at one place that wobbles and turns at ``turn`` rad/s."""
+    time = STEP * np.arange(round(seconds / STEP))
+    wobble = [0.4 * np.sin(5.0 * time), 0.3 * np.cos(3.0 * time)]
+    rates = np.stack([*wobble, turn + 0.2 * np.sin(time)], axis=1)
+    attitude = [np.array([[1.0, 0.0, 0.0, 0.0]])]
+    for rotation in 0.5 * STEP * (rates[1:] + rates[:-1]):
+        attitude.append(rotated_by(attitude[-1], rotation[None]))
+    table = pd.DataFrame({"t": time, **dict.fromkeys(CAPTURE_COLUMNS, 0.0)})
+    table["pz"] = 1.0
+    table[CAPTURE_COLUMNS[QUATERNION]] = np.concatenate(attitude)
+    table[GYRO_COLUMNS] = rates
+    return table.assign(**dict.fromkeys(THRUSTS, 0.1))
+
+
+def read_back(table, folder):
+    table.to_csv(folder / "flight.csv", index=False)
+    return read_logs(folder, STEP)[0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("logs")
+    for seed in (0, 1, 2):
+        flown(seed).to_csv(path / f"flight_{seed}.csv", index=False)
+    return path
+
+
+def test_our_own_log_flown_again_is_nearly_the_same_flight(folder):
+    # The calibration of motors and markers, which need none here, costs a little.
+    for _, predictions, end in open_loop(read_logs(folder, STEP), VEHICLE):
+        simulated, _, stays = (errors(prediction, end) for prediction in predictions)
+        assert (simulated < 0.7 * stays).all()
+
+
+@pytest.mark.parametrize("late", [0, 3])
+@pytest.mark.parametrize("turn", [0.0, -3.0])
+def test_the_clock_is_found_while_the_vehicle_turns(tmp_path, turn, late):
+    table = turning(turn=turn)
+    table[GYRO_COLUMNS] = table[GYRO_COLUMNS].shift(late).bfill()
+    assert read_back(table, tmp_path).offset == pytest.approx(late * STEP, abs=0.002)
+
+
+@pytest.mark.parametrize("missing", [2, 7])
+def test_nothing_is_known_within_a_long_gap(tmp_path, missing):
+    table = turning()
+    log = read_back(table.drop(range(200, 200 + missing)), tmp_path)
+    is_long = (missing + 1) * STEP > 0.05
+    assert not log.flying[200 : 200 + missing].any() if is_long else log.flying.all()
+    assert log.flying[:199].all() and log.flying[201 + missing :].all()
+
+
+def test_a_quaternion_and_its_negative_are_one_attitude(tmp_path):
+    table = turning()
+    expected = read_back(table, tmp_path).motion
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(table), 1))
+    table[CAPTURE_COLUMNS[QUATERNION]] *= signs
+    cosines = (read_back(table, tmp_path).motion * expected)[:, QUATERNION].sum(axis=1)
+    np.testing.assert_allclose(np.abs(cosines), 1.0, atol=1e-9)
+
+
+def test_pwm_becomes_the_thrust_that_the_firmware_expects():
+    pwm = np.array([[65535.0, 32767.5, 0.0, 70000.0]])
+    thrusts = motor_thrusts(pwm, np.array([[3.4]]))
+    expected = sum(c * 3.4**k for k, c in enumerate(THRUST_BY_VOLTAGE))
+    assert thrusts[0, 0] == pytest.approx(expected) and 0.15 < expected < 0.16
+    assert 0.0 < thrusts[0, 1] < thrusts[0, 0] and np.isnan(thrusts[0, 2:]).all()
+
+
+def test_check_vehicle_prints_the_errors(folder, capsys):
+    assert main(["check-vehicle", "crazyflie_nanobench", "--flights", str(folder)]) == 0
+    assert "after 0.2 s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda table: table.drop(columns=["qw"]), "accelerometer"),
+        (lambda table: table.assign(qw="a"), "attitude: 0 of"),
+        (lambda table: table[:1], "bad.csv"),
+        (lambda table: table.assign(t=table["t"].where(table.index != 8, 0.01)), "runs back"),
+        (lambda table: table.assign(pz=0.0), "0.3 m"),
+        (lambda table: table.drop(columns=THRUSTS), "motor commands"),
+        # In other units, axes or orders, or damaged
+        (lambda table: table.assign(t=1e6 * table["t"]), "unit"),
+        (lambda table: table.assign(t=table["t"].where(table.index < 199, 1e300)), "unit"),
+        (lambda table: table[:50], "shorter than 1 s"),
+        (lambda table: table.assign(gyro_x=57.3 * table["gyro_x"]), "gyro x"),
+        (lambda table: table.assign(gyro_z=-table["gyro_z"]), "gyro z"),
+        (lambda table: table.assign(px=1000.0 * np.sin(table["t"])), "velocity x"),
+        (lambda table: table.assign(vy=1e300), "velocity"),
+        (lambda table: table.assign(qw=table["qw"].where(table.index != 8, 9.0)), "row 9: qw"),
+        (lambda table: table.assign(thrust_m2=-0.1), "M2"),
+        (lambda table: table.assign(thrust_m2=1e300), "thrust"),
+        (lambda table: table.rename(columns={"vz": "vx"}), "twice"),
+        (lambda table: table.assign(acc_x=0.0, acc_y=0.0, acc_z=1.0), "accelerometer"),
+    ],
+)
+def test_a_log_that_does_not_fit_is_refused_in_a_line(tmp_path, capsys, change, named):
+    change(turning(2.0)).to_csv(tmp_path / "bad.csv", index=False)
+    assert main(["check-vehicle", "crazyflie", "--flights", str(tmp_path), "-n", "0"]) == 2
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1
+
+
+def test_rows_without_numbers_are_left_out_and_named(tmp_path):
+    table = turning()
+    table.loc[::10, "gyro_x"] = np.nan
+    log = read_back(table, tmp_path)
+    assert log.flying.mean() > 0.95 and "60 of 600 rows" in log.notes[0]
+
+
+def shaken(vehicle, seconds=10.0, seed=0):
+    """Return a table as :mod:`log_writers` takes it, of a flight whose commands are shaken."""
+    env = QuadcopterVecEnv(
+        1,
+        "target_tracking",
+        vehicle=vehicle,
+        noise=0.0,
+        reference={"curve": "lissajous", "speed": 2.0},
+        seed=seed,
+        max_episode_steps=100_000,
+    )
+    expert = GeometricExpert(vehicle)
+    random = np.random.default_rng(seed)
+    env.reset()
+    rows = []
+    for now in range(round(seconds / vehicle.control_step)):
+        state = env.true_state()
+        actions = expert.actions(state) + 0.15 * random.standard_normal((1, 4)) * (now % 10 < 5)
+        shares = np.sqrt(vehicle.action_to_thrust(actions[0]) / vehicle.thrust_range[1])
+        force = [0.0, 0.0, state.specific_force[0, 2]]
+        parts = ([now * vehicle.control_step], state.body_rates[0], force, shares)
+        rows.append(np.concatenate(parts))
+        env.step(np.clip(actions, -1.0, 1.0))
+    names = ["t", *GYRO_COLUMNS, "acc_x", "acc_y", "acc_z"]
+    return pd.DataFrame(rows, columns=[*names, *(f"share_{k}" for k in (1, 2, 3, 4))])
+
+
+def stepped(vehicle, **changes):
+    """Return a vehicle whose control steps are as short as a log's."""
+    changes = {"control_step": 0.005, "delay": 2, "motor_integration": "exact", **changes}
+    return vehicle.model_copy(update=changes)
+
+
+@pytest.fixture(scope="module")
+def table():
+    return shaken(stepped(load_vehicle("crazyflie")), seconds=6.0)
+
+
+@pytest.mark.parametrize(
+    ("write", "order", "accuracy"),
+    [
+        (write_plain, "", 1e-6),
+        (write_usd, "crazyflie", 1e-4),
+        (write_ulog, "px4", 1e-4),
+        (write_blackbox, "betaflight", 0.02),
+    ],
+)
+def test_each_format_is_read_in_the_same_units_and_axes(table, tmp_path, write, order, accuracy):
+    write(tmp_path / "log", table)
+    (log,) = read_logs(tmp_path / "log")
+    assert (log.order, log.kind, log.has_motion, log.step) == (order, "share", False, 0.005)
+    rows = slice(20, 1100)
+    np.testing.assert_allclose(log.motion[rows, -3:], table[GYRO_COLUMNS][rows], atol=accuracy)
+    np.testing.assert_allclose(log.force[rows], table["acc_z"][rows], atol=accuracy)
+    commands = table[[f"share_{k}" for k in (1, 2, 3, 4)]][rows]
+    np.testing.assert_allclose(log.mean_commands()[rows], commands, atol=accuracy)
+
+
+def test_a_log_that_was_cut_is_read_to_its_end(table, tmp_path):
+    for number, write in enumerate((write_usd, write_ulog, write_blackbox)):
+        path = tmp_path / str(number)
+        write(path, table)
+        path.write_bytes(path.read_bytes()[: -path.stat().st_size // 3])
+        (log,) = read_logs(path)
+        assert 3.5 < len(log.flying) * log.step < 4.5
+
+
+def test_a_format_whose_package_is_missing_names_the_extra(table, tmp_path, monkeypatch):
+    write_ulog(tmp_path / "log.ulg", table[:10])
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    with pytest.raises(MissingExtra, match=r"\[fit\]"):
+        read_logs(tmp_path / "log.ulg")
+
+
+def test_motors_in_another_order_are_refused_with_the_one_that_fits(table, tmp_path):
+    write_plain(tmp_path / "log", table)
+    (log,) = read_logs(tmp_path / "log")
+    vehicle = load_vehicle("crazyflie")
+    thrusts = log.mean_commands() ** 2
+    refuse_other_order(log, vehicle, thrusts)
+    with pytest.raises(ConfigError, match="roll"):
+        refuse_other_order(log, vehicle, thrusts[:, [3, 2, 1, 0]])
+
+
+@pytest.mark.slow
+def test_the_fit_gives_back_what_flew(tmp_path):
+    flew = stepped(load_vehicle("crazyflie"))
+    write_usd(tmp_path / "log", shaken(flew, 20.0))
+    start = flew.model_copy(update={"motor_gain": 25.0, "inertia": [1.2e-5, 1.2e-5, 2.1e-5]})
+    fit = fit_vehicle(read_logs(tmp_path / "log"), start)
+    assert fit.vehicle.delay == flew.delay
+    np.testing.assert_allclose(fit.vehicle.motor_gain_up, flew.motor_gain_up, rtol=0.05)
+    np.testing.assert_allclose(fit.vehicle.inertia, flew.inertia, rtol=0.05)
+    commands = np.array([0.5, 0.8])
+    expected = flew.thrust_range[1] * commands**2
+    np.testing.assert_allclose(fit.curve.thrust(commands), expected, rtol=0.05)
+    held = {one.key[0]: one.reason for one in fit.estimates if one.reason}
+    assert "no velocity" in held["drag"] and "about z" in held["moment_thrust_ratio"]
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_vehicle_file_and_a_picture(folder, tmp_path, capsys):
+    output = tmp_path / "mine.yaml"
+    command = ["fit", str(folder), "--vehicle", "crazyflie_nanobench", "-o", str(output)]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "airspeed_moment" in printed and "after 0.2 s" in printed
+    assert (tmp_path / "mine.png").stat().st_size > 10_000
+    assert "±" in output.read_text() and load_vehicle(output).name == "mine"
+    assert yaml.safe_load(output.read_text())["mass"] == VEHICLE.mass
+    assert main(command) == 2
+
+
+def damaged(content, random):
+    """Return a log with some of its bytes changed, cut out, or twice."""
+    content = bytearray(content)
+    for _ in range(random.integers(1, 20)):
+        place = int(random.integers(len(content)))
+        size = int(random.choice([1, 8, 300]))
+        if random.random() < 0.5:
+            content[place : place + size] = random.bytes(size)
+        else:
+            content[place : place + size] = b""
+    return bytes(content[: random.integers(1, len(content))])
+
+
+@pytest.mark.parametrize("count", [10, pytest.param(50, marks=pytest.mark.slow)])
+def test_damaged_logs_are_read_or_refused_in_a_line(table, tmp_path, count):
+    random = np.random.default_rng(count)
+    for write in (write_plain, write_usd, write_ulog, write_blackbox):
+        write(tmp_path / "whole", table[:400])
+        content = (tmp_path / "whole").read_bytes()
+        for number in range(count):
+            (tmp_path / str(number)).write_bytes(damaged(content, random))
+            # Anything but a refusal fails.
+            with suppress(ConfigError):
+                read_logs(tmp_path / str(number))
