@@ -5,6 +5,7 @@ how it was trained (command, seed, commit) and what was measured. ``examples/pub
 both.
 """
 
+import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,11 +51,11 @@ def load_pretrained(name: str, **kwargs: Any) -> "PPO":
     """
     from stable_baselines3 import PPO
 
-    from sb3_quad.agents.zips import load_zip
-
     kwargs.setdefault("device", "cpu")
     if name.startswith(ADDRESS):
-        model: PPO = load_zip(None, hub_agent(name), name, **kwargs)
+        # By its name, since commands look for agents before they import PyTorch.
+        zips = importlib.import_module("sb3_quad.agents.zips")
+        model: PPO = zips.load_zip(None, hub_agent(name), name, **kwargs)
         return model
     return PPO.load(pretrained_path(name), **kwargs)
 
