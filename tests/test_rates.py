@@ -16,6 +16,7 @@ from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import BODY_RATES, QUATERNION, ROTOR_SPEEDS, P
 from sb3_quad.envs.vehicles.rates import RATE_PARAMETERS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
+from sb3_quad.evaluation.compare import compare
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
@@ -187,6 +188,8 @@ def test_a_zip_says_what_its_actions_command(tmp_path):
     APG("MlpPolicy", env, initial_policy=model, n_steps=8, **small).learn(64)
     # It flies as it was trained, and files of it command the same.
     fly(str(tmp_path / "rates.zip"), "state_recovery", 2, max_episode_steps=20)
+    shown = {"agent": model, "named": "geometric", "own": GeometricExpert(action="rates")}
+    assert compare(shown, "state_recovery", n_episodes=2, max_episode_steps=20)["named"]
     for file_format in ("c", "onnx"):
         exported = export_policy(tmp_path / "rates.zip", file_format, n_observations=100)
         assert "collective thrust" in exported.metadata["result"]

@@ -142,10 +142,14 @@ def _load(
         own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
         # The first agent decides for all controllers that do not say how they fly.
         if not shared:
-            shared = {name: getattr(known, name) for name in ("vehicle", "vehicles", "noise")}
+            names = ("vehicle", "vehicles", "noise", "action")
+            shared = {name: getattr(known, name) for name in names}
     settings = {}
     for label, controller in controllers.items():
-        how = FlightSettings(**own.get(label, shared)).with_changes(**env_kwargs)
+        given = dict(own.get(label, shared))
+        if isinstance(getattr(controller, "action", None), str):
+            given["action"] = controller.action  # of an expert
+        how = FlightSettings(**given).with_changes(**env_kwargs)
         if label not in pilots:
             pilots[label] = resolve_expert(
                 controller, how.vehicle, "controller", how.rotor_layout, how.action
