@@ -35,7 +35,7 @@ from sb3_quad.experts.geometric import GeometricExpert
 HERE = Path(__file__).resolve().parent
 STEP = 0.001  # s: of the physics, and between packets
 PERIOD = 10  # steps between two commands; a command answers the state one period before
-SECONDS = {"hover": 4.0, "5 m step": 5.0, "120° of roll": 5.0}
+SECONDS = {"hover": 3.0, "5 m step": 4.0, "120° of roll": 4.0}
 HEIGHT = 20.0  # m, of the target
 HEADER = """\
 | flight | loop | ends within 0.1 m | last second rms, m | at most | within 0.1 m after, s | sinks, m |
@@ -79,7 +79,7 @@ class Sitl:
         self.start()
         self.configure(SETTINGS)
         self.start()
-        self.sticks([*channels(0.0, np.zeros(3)), 1000])
+        self.sticks([1500, 1500, 1000, 1500, 1000])
         self.rest(6.0)  # It does not arm in its first seconds.
 
     def start(self) -> None:
@@ -151,8 +151,8 @@ class Sitl:
 
     def arm(self) -> None:
         """Disarm, so that the integrals are zero, arm, and raise the throttle for airmode."""
-        for throttle, switch in ((0.0, 1000), (0.0, 2000), (0.4, 2000)):
-            self.sticks([*channels(throttle, np.zeros(3)), switch])
+        for throttle, switch in ((1000, 1000), (1000, 2000), (1400, 2000)):
+            self.sticks([1500, 1500, throttle, 1500, switch])
             self.rest(0.3)
         if self.motors.min() < 0.2:
             raise RuntimeError(f"the SITL does not arm: motors {self.motors}")

@@ -111,19 +111,20 @@ class HoverThrust:
         return float(np.clip(self.throttle * max(thrust, 0.0) ** (1.0 / self.power), 0.0, 1.0))
 
     def update(self, state: State, throttle: float) -> None:
-        """Learn from the velocity that a throttle has led to since the last state. Large tilts,
-        small thrusts and gaps teach nothing.
+        """Learn from the velocity that a throttle has led to since the last state. Only flight that
+        is close to hover teaches anything, because thrust lags behind the throttle.
         """
         last, self._last = self._last, state
         if last is None:
             return
         dt = state.time - last.time
-        if not 0.0 < dt < 0.1 or state.tilt > math.radians(30.0) or throttle < 0.05:
+        if not 0.0 < dt < 0.1 or state.tilt > math.radians(15.0):
             return
         felt = (state.velocity - last.velocity) / dt + [0.0, 0.0, GRAVITY]
         thrust = felt @ last.rotation[:, 2] / GRAVITY
         expected = (throttle / self.throttle) ** self.power
-        # Thrust lags behind the throttle by the motors, so that only the average counts.
+        if abs(thrust - 1.0) > 0.3 or abs(expected - 1.0) > 0.3:
+            return
         change = (expected - thrust) * dt / (self.power * self.time_constant)
         self.throttle = float(np.clip(self.throttle * (1.0 + change), *self.range))
 
