@@ -540,14 +540,6 @@ class Vehicle(Frozen):
         middle, half = self._middle_and_half
         return middle + half * np.clip(action, -1.0, 1.0)
 
-    @property
-    def rate_range(self) -> tuple[FloatArray, FloatArray]:
-        """Middle and half of what ``action="rates"`` commands, (4,) each: collective thrust, N, and
-        body rates, rad/s.
-        """
-        middle, half = self._middle_and_half
-        return np.array([4 * middle, 0, 0, 0]), np.array([4 * half, *self.rate_limits_and_gains[0]])
-
     def parameters(self) -> FloatArray:
         """Return the numbers that the compiled kernel needs, in the order of ``PARAMETER_NAMES``,
         (names,).

@@ -162,11 +162,19 @@ class Sitl:
         self.process.wait(10.0)
 
 
+def command_range(vehicle):
+    """Return middle and half range, (4,), of collective thrust, N, and body rates, rad/s."""
+    least, most = 4.0 * np.array(vehicle.thrust_range)
+    limits, _ = vehicle.rate_limits_and_gains
+    middle = np.array([(most + least) / 2.0, 0.0, 0.0, 0.0])
+    return middle, np.array([(most - least) / 2.0, *limits])
+
+
 def commands_of(policy, vehicle, n):
     """Return a function from the true state of n vehicles to thrusts divided by the weight, (n,),
     and body rates, (n, 3).
     """
-    middle, half = vehicle.rate_range
+    middle, half = command_range(vehicle)
     weight = 4.0 * vehicle.hover_thrust
     if policy == "geometric":
         expert = GeometricExpert(vehicle, action="rates")
@@ -234,7 +242,7 @@ def fly_in_model(vehicle, policy, task, n, seed):
     """
     batch = new_batch(vehicle, n, "rates", starts(task, n, seed))
     command = commands_of(policy, vehicle, n)
-    middle, half = vehicle.rate_range
+    middle, half = command_range(vehicle)
     alive = np.ones(n, bool)
     path = []
     for _ in range(round(SECONDS[task] / vehicle.control_step)):

@@ -5,7 +5,9 @@ World axes: z up. Body axes: x forward, y left, z up. Units: m, m/s, rad/s, s. A
 controller turns its own frames and units to these.
 """
 
+import itertools
 import math
+import re
 import time
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -13,6 +15,7 @@ from typing import Protocol
 import numpy as np
 
 GRAVITY = 9.81
+PATIENCE = 10.0  # s: how long it waits for the control
 
 
 @dataclass
@@ -64,12 +67,14 @@ class Policy:
         options.intra_op_num_threads = 1
         self.session = onnxruntime.InferenceSession(path, options, ["CPUExecutionProvider"])
         facts = self.session.get_modelmeta().custom_metadata_map
-        if "weight" not in facts:
+        if "collective thrust" not in facts.get("result", ""):
             raise ValueError(
                 f"{path}: does not command thrust and body rates; export an agent that was trained"
                 " with action: rates"
             )
-        self.weight = float(facts["weight"].split()[0])
+        # One number for all rotors, or four of them
+        hover = re.search(r"hover thrusts? (.*?) N,", facts["vehicle"]).group(1).split(", ")
+        self.weight = 4.0 * float(np.mean([float(number) for number in hover]))
         self.period = float(facts["period"].split()[0])
         self.inputs = self.session.get_inputs()
         self.reset()
@@ -182,7 +187,7 @@ class Link(Protocol):
         """Why the policy must not take over, or an empty string. Sends nothing."""
 
     def take_over(self) -> None:
-        """Ask the flight controller to follow commands; the first ones have been sent."""
+        """Ask the flight controller to follow commands, which have been coming for a while."""
 
     def is_ours(self) -> bool:
         """Whether the flight controller follows commands. A pilot may take over at any time."""
@@ -197,37 +202,44 @@ class Link(Protocol):
 def fly(link, policy, hover, target, limits, seconds, clock=time.monotonic, sleep=time.sleep):
     """Fly to a target for some seconds, and hand over. Return why it ended; empty: time is over.
 
-    For the first half second it only streams commands, since some flight controllers follow none
-    before, and since the policy needs a history. The vehicle must be in the air, at rest.
+    The vehicle is in the air, and another mode of its controller flies it. First, commands to hover
+    are streamed, since some flight controllers follow none otherwise. After half a second it asks
+    for the control, and when it has it, the policy begins.
 
     :raises RuntimeError: the flight controller is not ready; nothing was sent.
     """
-    refusal = link.refusal() or Watchdog(limits).fault(link.state(), target, clock())
+    watchdog = Watchdog(limits)
+    refusal = link.refusal() or watchdog.fault(link.state(), target, clock())
     if refusal:
         raise RuntimeError(f"not taking over: {refusal}")
-    watchdog = Watchdog(limits)
+    watchdog.last_check = None
     policy.reset()
     n_first = round(0.5 / policy.period)
-    begin = clock()
+    n_patience = n_first + round(PATIENCE / policy.period)
+    n_steps = round(seconds / policy.period)
+    flown = -1  # steps of the policy; -1: it does not fly yet
     fault = "the companion loop failed"
+    begin = clock()
     try:
-        for step in range(n_first + round(seconds / policy.period)):
+        for step in itertools.count():
             state = link.state()
             fault = watchdog.fault(state, target, clock())
-            if not fault and step > n_first + 50 and not link.is_ours():
+            is_ours = step > n_first and link.is_ours()
+            if not fault and flown >= 0 and not is_ours:
                 fault = "another mode flies"
-            if fault:
+            if not fault and flown < 0 and step > n_patience:
+                fault = f"no control after {PATIENCE:g} s"
+            if fault or flown >= n_steps:
                 break
-            thrust, body_rates = policy(state, target)
-            if step < n_first:
-                # The policy does not fly yet: neither its integral nor its actions may run away.
-                thrust, body_rates = 1.0, np.zeros(3)
-                policy.reset()
+            thrust, body_rates = 1.0, np.zeros(3)
+            if is_ours:
+                thrust, body_rates = policy(state, target)
+                flown += 1
             throttle = hover.command(thrust)
             link.send(throttle, body_rates)
             if step == n_first:
                 link.take_over()
-            elif step > n_first + 50:
+            if flown > 0:
                 hover.update(state, throttle)
             sleep(max(0.0, begin + (step + 1) * policy.period - clock()))
     except BaseException:

@@ -59,8 +59,6 @@ class TrainedPolicy:
         and σ.
     :ivar observation: the frames that the policy sees.
     :ivar turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
-    :ivar output: ``thrusts``, ``speeds`` or, for a policy whose actions are rates, ``rates``.
-    :ivar to_layout: from the file's results to those in that layout, (4, 4).
 
     :param settings: how the policy flies.
     :param vehicle: the vehicle that it flies; its layout may differ.
@@ -81,7 +79,7 @@ class TrainedPolicy:
         settings = settings.with_changes(vehicle=vehicle, rotor_layout=layout)
         row = QuadcopterBatch(1, settings, n_threads=1)
         self.model = model
-        self.output = "rates" if settings.action == "rates" else output
+        self.output = output
         self.own = vehicle
         self.vehicle = row.vehicle_list[0]
         self.mean = row.mean[:, 0]
@@ -97,19 +95,11 @@ class TrainedPolicy:
             self.std = self.std * np.sqrt(statistics.obs_rms.var + statistics.epsilon)
         self.turn = find_turn(vehicle, layout)
         self.own_mean = self.mean @ turn_features(self.turn)
-        self.to_layout = np.eye(4)
-        if self.output == "rates":
-            self.to_layout[1:, 1:] = self.turn.axes
-        else:
-            self.to_layout = self.to_layout[[*self.turn.order]]
 
     def results(self, actions: Any) -> FloatArray:
-        """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions, (..., 4), in
-        float64; of rates, the collective thrust, N, and body rates, rad/s.
+        """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape,
+        in float64.
         """
-        if self.output == "rates":
-            middle, half = self.vehicle.rate_range
-            return middle + half * np.asarray(actions, np.float64)
         thrusts = self.vehicle.action_to_thrust(np.asarray(actions, np.float64))
         if self.output == "thrusts":
             return thrusts
@@ -134,7 +124,7 @@ def compare(
     :param by: the program that runs the file, for the message.
     :param n: maximum number of observations, since a flight may end early.
     :param relates: whether the file also makes observations relative to references.
-    :return: the largest difference of any result, N or rad/s, and the number of observations that
+    :return: the largest difference of any rotor, N or rad/s, and the number of observations that
         were compared.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
@@ -151,7 +141,6 @@ def compare(
         observation_mean=trained.mean,
         observation_std=trained.std,
         vehicle=trained.vehicle,
-        action="rates" if trained.output == "rates" else "thrusts",
         max_episode_steps=ENDLESS,
         noise=0.0,
         reference=MOVING,
@@ -183,14 +172,13 @@ def compare(
         if trained.clip:
             observation = observation.clip(-trained.clip, trained.clip)
         actions, _ = trained.model.predict(observation, deterministic=True)
-        difference = np.abs(results @ trained.to_layout.T - trained.results(actions))
+        difference = np.abs(results[:, trained.turn.order] - trained.results(actions))
         error = float(np.max(difference[compared], initial=error))  # NaN stays
         count += compared.sum()
         # After a flight is lost, it is no longer compared.
         observation, _, lost = batch.step(actions)
         compared &= ~lost
-    least, greatest = trained.results([[-1.0] * 4, [1.0] * 4])
-    allowed = TOLERANCE * (greatest - least).min()
+    allowed = TOLERANCE * np.ptp(trained.results([-1.0, 1.0]))
     # Negated, so that NaN fails as well.
     if not error <= allowed:
         raise ExportError(

@@ -23,11 +23,7 @@ from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import TrainedPolicy
 
 ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}
-OUTPUTS = {
-    "thrusts": ("thrust", "N"),
-    "speeds": ("rotor_speed", "rad/s"),
-    "rates": ("thrust_and_rates", "N or rad/s"),
-}
+OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
 """Each output, with the name and the unit of its four numbers."""
 
 
@@ -38,10 +34,10 @@ class Network(nn.Module):
     ``a = clip(layers((features - mean) * inverse_std), -1, 1)``, where VecNormalize bounds the
     input of the layers by ``clip``. Then ``q = middle + half_range * a`` (Eq. 3.18): thrusts, N.
     For speeds, middle and half_range are divided by kF, and the result is the root of q, rad/s (Eq.
-    2.4). For actions that are rates, q is the collective thrust, N, and the body rates, rad/s, and
-    ``to_own`` turns these to the vehicle's own axes.
+    2.4).
 
     A policy that sees more than the present features keeps the frames of
+
     :mod:`sb3_quad.envs.simulation.frames` in a state, float32 (batch, ``state_size``). The state is
     zero when a flight begins. It has those of these parts that the policy sees: the last action
     (4); the integral s (3), m, with a 1 once a flight has begun; the earlier frames, scaled, the
@@ -59,7 +55,6 @@ class Network(nn.Module):
     inverse_std: th.Tensor
     middle: th.Tensor
     half_range: th.Tensor
-    to_own: th.Tensor
 
     def __init__(self, layers: nn.Sequential, trained: TrainedPolicy) -> None:
         super().__init__()
@@ -79,15 +74,11 @@ class Network(nn.Module):
             limits /= vehicle.thrust_coefficient
         # The previewed accelerations follow the features.
         ahead = np.zeros(3 * len(observation.preview or ()))
-        middle, half_range = limits.mean(), np.ptp(limits) / 2
-        if trained.output == "rates":
-            middle, half_range = vehicle.rate_range
         buffers = {
             "mean": np.append(trained.own_mean, ahead),
             "inverse_std": 1.0 / np.append(trained.std, ahead + ACCELERATION_STD),
-            "middle": middle,
-            "half_range": half_range,
-            "to_own": trained.to_layout,
+            "middle": limits.mean(),
+            "half_range": np.ptp(limits) / 2,
         }
         for name, value in buffers.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float32))
@@ -139,10 +130,8 @@ class Network(nn.Module):
         return self.command(action), th.cat(following, dim=1)
 
     def command(self, action: th.Tensor) -> th.Tensor:
-        """Rotor thrusts or speeds, or thrust and body rates, (batch, 4), for actions."""
+        """Rotor thrusts or speeds, (batch, 4), for actions."""
         value: th.Tensor = self.middle + self.half_range * action
-        if self.trained.output == "rates":
-            return value @ self.to_own
         if self.trained.output == "thrusts":
             return value
         # Rounding may put a rotor that can stand still slightly below zero.
@@ -205,8 +194,7 @@ def own_layers(layers: nn.Sequential, trained: TrainedPolicy) -> nn.Sequential:
     """Copy a policy's layers for features in the vehicle's own body frame and its own order of the
     rotors.
 
-    The first layer turns the features, and the last action of rotors; the last layer renumbers the
-    rotors.
+    The first layer turns the features, and the last action; the last layer renumbers the rotors.
     """
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
     turn = trained.turn
@@ -218,8 +206,6 @@ def own_layers(layers: nn.Sequential, trained: TrainedPolicy) -> nn.Sequential:
     features = frames[..., :OBSERVATION_SIZE]
     turned = turn_features(turn) * trained.std / trained.std[:, None]
     features.copy_(features @ th.from_numpy(turned))
-    if trained.output == "rates":
-        return layers  # the results are turned instead
     if trained.observation.last_action:
         action = frames[..., OBSERVATION_SIZE:]
         action.copy_(action[..., turn.own])

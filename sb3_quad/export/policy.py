@@ -62,8 +62,7 @@ def export_policy(
 
     The file takes the features of an observation in physical units, see
     ``metadata["observation"]``, relative to a moving reference, see ``metadata["reference"]``. It
-    returns the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped; as
-    ONNX, of a policy whose actions are rates, the collective thrust (N) and body rates (rad/s).
+    returns the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
     Earlier frames that the policy sees are in a state, ``metadata["state"]``. A vehicle that is not
     given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it. If
     it finds none, the vehicle must be given, and the scaling is that of Table A.2.
@@ -93,8 +92,7 @@ def export_policy(
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     model = load_model(path)
     settings, source = agent_settings(path, model)
-    if file_format != "onnx" or output != "thrusts":
-        refuse_other_action(f"model {path}", model, "thrusts")
+    refuse_other_action(f"model {path}", model, "thrusts")
     if vehicle is None:
         vehicle = _own_vehicle(f"model {path}", settings, source)
     flown = first_vehicle(vehicle)
@@ -171,7 +169,7 @@ def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:
         version=__version__,
         network=network,
         # The limits of the results are those of the extreme actions.
-        limits=trained.results([[-1.0] * 4, [1.0] * 4])[:, 0],
+        limits=trained.results([-1.0, 1.0]),
         features=FEATURES,
         places=GROUPS,
         motors=motor_order(trained.own) if network.observation.features == "px4" else [],
