@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Sequence
-from typing import Any, Literal, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 from gymnasium import spaces
@@ -51,7 +51,6 @@ class FlightKeywords(TypedDict, total=False):
     noise: ArrayLike | StrMapping | Noise
     observation_mean: ArrayLike | None
     observation_std: ArrayLike | None
-    features: Literal["body", "px4"]
     last_action: bool
     history: Sequence[int] | None
     position_integral: StrMapping | PositionIntegral | None

@@ -95,7 +95,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | 12-14 | linear velocity | body | m/s | 5 |
     | 15-17 | angular velocity | body | rad/s | 5 |
 
-    With `features="px4"` the velocity is in the world frame, and 5, 8 and 11 are zero.
 
     ## Rewards
 
@@ -165,7 +164,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `noise` | 0.05 | relative std of the observation noise, or the fields of `Noise` |
     | `observation_mean` | `None` | mean of Eq. 3.16, (18,); `None`: zero |
     | `observation_std` | `None` | std of Eq. 3.16, (18,); `None`: the table above |
-    | `features` | `"body"` | `"px4"`: those that PX4's `mc_nn_control` shows a network |
     | `last_action` | `False` | whether a frame ends with the action before it (22 numbers) |
     | `history` | `None` | ages of the observed frames in control steps, such as `(0, 1, 2, 4)` |
     | `position_integral` | `None` | fields of `PositionIntegral`; `{}`: its defaults |

@@ -32,8 +32,6 @@ class Observation:
         self.ages = settings.get("history") or [0]
         self.last_action = settings.get("last_action", False)
         self.rule = settings.get("position_integral")
-        # Agents for PX4 see the velocity in the world frame, and no third column of the matrix.
-        self.for_px4 = settings.get("features") == "px4"
         # Control steps ahead in which the agent sees the acceleration of its reference.
         self.preview = settings.get("preview") or []
         self.control_step = settings["vehicle"]["control_step"]
@@ -66,8 +64,7 @@ class Observation:
         :param accelerations: of the reference in each control step of ``preview``, (previews, 3),
             world frame, m/s²; None: it rests.
         """
-        # Everything is relative to the reference, and the world is turned to its heading. For an
-        # agent for PX4, pass no heading, and the velocity itself.
+        # Everything is relative to the reference, and the world is turned to its heading.
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         velocity = rotation.T @ velocity
@@ -85,11 +82,7 @@ class Observation:
         features = np.concatenate(
             [position + self.integral, rotation.T.ravel(), velocity, body_rates]
         )
-        if self.for_px4:
-            features[12:15] = rotation @ velocity
         frame = (features - self.mean) / self.std
-        if self.for_px4:
-            frame[[5, 8, 11]] = 0.0
         if self.last_action:
             frame = np.concatenate([frame, np.clip(action, -1, 1)])
         self.frames = [frame, *self.frames[: self.ages[-1]]]

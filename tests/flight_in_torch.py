@@ -289,9 +289,6 @@ class Observer:
             turn(to_body, state.velocity - self.target_velocity),
             state.body_rates - turn(to_body, self.turning),
         ]
-        if self.settings.features == "px4":
-            error = state.position - self.target
-            parts = [error, to_body.flatten(1), state.velocity, state.body_rates]
         return th.cat(parts, dim=1)
 
     def disturb(self, features, noise):
@@ -309,10 +306,6 @@ class Observer:
         """
         noisy = self.disturb(self.features(state), noise)
         scaled = (noisy - self.mean) / self.std
-        if self.settings.features == "px4":
-            shown = th.ones(OBSERVATION_SIZE)
-            shown[[5, 8, 11]] = 0.0
-            scaled = scaled * shown
         if self.settings.position_integral is not None:
             gain_dt, near2, slow2, limit = self.numbers.tolist()
             error, speed = noisy[:, 0:3], noisy[:, 12:15]

@@ -177,7 +177,6 @@ RANDOM = {
 ESTIMATOR = {"position": 0.3, "velocity": [0, 0.5], "attitude": 20, "body_rates": 0.5}
 SEEN = {
     "action": st.just("rates"),
-    "features": st.just("px4"),
     "noise": st.sampled_from(
         [
             0.0,
@@ -249,7 +248,6 @@ DISTRIBUTION = {"vehicles": st.just({"distribution": "raptor"})}
     vehicle={},
     randomize={},
     seen={
-        "features": "px4",
         "noise": {"relative": 0.1, "additive": 0.05},
         "reference": {"curve": "random_smooth", "heading": "random", "heading_rate": 2.0},
         "position_integral": {"gain": 3, "distance": 1, "speed": 4, "limit": 0.05},

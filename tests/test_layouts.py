@@ -148,7 +148,6 @@ def test_a_model_and_an_expert_fly_their_vehicle_in_another_layout():
     [
         ({"vehicle": "crazyflie"}, "rotor_layout itm, here crazyflie"),
         ({"observation_std": [50.0] * 18}, "observation_std"),
-        ({"features": "px4"}, "features body, here px4"),
         ({"vehicle": "crazyflie", "rotor_layout": "itm"}, None),
         ({}, None),
     ],

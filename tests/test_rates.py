@@ -19,6 +19,7 @@ from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.export.policy import export_policy
 
 LOOPS = {"rate_gains": [0.5, 2.0], "rate_lag": [0.0, 0.02]}
 TORQUE = {"magnitude": 0.05, "unit": "weight", "axes": [1.0, 1.0, 0.3]}
@@ -184,8 +185,14 @@ def test_a_zip_says_what_its_actions_command(tmp_path):
     own = settings_of_model(load_model(tmp_path / "rates.zip"))
     assert own.observed["action"] == "rates"
     APG("MlpPolicy", env, initial_policy=model, n_steps=8, **small).learn(64)
-    # It flies as it was trained.
+    # It flies as it was trained, and files of it command the same.
     fly(str(tmp_path / "rates.zip"), "state_recovery", 2, max_episode_steps=20)
+    for file_format in ("c", "onnx"):
+        exported = export_policy(tmp_path / "rates.zip", file_format, n_observations=100)
+        assert "collective thrust" in exported.metadata["result"]
+    for unfit in ({"file_format": "crazyflie"}, {"file_format": "c", "output": "speeds"}):
+        with pytest.raises(ConfigError, match="rates"):
+            export_policy(tmp_path / "rates.zip", **unfit)
 
 
 @pytest.mark.parametrize("action", ["thrusts", "rates"])

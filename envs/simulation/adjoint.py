@@ -390,28 +390,23 @@ DIFFERENTIATED = {"position", "rotation", "velocity", "body_rates"}
 
 
 @fast
-def features_vjp(b, grad_feature, gradient, for_px4):
+def features_vjp(b, grad_feature, gradient):
     """Vector-Jacobian product of :func:`.observation.features`.
 
     It is added to the gradient with respect to the state of a loaded block.
 
     :param grad_feature: float64 (OBSERVATION_SIZE, LANES), with respect to the features in
         their units.
-    :param for_px4: whether the velocity has world axes.
     """
     f = grad_feature
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
         _add(gradient, X.position, lane, vector_at(f, F.position, lane))
         _add(gradient, X.body_rates, lane, vector_at(f, F.body_rates, lane))
-        # The observed velocity is Rᵀ v, or v itself, which the attitude does not turn.
+        # The observed velocity is Rᵀ v.
         observed = vector(f[F.velocity :], lane)
-        of_velocity = observed
-        v = 0.0, 0.0, 0.0
-        if not for_px4:
-            of_velocity = to_world(r, observed)
-            v = vector(b.velocity, lane)
-        _add(gradient, X.velocity, lane, of_velocity)
+        v = vector(b.velocity, lane)
+        _add(gradient, X.velocity, lane, to_world(r, observed))
         # The observed matrix is Rᵀ, row by row: its columns are the rows of R.
         x = add(_column(f, 0, lane), scaled(v[0], observed))
         y = add(_column(f, 1, lane), scaled(v[1], observed))

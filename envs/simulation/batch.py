@@ -161,7 +161,6 @@ class QuadcopterBatch:
 
         # The frames that a policy sees besides the present features.
         self.observation = settings.observation
-        self.for_px4 = self.observation.features == "px4"
         integral = self.observation.position_integral
         depth = (self.observation.ages[-1] + 1) * self.observation.is_extended
         self.frames = np.zeros((n, depth, self.observation.frame_size), dtype=np.float32)

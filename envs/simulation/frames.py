@@ -6,7 +6,7 @@ action that led there. An observation is the frames of several ages, one after t
 compiled functions keep the frames of a row and build observations from them.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from numba import float32
 from pydantic import Field, PositiveFloat, field_validator
@@ -50,9 +50,6 @@ class PositionIntegral(Frozen):
 class ObservationSettings(Frozen):
     """The content of an observation; by default the 18 features alone."""
 
-    features: Literal["body", "px4"] = "body"
-    """``body``, or ``px4``: as PX4's mc_nn_control shows the state, with the velocity in world
-    axes, zeros for the world's z axis in body axes, and the reference's position alone"""
     last_action: bool = False
     """whether a frame ends with the action that led to it, clipped to [-1, 1]"""
     history: tuple[Age, ...] | None = None

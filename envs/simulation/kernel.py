@@ -198,7 +198,7 @@ def step(
     wind_starts, chances, estimator_numbers, estimate, frames, ages, integral, integral_numbers,
     streams, scaling, task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations, last_actions,
-    moves, for_px4, course, tracks, track_numbers, previews,
+    moves, course, tracks, track_numbers, previews,
     physics_step, substeps, in_air, autoreset,
 ):  # fmt: skip
     """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
@@ -245,7 +245,6 @@ def step(
     :param last_actions: float32 (0 or n, 4), of the control step before, if change has a cost.
     :param moves: whether references move or have a heading; otherwise the rows of the state after
         the target's position are not read.
-    :param for_px4: whether observations are those of ``features: px4``.
     :param course: (COURSE_SIZE, 0 or n), see :mod:`.tracks`, also for ``tracks`` and
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
@@ -327,7 +326,7 @@ def step(
                 score_calm(b, first, count, actions, last_actions, physics_step * substeps)
             if estimate.shape[1] > 0:
                 perceive(b, count, True, estimator_numbers, estimate)
-            observe(b, moves, for_px4)
+            observe(b, moves)
             if estimate.shape[1] > 0:
                 # What follows reads the true state.
                 load_rows(state, first, b.resting)
@@ -394,7 +393,7 @@ def step(
             load_scaling(b, scaling)
         if estimate.shape[1] > 0:
             perceive(b, count, False, estimator_numbers, estimate)
-        observe(b, moves, for_px4)
+        observe(b, moves)
         _write_observations(
             b, count, integral, ages, frames, previews, course, tracks, track_numbers,
             observations,

@@ -90,27 +90,24 @@ def turn_features(turn: Turn) -> FloatArray:
 
 
 @inlined
-def features(b, moves, for_px4):
+def features(b, moves):
     """Write the features of a loaded block, in the units of the table and without noise.
 
     They go to ``b.feature``, float32.
 
     :param moves: whether references move or have a heading.
-    :param for_px4: whether the velocity has world axes, and nothing but the position is relative.
     """
-    _features_at_rest(b, for_px4)
-    if moves and not for_px4:
+    _features_at_rest(b)
+    if moves:
         _relate(b)
         _turn(b)
 
 
 @fast
-def _features_at_rest(b, for_px4):
+def _features_at_rest(b):
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
-        v = vector(b.velocity, lane)
-        if not for_px4:
-            v = to_body(r, v)
+        v = to_body(r, vector(b.velocity, lane))
         offset = subtract(vector(b.position, lane), vector(b.target, lane))
         store(b.observed_position, lane, offset)
         # From world to body: the columns of r
@@ -189,20 +186,12 @@ def _disturb_and_scale(b):
 
 
 @inlined
-def observe(b, moves, for_px4):
+def observe(b, moves):
     """Write the scaled features of a loaded block with their noise to ``b.feature``.
 
     The noise belongs to the row's episode and step: it stays the same until the stream advances.
     """
-    features(b, moves, for_px4)
+    features(b, moves)
     random_words(b, OBSERVATION_NOISE)
     standard_normals(b)
     _disturb_and_scale(b)
-    if for_px4:
-        clear_hidden(b.observed_rotation)
-
-
-@inlined
-def clear_hidden(rotation):
-    """Clear what PX4's module does not show, the last column of the rotation matrix, (9, LANES)."""
-    rotation[2::3] = 0.0

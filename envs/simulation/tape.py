@@ -34,7 +34,6 @@ from sb3_quad.envs.simulation.observation import (
     FEATURE_SIZES,
     OBSERVATION_SIZE,
     F,
-    clear_hidden,
     features,
     with_noise,
 )
@@ -205,7 +204,6 @@ class FlightTape:
             batch.vehicles,
             batch.scaling,
             batch.moves,
-            batch.for_px4,
             batch.ages,
             self._integrals,
             batch.integral_numbers,
@@ -226,7 +224,7 @@ class FlightTape:
 @compiled
 def step_vjp(
     control, leads, step, lengths, states, actions, queue, streams, estimates, wrench, wind,
-    filtered_rates, vehicles, scaling, moves, for_px4, ages, integrals, integral_numbers,
+    filtered_rates, vehicles, scaling, moves, ages, integrals, integral_numbers,
     grad_observation, grad_frames, grad_integral, grad_filtered, gradient, grad_actions,
     physics_step, substeps, in_air,
 ):  # fmt: skip
@@ -281,19 +279,17 @@ def step_vjp(
                     displace(b, estimates[step + 1])
                     # While gradients of features are added, all are with respect to the estimate.
                     turn_attitudes(b, own[X.quaternion : X.velocity], estimates[step + 1], 1.0)
-                features(b, moves, for_px4)
+                features(b, moves)
                 random_words(b, OBSERVATION_NOISE)
                 standard_normals(b)
                 _frames_vjp(
                     b, first, count, step + 1, lengths, actions, ages, integrals, integral_numbers,
                     grad_observation, grad_frames, grad_integral, grad_feature, grad_actions,
                 )  # fmt: skip
-                if for_px4:
-                    clear_hidden(grad_feature[F.rotation : F.velocity])
                 noise_vjp(b, grad_feature)
-                if moves and not for_px4:
+                if moves:
                     relation_vjp(b, grad_feature)
-                features_vjp(b, grad_feature, own, for_px4)
+                features_vjp(b, grad_feature, own)
                 if is_estimate:
                     turn_attitudes(b, own[X.quaternion : X.velocity], estimates[step + 1], -1.0)
 

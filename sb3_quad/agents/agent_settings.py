@@ -162,6 +162,8 @@ def settings_of_record(record: Any, where: str) -> FlightSettings:
             raise ConfigError(f"{where}: {source!r} is a path; a zip holds what it needs")
     # A task is saved by its fields; a mixture has weights by name instead.
     task = record.get("task")
+    # Zips of before say which of two kinds of features they have; the other kind is gone.
+    record = {key: value for key, value in record.items() if (key, value) != ("features", "body")}
     changes: StrDict = {"vehicle": validate(Vehicle, record.get("vehicle"), where)}
     if isinstance(task, dict) and "name" in task:
         changes["task"] = validate(Task, task, where)

@@ -6,6 +6,7 @@ It recovers from nearly every attitude, spin and fall, and flies to targets.
 import numpy as np
 
 from sb3_quad.base.types import FloatArray
+from sb3_quad.envs.simulation.settings import Action
 from sb3_quad.envs.simulation.state import (
     FELT,
     FORCE_WORLD,
@@ -17,7 +18,7 @@ from sb3_quad.envs.vehicles.gains import GeometricGains
 from sb3_quad.envs.vehicles.vehicle import VehicleSource, load_vehicle
 from sb3_quad.experts.geometric_gains import TrueConstants, constants_of, derived_gains
 from sb3_quad.experts.geometric_law import fly_geometric
-from sb3_quad.experts.protocol import Action, Actions, Expert
+from sb3_quad.experts.protocol import Actions, Expert
 
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 # Half of the drag from the vehicle's own motion is not compensated, because it damps.

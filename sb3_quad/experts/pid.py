@@ -7,10 +7,11 @@ import numpy as np
 from sb3_quad.base.compiled import compiled
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.simulation.physics import rotation, to_body
+from sb3_quad.envs.simulation.settings import Action
 from sb3_quad.envs.simulation.state import QuadcopterState, X
 from sb3_quad.envs.simulation.vectors import scaled, subtract, vector_at
 from sb3_quad.envs.vehicles.vehicle import VehicleSource
-from sb3_quad.experts.protocol import Action, Actions, Expert, command_rates
+from sb3_quad.experts.protocol import Actions, Expert, command_rates
 
 # The thesis scales φ_des and θ_des to a quarter, "to ensure smoother rotations" (3.2.1).
 ANGLE_FACTOR = 0.25

@@ -1,1 +1,1 @@
-"""Trained policies as files that fly without this package: ONNX, C, Crazyflie, PX4."""
+"""Trained policies as files that fly without this package: ONNX, C, Crazyflie."""

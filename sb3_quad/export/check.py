@@ -13,7 +13,7 @@ from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
 from sb3_quad.envs.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.envs.simulation.state import QuadcopterState, X
+from sb3_quad.envs.simulation.state import P, QuadcopterState, X
 from sb3_quad.envs.simulation.tasks import TASKS, Task
 from sb3_quad.envs.simulation.tracks import ACCELERATION_STD
 from sb3_quad.envs.vehicles.layout import find_turn
@@ -62,9 +62,10 @@ class TrainedPolicy:
 
     :param settings: how the policy flies.
     :param vehicle: the vehicle that it flies; its layout may differ.
-    :param output: ``thrusts`` (N) or ``speeds`` (rad/s).
+    :param output: ``thrusts`` (N) or ``speeds`` (rad/s) of the rotors; or ``rates``, the collective
+        thrust (N) and body rates (rad/s), of a policy with ``action="rates"``.
     :raises ConfigError: settings that the environment refuses; a layout that does not fit;
-        statistics for more than the present features.
+        statistics for more than the present features; a policy of another output.
     """
 
     def __init__(
@@ -94,12 +95,25 @@ class TrainedPolicy:
             self.mean = self.mean + self.std * statistics.obs_rms.mean
             self.std = self.std * np.sqrt(statistics.obs_rms.var + statistics.epsilon)
         self.turn = find_turn(vehicle, layout)
+        if settings.action == "rates":
+            low, high = 4.0 * np.array(self.vehicle.thrust_range)
+            rates = row.vehicles[P.rate_limit_x : P.rate_limit_x + 3, 0]
+            self.limits = np.array([[low, *-rates], [high, *rates]])
+            if not np.allclose(self.turn.axes, np.eye(3)):
+                raise ConfigError(
+                    f"{vehicle.name}: its axes are turned from those of the agent's body rates; "
+                    "turn rotor_positions in its file to the layout of the agent"
+                )
         self.own_mean = self.mean @ turn_features(self.turn)
 
     def results(self, actions: Any) -> FloatArray:
         """Return rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape,
-        in float64.
+        or collective thrust and body rates, N and rad/s, of actions (..., 4), in float64.
         """
+        if self.output == "rates":
+            half = np.ptp(self.limits, axis=0) / 2.0
+            commands: FloatArray = self.limits.mean(axis=0) + half * np.asarray(actions)
+            return commands
         thrusts = self.vehicle.action_to_thrust(np.asarray(actions, np.float64))
         if self.output == "thrusts":
             return thrusts
@@ -124,7 +138,7 @@ def compare(
     :param by: the program that runs the file, for the message.
     :param n: maximum number of observations, since a flight may end early.
     :param relates: whether the file also makes observations relative to references.
-    :return: the largest difference of any rotor, N or rad/s, and the number of observations that
+    :return: the largest difference of any result, N or rad/s, and the number of observations that
         were compared.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not
         finite.
@@ -141,6 +155,7 @@ def compare(
         observation_mean=trained.mean,
         observation_std=trained.std,
         vehicle=trained.vehicle,
+        action="rates" if trained.output == "rates" else "thrusts",
         max_episode_steps=ENDLESS,
         noise=0.0,
         reference=MOVING,
@@ -172,13 +187,15 @@ def compare(
         if trained.clip:
             observation = observation.clip(-trained.clip, trained.clip)
         actions, _ = trained.model.predict(observation, deterministic=True)
-        difference = np.abs(results[:, trained.turn.order] - trained.results(actions))
+        if trained.output != "rates":
+            results = results[:, trained.turn.order]
+        difference = np.abs(results - trained.results(actions))
         error = float(np.max(difference[compared], initial=error))  # NaN stays
         count += compared.sum()
         # After a flight is lost, it is no longer compared.
         observation, _, lost = batch.step(actions)
         compared &= ~lost
-    allowed = TOLERANCE * np.ptp(trained.results([-1.0, 1.0]))
+    allowed = TOLERANCE * np.ptp(trained.results([[-1.0] * 4, [1.0] * 4]), axis=0).min()
     # Negated, so that NaN fails as well.
     if not error <= allowed:
         raise ExportError(

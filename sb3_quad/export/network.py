@@ -23,13 +23,17 @@ from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import TrainedPolicy
 
 ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}
-OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
+OUTPUTS = {
+    "thrusts": ("thrust", "N"),
+    "speeds": ("rotor_speed", "rad/s"),
+    "rates": ("command", "N or rad/s"),
+}
 """Each output, with the name and the unit of its four numbers."""
 
 
 class Network(nn.Module):
-    """A deterministic policy from features in physical units to the four rotors, all of it float32,
-    on the CPU.
+    """A deterministic policy from features in physical units to the four rotors, or to collective
+    thrust and body rates, all of it float32, on the CPU.
 
     ``a = clip(layers((features - mean) * inverse_std), -1, 1)``, where VecNormalize bounds the
     input of the layers by ``clip``. Then ``q = middle + half_range * a`` (Eq. 3.18): thrusts, N.
@@ -65,8 +69,10 @@ class Network(nn.Module):
         self.clip = trained.clip
         self.result, self.unit = OUTPUTS[trained.output]
         # Eq. 3.18 maps an action to thrusts; divided by kF, to squares of speeds.
-        limits = np.array(vehicle.thrust_range)
-        if trained.output == "speeds":
+        limits = np.array(vehicle.thrust_range)[:, None] * np.ones(4)
+        if trained.output == "rates":
+            limits = trained.limits
+        elif trained.output == "speeds":
             if not vehicle.thrust_coefficient:
                 raise ConfigError(
                     f"output speeds: {vehicle.name} has no thrust_coefficient; export thrusts"
@@ -77,8 +83,8 @@ class Network(nn.Module):
         buffers = {
             "mean": np.append(trained.own_mean, ahead),
             "inverse_std": 1.0 / np.append(trained.std, ahead + ACCELERATION_STD),
-            "middle": limits.mean(),
-            "half_range": np.ptp(limits) / 2,
+            "middle": limits.mean(axis=0),
+            "half_range": np.ptp(limits, axis=0) / 2,
         }
         for name, value in buffers.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float32))
@@ -130,9 +136,9 @@ class Network(nn.Module):
         return self.command(action), th.cat(following, dim=1)
 
     def command(self, action: th.Tensor) -> th.Tensor:
-        """Rotor thrusts or speeds, (batch, 4), for actions."""
+        """Rotor thrusts or speeds, or thrust and body rates, (batch, 4), for actions."""
         value: th.Tensor = self.middle + self.half_range * action
-        if self.trained.output == "thrusts":
+        if self.trained.output != "speeds":
             return value
         # Rounding may put a rotor that can stand still slightly below zero.
         return value.relu().sqrt()
@@ -151,13 +157,12 @@ class Network(nn.Module):
         ]
 
 
-def build_network(trained: TrainedPolicy, where: str = "model", features: str = "body") -> Network:
+def build_network(trained: TrainedPolicy, where: str = "model") -> Network:
     """Build the network of an SB3 model with ``MlpPolicy``, on-policy, SAC's or TD3's, with its
     scaling and its rotors.
 
     :param where: the name of the model in messages.
-    :param features: the features that it must have been trained with.
-    :raises ConfigError: an unknown output, other features or spaces than the quadcopter's, a policy
+    :raises ConfigError: an unknown output, other spaces than the quadcopter's, a policy
         that :func:`check_policy` refuses, or a network with other layers than linear ones, tanh and
         ReLU.
     """
@@ -175,11 +180,6 @@ def build_network(trained: TrainedPolicy, where: str = "model", features: str = 
         raise ConfigError(
             f"{where}: its actions are {model.action_space}, the quadcopter's are {ACTIONS}"
         )
-    if trained.observation.features != features:
-        raise ConfigError(
-            f"{where}: --format px4 needs and takes features: px4, all others body; "
-            f"train with --env-kwargs features:{features}"
-        )
     # C knows these layers only.
     for layer in layers:
         if type(layer) not in (nn.Linear, *ACTIVATIONS):
@@ -195,6 +195,7 @@ def own_layers(layers: nn.Sequential, trained: TrainedPolicy) -> nn.Sequential:
     rotors.
 
     The first layer turns the features, and the last action; the last layer renumbers the rotors.
+    Thrust and body rates stay, since their axes are those of the layout.
     """
     layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
     turn = trained.turn
@@ -206,6 +207,8 @@ def own_layers(layers: nn.Sequential, trained: TrainedPolicy) -> nn.Sequential:
     features = frames[..., :OBSERVATION_SIZE]
     turned = turn_features(turn) * trained.std / trained.std[:, None]
     features.copy_(features @ th.from_numpy(turned))
+    if trained.output == "rates":
+        return layers
     if trained.observation.last_action:
         action = frames[..., OBSERVATION_SIZE:]
         action.copy_(action[..., turn.own])

@@ -18,21 +18,20 @@ from sb3_quad.base.templates import render
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.envs.simulation.observation import FEATURES, GROUPS
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.vehicles.vehicle import Vehicle, VehicleSource, first_vehicle, load_vehicle
-from sb3_quad.export import crazyflie, load, px4
+from sb3_quad.envs.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
+from sb3_quad.export import crazyflie, load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, TrainedPolicy, compare
 from sb3_quad.export.cost import cost_of
 from sb3_quad.export.crazyflie import plan_app
 from sb3_quad.export.network import Network, build_network, write_onnx
-from sb3_quad.export.px4 import load_px4, motor_order, write_px4
 
 # Formats, with the suffixes of their files or folders
-FORMATS = {"onnx": ".onnx", "c": ".h", "crazyflie": "_crazyflie", "px4": "_px4"}
+FORMATS = {"onnx": ".onnx", "c": ".h", "crazyflie": "_crazyflie"}
 # Formats that are folders, with the file that contains the policy
-FOLDERS = {"crazyflie": "src/policy.h", "px4": "control_net.tflite"}
+FOLDERS = {"crazyflie": "src/policy.h"}
 # The other files in them; the template of FILE is FORMAT.FILE.j2, with . for /.
-FILES = {"crazyflie": crazyflie.FILES, "px4": px4.FILES}
+FILES = {"crazyflie": crazyflie.FILES}
 
 Write = Callable[[Network, StrDict], bytes]
 Read = Callable[[bytes, int], tuple[load.Call, str]]
@@ -62,13 +61,14 @@ def export_policy(
 
     The file takes the features of an observation in physical units, see
     ``metadata["observation"]``, relative to a moving reference, see ``metadata["reference"]``. It
-    returns the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped.
+    returns the four rotors' thrusts (N) or speeds (rad/s), or the collective thrust (N) and body
+    rates (rad/s) of a policy that commands these, by the policy's mean action, clipped.
     Earlier frames that the policy sees are in a state, ``metadata["state"]``. A vehicle that is not
     given, and the scaling, are those that :func:`agent_settings` finds in the zip or next to it. If
     it finds none, the vehicle must be given, and the scaling is that of Table A.2.
 
-    :param file_format: ``onnx``, ``c``, ``crazyflie``, which is an app around the C header, or
-        ``px4``; ``output``: ``thrusts`` or ``speeds``.
+    :param file_format: ``onnx``, ``c``, or ``crazyflie``, which is an app around the C header;
+        ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: the vehicle whose body frame, order of rotors, thrust limits and, for speeds, kF
         the file uses.
     :param name: the C function is called ``NAME_policy``; None: the name of the zip.
@@ -92,7 +92,12 @@ def export_policy(
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     model = load_model(path)
     settings, source = agent_settings(path, model)
-    refuse_other_action(f"model {path}", model, "thrusts")
+    if file_format in FOLDERS:
+        refuse_other_action(f"model {path}", model, "thrusts")
+    if settings.action == "rates":
+        if output != "thrusts":
+            raise ConfigError(f"model {path}: commands thrust and body rates; remove --output")
+        output = "rates"
     if vehicle is None:
         vehicle = _own_vehicle(f"model {path}", settings, source)
     flown = first_vehicle(vehicle)
@@ -100,14 +105,13 @@ def export_policy(
         # Axes and rotors as the firmware has them.
         flown = flown.in_layout_of(load_vehicle("crazyflie"))
     trained = TrainedPolicy(model, settings, flown, output)
-    features = "px4" if file_format == "px4" else "body"
-    network = build_network(trained, f"model {path}", features)
+    network = build_network(trained, f"model {path}")
     is_header = file_format in ("c", "crazyflie")
     facts: StrDict = {"cost": cost_of(network) if is_header else None}
     facts["plan"] = plan_app(network) if file_format == "crazyflie" else {}
     metadata = _describe(Path(path), network, **facts)
     # The file is checked, then written again with the result of the check in it.
-    write, read = _writer_and_reader(file_format, prefix, flown)
+    write, read = _writer_and_reader(file_format, prefix)
     call, by = read(write(network, metadata), network.state_size)
     error, n_compared = compare(trained, call, by, n_observations, relates=is_header)
     metadata["check"] = (
@@ -118,8 +122,6 @@ def export_policy(
     if file_format in FOLDERS:
         words = {"name": prefix, "metadata": metadata, "vehicle": flown, **facts["plan"]}
         files = _folder(file_format, content, words)
-    if file_format == "px4" and files is not None:
-        metadata["parameters"] = "; ".join(files[px4.PARAMETERS].decode().splitlines())
     return Export(content, metadata, error, network.unit, source, files)
 
 
@@ -142,12 +144,10 @@ def _own_vehicle(where: str, settings: FlightSettings, source: Path | None) -> V
     return vehicle
 
 
-def _writer_and_reader(file_format: str, prefix: str, flown: Vehicle) -> tuple[Write, Read]:
+def _writer_and_reader(file_format: str, prefix: str) -> tuple[Write, Read]:
     """Return what writes files of a format, and what reads them for the check."""
     if file_format == "onnx":
         return write_onnx, load.load_onnx
-    if file_format == "px4":
-        return write_px4, partial(load_px4, vehicle=flown)
     return partial(write_header, name=prefix), partial(load.load_header, name=prefix)
 
 
@@ -169,10 +169,9 @@ def _describe(path: Path, network: Network, **facts: Any) -> dict[str, str]:
         version=__version__,
         network=network,
         # The limits of the results are those of the extreme actions.
-        limits=trained.results([-1.0, 1.0]),
+        limits=trained.results([[-1.0] * 4, [1.0] * 4]),
         features=FEATURES,
         places=GROUPS,
-        motors=motor_order(trained.own) if network.observation.features == "px4" else [],
         n_parameters=parameters_to_vector(network.parameters()).numel(),
         needs=network.observation.model_dump(mode="json", exclude={"preview"}),
         **facts,

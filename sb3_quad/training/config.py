@@ -48,7 +48,7 @@ from sb3_quad.training.algorithms import (
 )
 from sb3_quad.training.options import JobOptions
 
-_FOLDERS = ("any_quadcopter", "nominal", "px4", "robust", "thesis")
+_FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind = Literal["batch", "dummy", "subproc"]

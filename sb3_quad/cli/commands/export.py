@@ -8,9 +8,6 @@ checked against the policy on 10,000 observations. A policy that observes
 earlier frames, its last action or the position integral also takes a state,
 and returns the next one.
 
-A network for PX4 takes the 15 numbers of its module mc_nn_control instead, and
-comes with the module's parameters (docs/export.md).
-
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1 --format onnx
   # defines agent_policy(observation, thrust)
@@ -18,11 +15,10 @@ examples:
   # rotor speeds instead of thrusts, rad/s
   sb3-quad export agent.zip --format onnx --output speeds
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
-  sb3-quad export x500-px4 --format px4
   # a folder that the Crazyflie's firmware builds
   sb3-quad export crazyflie-robust --format crazyflie -o my_app
 
-ONNX: pip install '.[export]' from a clone; PX4: pip install '.[px4]'. The check
+ONNX: pip install '.[export]' from a clone. The check
 of a C header needs a C compiler.
 """
 
@@ -44,11 +40,11 @@ FLAGS: Flags = {
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC or TD3): "
         "a zip, a run folder, hf:ORG/NAME, or a name such as itm-recovery",
     ),
-    "--format": ({"required": True}, "onnx, c, crazyflie or px4"),
+    "--format": ({"required": True}, "onnx, c or crazyflie"),
     "-o FILE": (
         {"dest": "file"},
         "file to write, or a folder for it (MODEL.onnx or .h in this folder); "
-        "for crazyflie and px4 the folder of all files (MODEL_crazyflie, MODEL_px4)",
+        "for crazyflie the folder of all files (MODEL_crazyflie)",
     ),
     "--output KIND": (
         str,
@@ -80,7 +76,7 @@ def run(options: Namespace) -> int:
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
     # Suffixes that no format has, such as .hpp, are the user's choice.
-    if file.suffix != ending and file.suffix in (*FORMATS.values(), ".tflite", ".zip"):
+    if file.suffix != ending and file.suffix in (*FORMATS.values(), ".zip"):
         raise ConfigError(f"{file}: --format {options.format} writes {model.stem}{ending}")
     refuse_existing(file / FOLDERS.get(options.format, ""), options.overwrite)
     name = options.name

@@ -1,1 +1,0 @@
-"""Settings for policies that PX4's module mc_nn_control computes."""
