@@ -191,9 +191,9 @@ def commands_of(policy, vehicle, n):
 
     def command(state):
         columns = state.position, state.quaternion, state.velocity, state.body_rates
-        rows = zip(pilots, state.target, *columns)
+        rows = zip(pilots, state.target, *columns, strict=True)
         results = [pilot(State(0.0, *parts), target) for pilot, target, *parts in rows]
-        thrusts, rates = zip(*results)
+        thrusts, rates = zip(*results, strict=True)
         return np.array(thrusts), np.array(rates)
 
     return command
@@ -217,9 +217,7 @@ def starts(task, n, seed):
 
 
 def new_batch(vehicle, n, action, start):
-    settings = FlightSettings(
-        vehicle=vehicle, action=action, noise=0.0, max_episode_steps=ENDLESS
-    )
+    settings = FlightSettings(vehicle=vehicle, action=action, noise=0.0, max_episode_steps=ENDLESS)
     batch = QuadcopterBatch(n, settings, 0, 1, autoreset=False)
     batch.reset()
     quaternion, rates, offset = start

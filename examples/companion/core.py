@@ -89,7 +89,7 @@ class Policy:
         """Return the thrust divided by the weight, and body rates, rad/s."""
         self.values[0][0, :18] = state.observation(target)
         names = [entry.name for entry in self.inputs]
-        command, *self.values[1:] = self.session.run(None, dict(zip(names, self.values)))
+        command, *self.values[1:] = self.session.run(None, dict(zip(names, self.values, strict=True)))
         return float(command[0, 0]) / self.weight, command[0, 1:].astype(float)
 
 

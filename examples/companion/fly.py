@@ -1,4 +1,4 @@
-"""Let an exported agent fly a vehicle behind its flight controller's rate loop, for some seconds.
+r"""Let an exported agent fly a vehicle behind its flight controller's rate loop, for some seconds.
 
     pip install '.[companion]'
     sb3-quad export any-quadcopter-rates --format onnx --vehicle mine.yaml -o agent.onnx
