@@ -133,8 +133,8 @@ def test_it_hands_over_when_the_policy_fails_and_sends_nothing_when_it_is_not_re
     [
         ({"velocity": np.array([0.0, math.nan, 0.0])}, "not finite"),
         ({"quaternion": np.zeros(4)}, "not finite"),
-        ({"position": [*TARGET, 0.0, 0.0, 4.0]}, "height 6.00 m"),
-        ({"position": [*TARGET, 6.0, 0.0, 0.0]}, "too far"),
+        ({"position": TARGET + np.array([0.0, 0.0, 4.0])}, "height 6.00 m"),
+        ({"position": TARGET + np.array([6.0, 0.0, 0.0])}, "too far"),
         ({"body_rates": np.array([0.0, -30.0, 0.0])}, "spins"),
         ({"quaternion": turned([1.0, 0.0, 0.0], 120.0)}, "tilted"),
         ({}, ""),
@@ -196,7 +196,7 @@ def test_the_policy_sees_its_frames_and_keeps_its_state(tmp_path):
     onnx.save(model, tmp_path / "a.onnx")
     policy = core.Policy(str(tmp_path / "a.onnx"))
     state = at_rest(
-        position=[*TARGET, 0.0, 0.0, 0.4],
+        position=TARGET + np.array([0.0, 0.0, 0.4]),
         quaternion=turned([0.0, 0.0, 1.0], 90.0),
         velocity=np.array([0.0, 3.0, 0.0]),
         body_rates=np.array([5.0, 0.0, 0.0]),
@@ -258,7 +258,7 @@ def test_px4_gets_rates_in_its_frames_and_goes_back_to_position_mode(px4, monkey
     monkeypatch.setattr(via_px4.time, "sleep", clock.sleep)
     mavlink = fake.mavlink
     assert link.state() is None and "hold" in link.refusal()
-    # 5 m north, 1 m east, 2 m up; nose up by 30 degrees; sinks; rolls right, nose rises, turns right
+    # North 5 m, east 1 m, up 2 m; the nose 30 degrees up; it sinks, rolls and turns to the right.
     half = math.radians(15.0)
     quaternion = math.cos(half), 0.0, math.sin(half), 0.0
     fake.speak(

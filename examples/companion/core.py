@@ -89,7 +89,8 @@ class Policy:
         """Return the thrust divided by the weight, and body rates, rad/s."""
         self.values[0][0, :18] = state.observation(target)
         names = [entry.name for entry in self.inputs]
-        command, *self.values[1:] = self.session.run(None, dict(zip(names, self.values, strict=True)))
+        given = dict(zip(names, self.values, strict=True))
+        command, *self.values[1:] = self.session.run(None, given)
         return float(command[0, 0]) / self.weight, command[0, 1:].astype(float)
 
 
@@ -100,15 +101,17 @@ class HoverThrust:
     :ivar throttle: the estimate; begin with what your controller shows in hover.
     :ivar power: thrust rises with the throttle to this power: 1 where the firmware linearizes the
         thrust, 2 where the throttle is the motors' speed.
-    :ivar time_constant: of the estimate, s.
+    :ivar lag: from a throttle to its thrust, s; ``time_constant``: of the estimate, s.
     """
 
     throttle: float
     power: float = 1.0
+    lag: float = 0.05
     time_constant: float = 2.0
     _last: State | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        self._expected = 1.0
         self.range = 0.5 * self.throttle, min(2.0 * self.throttle, 1.0)
 
     def command(self, thrust: float) -> float:
@@ -117,20 +120,22 @@ class HoverThrust:
 
     def update(self, state: State, throttle: float) -> None:
         """Learn from the velocity that a throttle has led to since the last state. Only flight that
-        is close to hover teaches anything, because thrust lags behind the throttle.
+        is close to hover teaches anything.
         """
         last, self._last = self._last, state
         if last is None:
             return
         dt = state.time - last.time
-        if not 0.0 < dt < 0.1 or state.tilt > math.radians(15.0):
+        if not 0.0 < dt < 0.1:
             return
+        now = (throttle / self.throttle) ** self.power
+        self._expected += (now - self._expected) * min(dt / self.lag, 1.0)
         felt = (state.velocity - last.velocity) / dt + [0.0, 0.0, GRAVITY]
         thrust = felt @ last.rotation[:, 2] / GRAVITY
-        expected = (throttle / self.throttle) ** self.power
-        if abs(thrust - 1.0) > 0.3 or abs(expected - 1.0) > 0.3:
+        is_near = max(abs(thrust - 1.0), abs(self._expected - 1.0)) < 0.3
+        if not is_near or state.tilt > math.radians(15.0):
             return
-        change = (expected - thrust) * dt / (self.power * self.time_constant)
+        change = (self._expected - thrust) * dt / (self.power * self.time_constant)
         self.throttle = float(np.clip(self.throttle * (1.0 + change), *self.range))
 
 

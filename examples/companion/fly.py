@@ -61,6 +61,7 @@ CONNECT = {
 
 
 def main() -> None:
+    """Connect, fly, and say why it ended."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("controller", choices=CONNECT)
     parser.add_argument("agent", help="an ONNX file that commands thrust and body rates")

@@ -1,9 +1,9 @@
-"""Betaflight, by MSP over a serial port: RC channels of a companion computer in place of the pilot's.
+"""Betaflight, by MSP over a serial port: RC channels in place of the pilot's.
 
 The pilot keeps the transmitter. One switch arms, another one (mode MSP OVERRIDE) gives roll, pitch,
 throttle and yaw to the companion computer, so the pilot hands over and takes back. **If commands
-stop, Betaflight keeps the last ones until the pilot flips the switch.** It knows no position: give a
-function that returns the state, from motion capture or an odometry.
+stop, Betaflight keeps the last ones until the pilot flips the switch.** It knows no position: give
+a function that returns the state, from motion capture or an odometry.
 
     set msp_override_channels_mask = 15    # roll, pitch, throttle, yaw
     set msp_override_failsafe = OFF        # so that losing the transmitter is a failsafe
@@ -42,6 +42,7 @@ def frame(code: int, payload: bytes = b"") -> bytes:
 
 
 def checksum(body: bytes) -> int:
+    """Return the last byte of a message, for the bytes after its direction."""
     return reduce(xor, body)
 
 
