@@ -62,6 +62,10 @@ from sb3_quad.export.network import check_policy
 from sb3_quad.training.runs import MADE_WITH, open_run
 
 UNKNOWN = "not recorded"
+COMMANDS = {
+    "thrusts": "the thrusts of the rotors",
+    "rates": "the collective thrust and the body rates (`action: rates`)",
+}
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 RECOVERY = "state recovery"
@@ -276,6 +280,7 @@ def write_card(
         frames=", ".join(f"{key}={value!r}" for key, value in seen.items()),
         vehicle=flies,
         noise=in_words(settings["noise"]),
+        commands=COMMANDS[settings.get("action", "thrusts")],
         recoveries=f"{measured[RECOVERY].n:,}",
         targets=f"{targets:,}",
         table=Table(heads, rows).markdown(),

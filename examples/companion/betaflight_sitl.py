@@ -14,6 +14,7 @@ import argparse
 import copy
 import math
 import os
+import shutil
 import socket
 import struct
 import subprocess
@@ -160,6 +161,7 @@ class Sitl:
     def close(self) -> None:
         os.close(self.go)
         self.process.wait(10.0)
+        shutil.rmtree(self.folder)
 
 
 def command_range(vehicle):
