@@ -167,6 +167,8 @@ if __name__ == "__main__":
                 "sb3-quad train writes that into its zips"
             )
         settings = model.flight_settings
+        if settings.get("action", "thrusts") != "thrusts":
+            sys.exit(f"{path}: commands body rates, and this script flies rotor thrusts")
         observation = Observation(settings)
         action = np.zeros(4)
         # The target is the origin.

@@ -92,11 +92,12 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
 
 @pytest.mark.slow
 def test_the_example_flies_every_zip_where_sb3_quad_cannot_be_imported(tmp_path):
-    zips = [sb3_quad.pretrained_path(name) for name in pretrained_names()]
+    names = [name for name in pretrained_names() if not name.endswith("-rates")]
+    zips = [sb3_quad.pretrained_path(name) for name in names]
     result = run(RUN, EXAMPLE, *zips)
     assert result.returncode == 0, result.stderr
     lines = [line for line in result.stdout.splitlines() if " m from" in line]
-    for name, line in zip(pretrained_names(), lines, strict=True):
+    for name, line in zip(names, lines, strict=True):
         distance = float(line.rpartition(": ")[2].split(" m from")[0])
         assert distance < NEXT_TO_TARGET.get(name, 0.1), name
     silent = tmp_path / "silent.zip"

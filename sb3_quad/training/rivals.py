@@ -12,6 +12,7 @@ import numpy as np
 from sb3_quad.agents.pretrained import load_pretrained, pretrained_names
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.agents.zips import load_model
+from sb3_quad.algorithms.labelling import refuse_other_action
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import save_model
 from sb3_quad.base.seeds import seed_for
@@ -90,6 +91,7 @@ def fly_rivals(
         try:
             if name in pretrained_names():
                 rival = load_pretrained(name)
+                refuse_other_action(name, rival, config.flight_settings.action)
                 settings = merged({**config.settings, **as_agent(rival, config, {})}, changes, name)
                 own_config = build_config(config.algo, config.env_id, settings, name)
                 path = str(folder / f"{name}.zip")
