@@ -298,7 +298,7 @@ def check_on_arm(folder, exported, tmp_path):
 )
 def test_what_no_crazyflie_flies_is_one_line(apps, tmp_path, monkeypatch, capsys, arguments, key):
     monkeypatch.chdir(tmp_path)
-    lines = CRAZYFLIE.model_dump(mode="json", exclude={"geometric_gains", "time_optimal"})
+    lines = CRAZYFLIE.model_dump(mode="json", exclude={"geometric_gains", "time_optimal", "rates"})
     lines.update(control_step=0.0105, physics_step=0.0015)
     Path("slow.yaml").write_text("\n".join(f"{name}: {value}" for name, value in lines.items()))
     Path("app", "src").mkdir(parents=True)

@@ -362,7 +362,7 @@ def test_a_value_of_another_type_or_out_of_range_is_refused(kind, value):
         convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
 
 
-PIPELINES = "two_stage.yml", "imitation.yml", "robust/crazyflie.yml", THESIS
+PIPELINES = "two_stage.yml", "imitation.yml", "robust/crazyflie.yml", "rates.yml", THESIS
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def shifted(vehicle: Vehicle, x: float, y: float = 0.0) -> Vehicle:
     )
 
 
-@given(vehicles(), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
+@given(vehicles(), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 def test_hover_about_another_centre_of_mass_takes_four_thrusts(
     vehicle: Vehicle, x: float, y: float
 ) -> None:

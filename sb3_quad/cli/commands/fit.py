@@ -1,8 +1,8 @@
 """Fit a vehicle file to logs of its flights.
 
-It reads PX4's ULog, Betaflight's blackbox, the logs of a Crazyflie's µSD card, and CSV files. It
-prints each parameter with its interval, how far predictions are off before and after on flights
-that were not fitted, and draws them.
+It reads PX4's ULog, Betaflight's blackbox, the logs of a Crazyflie's µSD card,
+and CSV files. It prints each parameter with its interval, how far predictions
+are off before and after on flights that were not fitted, and draws them.
 
 examples:
   # a Crazyflie's logs
