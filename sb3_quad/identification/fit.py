@@ -145,7 +145,7 @@ class Model:
             if part.size:
                 scaled.append((part / sizes[None, :, None]).reshape(len(part), -1))
         # Predictions that diverge must not become infinite.
-        return np.clip(np.nan_to_num(np.hstack(scaled), nan=1e3), -1e3, 1e3)
+        return np.asarray(np.clip(np.nan_to_num(np.hstack(scaled), nan=1e3), -1e3, 1e3))
 
     def slopes(self, vector: FloatArray) -> FloatArray:
         """Return the derivatives of the errors, (windows, n, keys), by differences."""
@@ -355,7 +355,7 @@ def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
     is_free = scaling.sizes == 0.0
     far = is_free & ((values > 0.98 * limits) | (vector < -0.99 * LARGEST_CHANGE))
     for k in np.flatnonzero(far):
-        reasons[scaling.keys[k]] = f"it would run to {values[k]:.2g}"
+        reasons[scaling.keys[int(k)]] = f"it would run to {values[k]:.2g}"
     kept = np.flatnonzero(~far)
     while True:
         half = np.zeros(len(vector))
@@ -363,7 +363,7 @@ def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
         widths = scaling.widths(vector, half)
         worst = int(np.argmax(widths / allowed))
         if widths[worst] <= allowed[worst]:
-            return [scaling.keys[k] for k in kept], reasons
+            return [scaling.keys[int(k)] for k in kept], reasons
         reasons[scaling.keys[worst]] = f"its interval would be ± {widths[worst]:.2g}"
         kept = kept[kept != worst]
 

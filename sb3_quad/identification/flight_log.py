@@ -78,7 +78,8 @@ class Log:
 
         :param delay: how much later commands act, s.
         """
-        edges = self.begin + self.offset - delay + self.step * np.arange(len(self.flying) + 1)
+        rows = np.arange(len(self.flying) + 1, dtype=np.float64)
+        edges = self.begin + self.offset - delay + self.step * rows
         return _held_means(self.commands, edges)
 
     @cached_property
@@ -174,7 +175,8 @@ def on_grid(recording: Recording, step: float) -> Log:
     motion[:, POSITION.stop] = 1.0
     offset = 0.0
     # Some logs are extrapolated after the radio was lost.
-    flying = np.isfinite(_held_means(commands, np.append(grid, grid[-1] + step))).all(axis=1)
+    means = _held_means(commands, np.append(grid, grid[-1] + step))
+    flying: BoolArray = np.asarray(np.isfinite(means).all(axis=1))
     if has_motion:
         offset = _fill_motion(path, series, grid, motion, flying)
     motion[:, BODY_RATES] = _resampled(series["gyro"], grid + offset, step)
@@ -310,7 +312,7 @@ def _fill_motion(
         motion[:, POSITION] = np.cumsum(velocity, axis=0) * step
 
     def gap(behind: float) -> FloatArray:
-        return _resampled(series["gyro"], grid + behind)[flying] - rates[flying]
+        return np.asarray(_resampled(series["gyro"], grid + behind)[flying] - rates[flying])
 
     costs = np.array([np.square(gap(behind)).sum() for behind in OFFSETS])
     # Noise alone must not move the clock.
@@ -335,7 +337,8 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
     commands = log.mean_commands()
     time, _ = log.commands
     flying = log.flying & np.isfinite(commands).all(axis=1)
-    flying &= _without_gaps(time, log.begin + log.offset + log.step * np.arange(len(flying)))
+    rows = np.arange(len(flying), dtype=np.float64)
+    flying &= _without_gaps(time, log.begin + log.offset + log.step * rows)
     mean = commands.mean(axis=1)
     if not knows_height:
         on = mean[mean > 0.2 * np.nanmax(mean)]

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import FloatArray
+from sb3_quad.base.types import FloatArray, IntArray
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import (
@@ -49,7 +49,7 @@ class Windows:
         self.ends = ends
         self.before = round(warm_up / vehicle.control_step)
         length = self.before + ends[-1] + 1
-        starts: list[FloatArray] = []
+        starts: list[IntArray] = []
         first = 0
         for log in logs:
             # A window is valid only if all of its rows fly.

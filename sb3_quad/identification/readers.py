@@ -175,7 +175,7 @@ def _usd(path: Path) -> list[Part]:
         # Version 1 counts milliseconds, version 2 microseconds.
         time, scale = ("<I", 1e-3) if version == 1 else ("<Q", 1e-6)
         place = 5
-        layouts = {}
+        layouts: dict[int, tuple[list[str], struct.Struct, list[Any]]] = {}
         for _ in range(kinds):
             (identifier,) = struct.unpack_from("<H", data, place)
             _, place = _text(data, place + 2)
@@ -223,7 +223,7 @@ def _table(path: Path) -> tuple[Format, list[Part]]:
     columns = {name.partition(" (us)")[0]: frame[name].to_numpy() for name in frame}
     fitting = []
     for log_format in TABLES:
-        known = set()
+        known: set[str] = set()
         for alternatives in log_format.series.values():
             known.update(*(option.names for option in alternatives))
         if log_format.time.names[0] in columns:
