@@ -69,7 +69,8 @@ class Sitl:
         self.folder = Path(tempfile.mkdtemp(prefix="sitl_"))
         shim = self.folder / "lockstep.so"
         source = HERE / "lockstep.c"
-        command = ["cc", "-O2", "-shared", "-fPIC", "-o", shim, source, "-ldl", "-lpthread"]
+        flags = ["-O2", "-shared", "-fPIC", "-ldl", "-lpthread"]
+        command = ["cc", str(source), "-o", str(shim), *flags]
         subprocess.run(command, check=True)
         self.program = program.resolve()
         self.motors = np.zeros(4)
@@ -109,9 +110,9 @@ class Sitl:
 
     def configure(self, lines: str) -> None:
         """Type lines into its command line, the last of which ends it."""
-        *lines, save = lines.strip().splitlines()
+        *typed, save = lines.strip().splitlines()
         with socket.create_connection(("127.0.0.1", 5761)) as terminal:
-            for line in ["#", *(f"{line}\n" for line in lines)]:
+            for line in ["#", *(f"{line}\n" for line in typed)]:
                 terminal.sendall(line.encode())
                 time.sleep(0.05)  # the terminal's thread runs in real time
                 for _ in range(20):
@@ -181,11 +182,11 @@ def commands_of(policy, vehicle, n):
     if policy == "geometric":
         expert = GeometricExpert(vehicle, action="rates")
 
-        def command(state):
+        def ask(state):
             values = middle + half * expert.actions(state)
             return values[:, 0] / weight, values[:, 1:]
 
-        return command
+        return ask
     first = Policy(policy)
     pilots = [copy.copy(first) for _ in range(n)]
     for pilot in pilots:

@@ -73,7 +73,8 @@ class Policy:
                 " with action: rates"
             )
         # One number for all rotors, or four of them
-        hover = re.search(r"hover thrusts? (.*?) N,", facts["vehicle"]).group(1).split(", ")
+        (listed,) = re.findall(r"hover thrusts? (.*?) N,", facts["vehicle"])
+        hover = listed.split(", ")
         self.weight = 4.0 * float(np.mean([float(number) for number in hover]))
         self.period = float(facts["period"].split()[0])
         self.inputs = self.session.get_inputs()
@@ -157,7 +158,8 @@ class Watchdog:
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
-        self.upright = self.last_check = None
+        self.upright: float | None = None
+        self.last_check: float | None = None
 
     def fault(self, state: State | None, target: np.ndarray, now: float) -> str:
         """Return why the policy must not fly on, or an empty string."""

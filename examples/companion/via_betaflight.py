@@ -58,10 +58,10 @@ class Betaflight:
         self.port = port
         self.state = pose
         self.calls = 0
-        self.hover = None  # throttle of the first command
+        self.hover: float | None = None  # throttle of the first command
         # Modes that Betaflight reports, in the order of the bits of its status
         self.modes = list(self.ask(BOX_IDS))
-        self.active = set()
+        self.active: set[int] = set()
 
     def ask(self, code: int) -> bytes:
         """Return what Betaflight answers.

@@ -8,6 +8,7 @@ and body axes are ours. The thrust is the firmware's 16-bit number; take the fir
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 from cflib.crazyflie.log import LogConfig
@@ -31,8 +32,8 @@ class Crazyflie:
     def __init__(self, cf, clock=time.monotonic) -> None:
         self.cf = cf
         self.clock = clock
-        self.seen = {}
-        self.times = {}
+        self.seen: dict[str, Any] = {}
+        self.times: dict[str, float] = {}
         # A log packet has room for 26 bytes.
         blocks = {
             "place": dict.fromkeys(PLACE, "float"),

@@ -7,6 +7,7 @@ last one, by ``COM_OBL_RC_ACT``: set that to 0, position mode.
 """
 
 import time
+from typing import Any
 
 import numpy as np
 from core import State
@@ -28,7 +29,7 @@ class Px4:
     def __init__(self, connection, clock=time.monotonic) -> None:
         self.connection = connection
         self.clock = clock
-        self.seen = {}
+        self.seen: dict[str, tuple[float, Any]] = {}
         for message in (
             MAV.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
             MAV.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
@@ -38,8 +39,8 @@ class Px4:
 
     def order(self, command: int, *values: float) -> None:
         c = self.connection
-        values = [*values, *[0.0] * (7 - len(values))]
-        c.mav.command_long_send(c.target_system, c.target_component, command, 0, *values)
+        rest = [0.0] * (7 - len(values))
+        c.mav.command_long_send(c.target_system, c.target_component, command, 0, *values, *rest)
 
     def receive(self) -> None:
         """Keep the latest message of each kind of PX4's own, with its time."""
