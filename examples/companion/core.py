@@ -1,5 +1,5 @@
-"""What a companion computer does with any flight controller: look at the state, ask the policy for
-collective thrust and body rates, and hand over as soon as something is wrong.
+"""The loop of a companion computer with any flight controller: look at the state, ask the policy
+for collective thrust and body rates, and hand over as soon as something is wrong.
 
 World axes: z up. Body axes: x forward, y left, z up. Units: m, m/s, rad/s, s. A link to a flight
 controller turns its own frames and units to these.
@@ -20,7 +20,7 @@ PATIENCE = 10.0  # s: how long it waits for the control
 
 @dataclass
 class State:
-    """What an estimator knows of the vehicle.
+    """The state of the vehicle by an estimator.
 
     :ivar time: when it was measured, s, on the clock of the loop.
     :ivar position: world axes, m; ``velocity``: world axes, m/s.
@@ -81,7 +81,7 @@ class Policy:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a flight, or go on after another controller has flown."""
+        """Begin a flight, or continue after another controller has flown."""
         sizes = [entry.shape[1] for entry in self.inputs]
         # A preview of accelerations follows the 18 numbers; the target rests.
         self.values = [np.zeros((1, size), np.float32) for size in sizes]

@@ -83,7 +83,7 @@ def regress(
 
     It adds the thrust of the air that flows past (least squares over all flights).
 
-    :return: the curve, and the root mean square of what is left, m/s².
+    :return: the curve, and the root mean square of the rest, m/s².
     """
     kind = one_kind(logs)
     regressors = []

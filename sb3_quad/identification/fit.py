@@ -62,7 +62,7 @@ LEAST_DELAY_WIDTH = 0.0015
 
 @dataclass(frozen=True)
 class Estimate:
-    """What logs say about a parameter."""
+    """A parameter by the logs."""
 
     key: Key
     value: float  #: in its unit
@@ -346,7 +346,7 @@ def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
     squares, products = model.equations(vector)
     scaling = model.scaling
     values = scaling.values(vector)
-    # A zero must be told from what was found.
+    # A parameter near zero must still be certain.
     allowed = np.maximum(LARGEST_WIDTH * np.abs(values), 1e-30)
     allowed[[key[0] in ("curve", "delay") for key in scaling.keys]] = np.inf
     reasons = {}

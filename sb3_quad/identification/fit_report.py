@@ -1,4 +1,4 @@
-"""What a fit says: a table, a vehicle file with comments, and a picture of its predictions."""
+"""The results of a fit: a table, a vehicle file with comments, and a picture of its predictions."""
 
 from collections.abc import Sequence
 

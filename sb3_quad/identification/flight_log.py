@@ -30,7 +30,7 @@ from sb3_quad.identification.readers import WAY_OUT, Recording, Series, read_rec
 
 # Rows below this height do not count, since the ground changes the thrust, m
 LEAST_HEIGHT = 0.3
-# Where the height is unknown, a vehicle flies while its motors get this share of what they get in
+# Where the height is unknown, a vehicle flies while its motors get this share of their command in
 # the middle of the flight, and not within this time of a start or landing, s.
 FLYING_SHARE = 0.6
 NEAR_GROUND = 0.5
@@ -69,7 +69,7 @@ class Log:
     has_motion: bool  #: whether attitude and velocity are known, not the body rates alone
     flying: BoolArray  #: (n,), in the air
     offset: float  #: how far the vehicle's clock was behind that of the motion capture, s
-    notes: tuple[str, ...] = ()  #: what was left out
+    notes: tuple[str, ...] = ()  #: on rows without numbers
 
     def mean_commands(self, delay: float = 0.0) -> FloatArray:
         """Return the mean command of each step, (n, 4), NaN where one is missing.
@@ -90,7 +90,7 @@ class Log:
         return np.asarray(np.einsum("nji,nj->i", rotation, motion[:, VELOCITY]) / len(motion))
 
     def part(self, rows: slice) -> "Log":
-        """Return a log of which only some rows count."""
+        """Return a log with some rows that count alone."""
         flying = np.zeros_like(self.flying)
         flying[rows] = self.flying[rows]
         return replace(self, flying=flying)
@@ -235,7 +235,7 @@ def _cleaned(path: Path, name: str, one: Series, notes: list[str]) -> Series:
             f"{path}: {name}: rows are {apart:.3g} s apart on average, where {LONGEST_GAP:g} s is "
             "the longest gap; is the time in the unit of its format?"
         )
-    # PWM that no motor can get is left out below.
+    # Rows with PWM that no motor can get do not count, see below.
     if name != "pwm_battery" and np.abs(values).max() > LARGEST:
         raise ConfigError(f"{path}: {name}: {np.abs(values).max():.3g} is too large")
     return time, values

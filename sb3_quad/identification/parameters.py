@@ -24,7 +24,7 @@ FASTEST = LARGEST_STEP["exact"] / MAX_PHYSICS_STEP  # 1/s
 
 
 class Guess(NamedTuple):
-    """What commands do."""
+    """A vehicle, and the effect of its commands."""
 
     vehicle: Vehicle  #: with the control step of the logs and no delay
     curve: Curve
