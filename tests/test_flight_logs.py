@@ -28,16 +28,15 @@ STEP = 0.01
 VEHICLE = load_vehicle("crazyflie_nanobench")
 
 
+def along(curve, vehicle, seed, **keywords):
+    """One vehicle without noise, on a curve of 2 m/s."""
+    keywords |= {"noise": 0.0, "reference": {"curve": curve, "speed": 2.0}}
+    return QuadcopterVecEnv(1, "target_tracking", vehicle=vehicle, seed=seed, **keywords)
+
+
 def flown(seed, seconds=8.0):
     """Return a log of flights to targets, as a table with thrusts in N."""
-    env = QuadcopterVecEnv(
-        1,
-        "target_tracking",
-        vehicle=VEHICLE,
-        noise=0.0,
-        reference={"curve": "figure_eight", "speed": 2.0},
-        seed=seed,
-    )
+    env = along("figure_eight", VEHICLE, seed)
     expert = GeometricExpert(VEHICLE)
     env.reset()
     rows = []
@@ -165,15 +164,7 @@ def test_rows_without_numbers_are_left_out_and_named(tmp_path):
 
 def shaken(vehicle, seconds=10.0, seed=0):
     """Return a table as :mod:`log_writers` takes it, of a flight whose commands are shaken."""
-    env = QuadcopterVecEnv(
-        1,
-        "target_tracking",
-        vehicle=vehicle,
-        noise=0.0,
-        reference={"curve": "lissajous", "speed": 2.0},
-        seed=seed,
-        max_episode_steps=100_000,
-    )
+    env = along("lissajous", vehicle, seed, max_episode_steps=100_000)
     expert = GeometricExpert(vehicle)
     random = np.random.default_rng(seed)
     env.reset()

@@ -211,15 +211,19 @@ def drag_forces(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> Fl
     :param vehicles: parameters, (len(PARAMETER_NAMES), n).
     :param wind: velocity of the air, (3, n), world frame, m/s.
     """
-    by_rotors = vehicles[P.rotor_drag_x : P.rotor_drag_z + 1] * state[ROTOR_SPEEDS].sum(axis=0)
-    in_body = (vehicles[P.drag_x : P.drag_z + 1] + by_rotors) * _airspeeds(state, wind)
-    return np.asarray(-np.einsum("nij,jn->in", rotation_matrices(state[QUATERNION].T), in_body))
+    force, _ = _drag_and_airspeed(state, vehicles, wind)
+    return force
 
 
-def _airspeeds(state: FloatArray, wind: FloatArray) -> FloatArray:
-    """Return the airspeeds of n vehicles, (3, n), body frame, m/s."""
+def _drag_and_airspeed(
+    state: FloatArray, vehicles: FloatArray, wind: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return :func:`drag_forces`, and the airspeeds, (3, n), body frame, m/s."""
     rotation = rotation_matrices(state[QUATERNION].T)
-    return np.asarray(np.einsum("nji,jn->in", rotation, state[VELOCITY] - wind))
+    airspeed = np.einsum("nji,jn->in", rotation, state[VELOCITY] - wind)
+    by_rotors = vehicles[P.rotor_drag_x : P.rotor_drag_z + 1] * state[ROTOR_SPEEDS].sum(axis=0)
+    in_body = (vehicles[P.drag_x : P.drag_z + 1] + by_rotors) * airspeed
+    return -np.einsum("nij,jn->in", rotation, in_body), airspeed
 
 
 def air_wrenches(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> FloatArray:
@@ -230,8 +234,7 @@ def air_wrenches(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> F
     The arguments are those of :func:`drag_forces`.
     """
     wrench = np.zeros((WRENCH_SIZE, state.shape[1]))
-    wrench[FORCE_WORLD] = drag_forces(state, vehicles, wind)
-    vx, vy, _ = _airspeeds(state, wind)
+    wrench[FORCE_WORLD], (vx, vy, _) = _drag_and_airspeed(state, vehicles, wind)
     wrench[W.force_body + 2] = vehicles[P.translational_lift] * (vx**2 + vy**2)
     total = state[ROTOR_SPEEDS].sum(axis=0)
     momentum = rotor_momenta(vehicles, state[ROTOR_SPEEDS])

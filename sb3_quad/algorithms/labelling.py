@@ -289,6 +289,17 @@ def refuse_wide_actions(space: spaces.Space[Any]) -> None:
         )
 
 
+def action_of(source: Any, default: str) -> str:
+    """Return what the actions of a controller command; the default if it does not say, as a
+    function does not.
+    """
+    record = getattr(source, FLIGHT_SETTINGS, None)
+    if isinstance(record, dict):
+        return str(record.get("action", "thrusts"))
+    known = getattr(source, "action", "thrusts" if hasattr(source, "actions") else default)
+    return known if isinstance(known, str) else default
+
+
 def refuse_other_action(name: str, source: Any, action: str) -> None:
     """Refuse a controller whose actions command something else. A function does not say what.
 
@@ -296,11 +307,8 @@ def refuse_other_action(name: str, source: Any, action: str) -> None:
     :param action: what actions command here.
     :raises ConfigError: they command something else.
     """
-    known = getattr(source, "action", "thrusts" if hasattr(source, "actions") else action)
-    record = getattr(source, FLIGHT_SETTINGS, None)
-    if isinstance(record, dict):
-        known = record.get("action", "thrusts")
-    if isinstance(known, str) and known != action:
+    known = action_of(source, action)
+    if known != action:
         raise ConfigError(
             f"{name}: commands {known}, and here actions are {action}; give action: {known}, or a"
             f" controller of {action}"

@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Group
 
 from sb3_quad.agents.resolve import resolve_expert
+from sb3_quad.algorithms.labelling import action_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.types import StrDict, StrMapping
@@ -146,10 +147,9 @@ def _load(
             shared = {name: getattr(known, name) for name in names}
     settings = {}
     for label, controller in controllers.items():
-        given = dict(own.get(label, shared))
-        if isinstance(getattr(controller, "action", None), str):
-            given["action"] = controller.action  # of an expert
-        how = FlightSettings(**given).with_changes(**env_kwargs)
+        given = own.get(label, shared)
+        action = action_of(controller, given.get("action", "thrusts"))
+        how = FlightSettings(**{**given, "action": action}).with_changes(**env_kwargs)
         if label not in pilots:
             pilots[label] = resolve_expert(
                 controller, how.vehicle, "controller", how.rotor_layout, how.action
