@@ -124,7 +124,8 @@ def flight_cost(flown: FlownStates) -> th.Tensor:
     near = 1.0 / _farness(d)
     weight = 0.002 + BODY_RATES_WEIGHT * near
     cost = cost + weight * length(flown.body_rates) + 0.001 * (1.0 - flown.r33)
-    cost = cost + HEADING * near * flown.heading_error
+    if flown.target_heading.any():
+        cost = cost + HEADING * near * flown.heading_error
     beyond = flown.actions - flown.actions.clamp(-1.0, 1.0)
     cost = cost + 0.01 * beyond.square().sum(dim=-1)
     return cost + 0.5 * (SAFE_HEIGHT - flown.position[..., 2]).clamp(min=0.0)

@@ -428,13 +428,14 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         """Return gradients (n, a), their norms limited to ``max_row_ratio`` times the median."""
         if self.max_row_ratio is None:
             return gradients
-        lengths = np.sqrt(np.einsum("ij,ij->i", gradients, gradients))
+        squares = np.einsum("ij,ij->i", gradients, gradients)
         # Rows whose flight was lost have zero gradients. Sorting is ten times as fast as np.median.
-        present = np.sort(lengths[lengths > 0.0])
+        present = np.sort(squares[squares > 0.0])
         if present.size == 0:
             return gradients
-        middle = present[(present.size - 1) // 2 : present.size // 2 + 1].mean()
+        middle = np.sqrt(present[[(present.size - 1) // 2, present.size // 2]]).sum() / 2.0
         limit = self.max_row_ratio * middle
-        if present[-1] <= limit:
+        if present[-1] <= limit * limit:
             return gradients
+        lengths = np.sqrt(squares)
         return np.asarray(gradients * (limit / np.maximum(lengths, limit))[:, None])

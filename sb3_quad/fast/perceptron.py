@@ -53,6 +53,8 @@ class Perceptron:
         widths = np.array([-(-size // 4) * 4 for size in sizes])
         self._units = int(widths.sum())
         self._scratch_size = (self._units + 2 * int(widths.max())) * ROWS
+        # The calling thread's own memory; others that help allocate theirs.
+        self._scratch = _aligned(self._scratch_size)
         self._size = int((widths[1:] * (widths[:-1] + 1)).sum())
         packed = np.zeros(self._size, np.float32)
         self._layers = Layers(widths, kinds, packed)
@@ -183,15 +185,16 @@ class Perceptron:
         # Each part goes to one thread only, since `next` holds Python's global lock.
         firsts = iter(range(0, chunks, size))
 
-        def work() -> None:
-            scratch = _aligned(self._scratch_size)
+        def work(scratch: Float32Array) -> None:
             for first in firsts:
                 function(
                     first, min(first + size, chunks), chunks, scratch, self._layers, *arguments
                 )
 
-        helpers = [_pool.submit(work) for _ in range(threads - 1)]
-        work()
+        helpers = [
+            _pool.submit(lambda: work(_aligned(self._scratch_size))) for _ in range(threads - 1)
+        ]
+        work(self._scratch)
         for helper in helpers:
             # Do not wait for one that has not begun: its core is busy with something else.
             if not helper.cancel():
