@@ -2,14 +2,12 @@
 
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
-from sb3_quad.callbacks.hyperparameters import HyperparameterLog
 from sb3_quad.callbacks.snapshot import SnapshotFile
 
 __all__ = [
     "BestModel",
     "Checkpoint",
     "EpisodeLog",
-    "HyperparameterLog",
     "ProgressLine",
     "SnapshotFile",
 ]

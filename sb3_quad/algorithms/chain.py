@@ -123,9 +123,10 @@ def _describe(env: VecEnv) -> Chain:
 
 def _changes(wrapper: Any) -> str:
     """Return the letters for a wrapper."""
+    declared = getattr(type(wrapper), "changes", None)
+    if declared is not None:
+        return str(declared)
     for kind in type(wrapper).__mro__:
-        if "changes" in vars(kind):
-            return str(vars(kind)["changes"])
         maker = kind.__module__.partition(".")[0]
         if maker == "sb3_quad":
             return ""
