@@ -52,7 +52,7 @@ _KNOWN = {name: letters for letters, names in _NAMES.items() for name in names.s
 _ANY = "oa"
 _MAKERS = ("gymnasium", "stable_baselines3")
 # A wrapper that has its own version of one of these does something that its base does not.
-_METHODS = {"step", "reset", "step_async", "step_wait", "action", "observation"}
+_METHODS = {"step", "reset", "step_async", "step_wait"}
 
 
 @dataclass(frozen=True)
