@@ -11,6 +11,8 @@ from stable_baselines3 import A2C, PPO, SAC
 
 from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv
 from sb3_quad.agents.zips import load_model, load_zip
+from sb3_quad.algorithms import common
+from sb3_quad.algorithms.common import warn_if_worse
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.training.config import load_config
 
@@ -197,3 +199,59 @@ def test_learning_needs_nothing_of_the_simulator():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert len(run.stdout.split()) <= 20
+
+
+def episodes(crashed, n=100, length=500.0):
+    """Return the returns and lengths of episodes that fly well, but for a share that crashes."""
+    well = np.stack([np.random.default_rng(0).normal(-1.0, 0.3, n), np.full(n, length)], axis=1)
+    well[: int(crashed * n)] = (-20.0, 60.0)
+    return well
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.0, 1.0), (0.0, 0.3), (0.1, 0.8)])
+def test_a_training_that_ends_far_below_its_start_is_told(before, after):
+    with pytest.warns(UserWarning, match="PPOBC: the training ends far below its start"):
+        warn_if_worse("PPOBC", episodes(before), episodes(after))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "lengths"),
+    [
+        (0.0, 0.02, (500.0, 500.0)),  # as a clone is beside its expert
+        (1.0, 1.0, (500.0, 500.0)),  # from nothing
+        (0.5, 0.6, (500.0, 500.0)),
+        (0.0, 0.0, (50.0, 500.0)),  # the first episodes were cut short
+    ],
+)
+def test_other_trainings_are_not(before, after, lengths, recwarn):
+    first, last = (
+        episodes(share, length=length) * [length / 500.0, 1.0]
+        for share, length in zip((before, after), lengths, strict=True)
+    )
+    warn_if_worse("PPOBC", first, last)
+    assert not recwarn
+
+
+@pytest.mark.parametrize("algorithm", OURS)
+def test_the_first_and_last_episodes_are_compared(algorithm, monkeypatch):
+    """Those that the agent flies: DAgger's expert flies the first rollout."""
+    compared = []
+    monkeypatch.setattr(common, "warn_if_worse", lambda *given: compared.append(given))
+    settings = dict(MAKERS[algorithm])
+    if algorithm is DAgger:
+        settings |= {"beta": 1.0, "beta_decay": 0.6, "beta_final": 0.0}
+    flown = []
+    original = algorithm._update_info_buffer
+
+    def watch(self, infos, dones):
+        original(self, infos, dones)
+        if dones.all():
+            flown.append([info["episode"]["r"] for info in infos])
+
+    monkeypatch.setattr(algorithm, "_update_info_buffer", watch)
+    env = QuadcopterVecEnv(16, max_episode_steps=20, seed=0)
+    algorithm("MlpPolicy", env, **settings).learn(3 * 16 * 20)
+    ((name, first, last),) = compared
+    assert name == algorithm.__name__
+    np.testing.assert_allclose(first[:, 0], flown[algorithm is DAgger])
+    np.testing.assert_allclose(last[:, 0], flown[2])

@@ -229,6 +229,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         """Return False: APG has no expert."""
         return False
 
+    def _shows_in_returns(self) -> bool:
+        """Return whether the reward says what the cost says."""
+        return not self.own_cost
+
     def learn(
         self,
         total_timesteps: int,

@@ -33,7 +33,7 @@ from sb3_quad.algorithms.networks import Terms, network_of, one_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
-from sb3_quad.base.types import BoolArray, Float32Array, StrDict, StrPath
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.base.validate import Share, Weight, check_arguments
 
 RateOrSchedule = Share | Schedule
@@ -59,6 +59,8 @@ _OF_NETWORKS = (
     "use_expln",
     "full_std",
 )
+# The first episodes of environments are compared with their last ones if there are this many.
+_COMPARED = 10
 # Prefixes of the parameters that only the critic has.
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")
 
@@ -76,6 +78,9 @@ class ExpertMixin(BaseAlgorithm):
     expert: ExpertLike | None = None
     # Queries the expert, and keeps a recurrent expert's state.
     _labeller: Labeller | None = None
+    # Return and length of each environment's first episode and of its last one
+    _first_episodes: dict[int, tuple[float, float]]
+    _last_episodes: dict[int, tuple[float, float]]
     check_expert: bool = True
     # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
@@ -190,13 +195,22 @@ class ExpertMixin(BaseAlgorithm):
     def learn(self, *arguments: Any, **keywords: Any) -> Self:
         """Learn as SB3 does. While an accelerator learns, PyTorch has one thread.
 
+        A warning says if the last episodes have far lower returns than the first ones.
+
         :raises ExpertError: no expert where one is needed, or one that does not fit.
         """
         if self.env is not None and self.will_clone():
             self._labeller = labeller_for(self.expert, self.env, self._labeller, self.check_expert)
         with network_of(self.policy).learning():
             super().learn(*arguments, **keywords)  # type: ignore[safe-super]
+        if len(self._first_episodes) >= _COMPARED:
+            first = np.array([*self._first_episodes.values()])
+            warn_if_worse(type(self).__name__, first, np.array([*self._last_episodes.values()]))
         return self
+
+    def _shows_in_returns(self) -> bool:
+        """Return whether the returns of the present rollout say how well the agent flies."""
+        return True
 
     def _labels(self, env: VecEnv) -> Float32Array:
         """Return the expert's actions for the present states, (n_envs, action_dim).
@@ -219,6 +233,8 @@ class ExpertMixin(BaseAlgorithm):
             self._labeller.look(observations, dones)
 
     def _setup_learn(self, *arguments: Any, **keywords: Any) -> Any:
+        self._first_episodes = {}
+        self._last_episodes = {}
         before, planned = self._last_obs, getattr(self, "_total_timesteps", 0)
         results = super()._setup_learn(*arguments, **keywords)
         if self._last_obs is not before:
@@ -240,6 +256,11 @@ class ExpertMixin(BaseAlgorithm):
         if dones is not None:
             rows = np.flatnonzero(dones)
             infos, dones = [infos[row] for row in rows], dones[rows]
+            for row, info in zip(rows.tolist(), infos, strict=True):
+                episode = info.get("episode")
+                if episode is not None and self._shows_in_returns():
+                    self._last_episodes[row] = (episode["r"], episode["l"])
+                    self._first_episodes.setdefault(row, self._last_episodes[row])
         super()._update_info_buffer(infos, dones)
 
     def _refuse_dict_observations(self) -> None:
@@ -276,7 +297,32 @@ class ExpertMixin(BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         # No object of this package may be pickled: PPO.load must work where it is not installed.
         own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
+        own += ["_first_episodes", "_last_episodes"]
         return [*super()._excluded_save_params(), *own, *self._not_saved]
+
+
+def warn_if_worse(name: str, first: FloatArray, last: FloatArray) -> None:
+    """Warn if the last episodes of a training have far lower returns than its first ones.
+
+    That is, by more than the standard deviation of the first ones plus half of that of the last
+    ones, and by more than a quarter of the first ones' mean. Where the last ones are longer, they
+    may cost more in proportion: the first ones of many environments often end early.
+
+    :param name: what learned.
+    :param first: the return and the length of each episode, (n, 2).
+    :param last: likewise.
+    """
+    start, first_length = first.mean(axis=0)
+    end, last_length = last.mean(axis=0)
+    usual = first[:, 0].std() + 0.5 * last[:, 0].std()
+    longer = max(last_length / first_length, 1.0)
+    if end < min(start, longer * start) - max(usual, 0.25 * abs(start)):
+        warnings.warn(
+            f"{name}: the training ends far below its start: the last episodes have a mean reward"
+            f" of {end:.3g}, the first ones had {start:.3g}; keep the agent that you had, or lower"
+            " learning_rate",
+            stacklevel=4,
+        )
 
 
 def model_of(source: BaseAlgorithm | StrPath | None) -> Any:

@@ -262,6 +262,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         """β of the current rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
         return max(self.beta - self.beta_decay * self._n_rollouts, self.beta_final)
 
+    def _shows_in_returns(self) -> bool:
+        """Return whether the agent flies at least half of the steps."""
+        return self.current_beta <= 0.5
+
     def set_beta(self, beta: float) -> None:
         """Let the expert fly with probability ``beta`` from the next rollout on.
 
