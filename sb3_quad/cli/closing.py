@@ -84,7 +84,7 @@ def close_run(result: TrainingResult) -> int:
         print(f"trained in {result.seconds:.1f} s")
     print("saved in", run.path)
     _print_next(run, run.result)
-    return 1 if handed.problem else 0
+    return int(bool(handed.problem))
 
 
 def close_pipeline(result: PipelineResult) -> int:

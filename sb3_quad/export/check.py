@@ -51,6 +51,7 @@ ROUNDING = 2e-6  # relative to the limits within which the position integral is 
 class TrainedPolicy:
     """A trained policy in its own environment, with which an exported file must agree.
 
+    :ivar action: what the policy's actions command.
     :ivar own: the vehicle in its own layout, which is the file's; ``vehicle``: in the layout that
         the policy knows.
     :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std``: σ, likewise;
@@ -80,6 +81,7 @@ class TrainedPolicy:
         mean, std = settings.scaling(1)
         self.model = model
         self.output = output
+        self.action = settings.action
         self.own = vehicle
         self.vehicle = settings.load_vehicles()[0]
         self.mean = mean[:, 0]
@@ -154,7 +156,7 @@ def compare(
         observation_mean=trained.mean,
         observation_std=trained.std,
         vehicle=trained.vehicle,
-        action="rates" if trained.output == "rates" else "thrusts",
+        action=trained.action,
         max_episode_steps=ENDLESS,
         noise=0.0,
         reference=MOVING,
