@@ -175,8 +175,8 @@ def refuse_wrapped(name: str, record: Any, here: list[str]) -> None:
         raise ConfigError(
             f"{name}: was trained with wrappers that change what it sees or does, or may do so"
             f" ({record!r}), without which it flies otherwise; use it in an environment"
-            " that has them, such as by evaluate_policy, or train without them; a class says that it"
-            ' changes neither by changes = ""'
+            " that has them, such as by evaluate_policy, or train without them; if a wrapper of"
+            ' yours changes neither, let its class say so by changes = ""'
         )
 
 
