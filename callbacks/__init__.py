@@ -1,17 +1,13 @@
 """Callbacks for any Stable-Baselines3 algorithm; docs/callbacks.md lists them."""
 
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.coefficient_schedule import CoefficientSchedule
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
-from sb3_quad.callbacks.hyperparameters import HyperparameterLog
 from sb3_quad.callbacks.snapshot import SnapshotFile
 
 __all__ = [
     "BestModel",
     "Checkpoint",
-    "CoefficientSchedule",
     "EpisodeLog",
-    "HyperparameterLog",
     "ProgressLine",
     "SnapshotFile",
 ]

@@ -1,7 +1,7 @@
 r"""Make pictures of the pages again, each by the commands that stand with its name.
 
-Scripts drew adaptive_times.png, cloning.png, learning_speed.png and robustness.png; commit 5e3ee3c0
-is the last that has them, in its folder of examples.
+Scripts drew cloning.png, learning_speed.png and robustness.png, and a report tracking_times.png;
+commit 5e3ee3c0 is the last that has them.
 
     make pictures                       # all of them
     make pictures ARGS="starts.png"     # only these
@@ -44,7 +44,6 @@ sb3-quad enjoy "RL agent=itm-recovery" geometric "PID expert=pid"
 frame film.webp 32 film_frame.png
 """,
     "side_hit_size.png": CHAPTER_4 + "cp thesis/figures/side_hit_size_0.png side_hit_size.png",
-    "tracking_times.png": CHAPTER_4 + "cp thesis/figures/tracking_times.png tracking_times.png",
     "starts.png": """
 sb3-quad evaluate PID=pid geometric "imitation agent=itm-imitation" "RL agent=itm-recovery"
     --suite robustness --scenario starts -o starts

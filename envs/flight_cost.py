@@ -4,13 +4,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch as th
-from torch.nn.functional import avg_pool1d, pad
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.envs.simulation.reward import CALM_CHANGE, CALM_DISTANCE
 from sb3_quad.envs.simulation.state import STATE
-from sb3_quad.envs.vehicles.vehicle import GRAVITY
 
 # Distances, m, at which the coarse and the fine term of the position reach half of their limit.
 COARSE, FINE = 0.5, 0.05
@@ -21,9 +19,6 @@ BODY_RATES_WEIGHT = 0.03
 HEADING = 0.1
 # Below this height, m, a flight is in danger.
 SAFE_HEIGHT = 1.5
-# How far the mean specific force along body z may fall below 1 g, in g, and the averaging time, s
-FORCE_DEFICIT = 0.45
-WINDOW = 0.8
 
 
 class FlownStates(NamedTuple):
@@ -148,23 +143,3 @@ def calm_cost(flown: FlownStates, control_step: float) -> th.Tensor:
 def _farness(d: th.Tensor) -> th.Tensor:
     """Return the divisor of terms that matter near the target, at distances d, m; 1 at d = 0."""
     return 1.0 + (d / CALM_DISTANCE) ** 2
-
-
-def low_force_cost(flown: FlownStates, control_step: float) -> th.Tensor:
-    """Return the cost of a specific force along body z that stays low, (steps, n).
-
-    It is the square of the amount, in g, by which the mean force of the last 0.8 s falls below 0.55
-    g; before the flight, the force counts as 1 g. As long as every such mean is above 0.5 g, the
-    force never stays below 0.5 g for a whole second, after which a Crazyflie's firmware cuts the
-    motors (:class:`~sb3_quad.evaluation.supervisor.Supervisor`).
-
-    :param control_step: s.
-    """
-    w, x, y, z = flown.quaternion.unbind(dim=-1)
-    up = th.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), flown.r33], dim=-1)
-    acceleration = flown.velocity.diff(dim=0) / (GRAVITY * control_step)
-    # By how much each force falls below 1 g; the first one is unknown.
-    lack = 1.0 - flown.r33[1:] - (acceleration * up[1:]).sum(dim=-1)
-    window = round(WINDOW / control_step)
-    mean = avg_pool1d(pad(lack, (0, 0, window, 0)).T, window, 1).T
-    return (mean - FORCE_DEFICIT).clamp(min=0.0).square()

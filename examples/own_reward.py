@@ -22,6 +22,8 @@ class CalmActions(VecEnvWrapper):
     step.
     """
 
+    changes = ""  # neither observations nor actions
+
     def __init__(self, venv, cost):
         super().__init__(venv)
         self.cost = cost

@@ -121,8 +121,6 @@ def run(options: argparse.Namespace) -> int:
     command, facts = _origin(Path(options.model))
     if not source:
         facts["vehicle"] = f"{UNKNOWN}; measured on `{settings.vehicle}`"
-    if settings.observation_mean is not None or settings.observation_std is not None:
-        facts["observation"] = "scaled by a mean and std of its own, in the zip's `flight_settings`"
     how = {
         "noise": settings.noise,
         **settings.in_any_task(),

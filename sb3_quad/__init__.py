@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from sb3_quad.envs.flight_cost import FlownStates, flight_cost
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
     from sb3_quad.envs.simulation.randomization import Randomization
-    from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
     from sb3_quad.envs.simulation.tasks import Task
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
     from sb3_quad.envs.vehicles.vehicle import load_vehicle
@@ -57,7 +56,6 @@ __all__ = [
     "load_vehicle",
     "pretrained_path",
     "row_seeds",
-    "sample_vehicles",
 ]
 
 # Imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
@@ -86,7 +84,6 @@ _LAZY = {
     "load_vehicle": "sb3_quad.envs.vehicles.vehicle",
     "pretrained_path": "sb3_quad.agents.pretrained",
     "row_seeds": "sb3_quad.base.seeds",
-    "sample_vehicles": "sb3_quad.envs.simulation.sampled_vehicles",
 }
 
 register_environments()

@@ -9,12 +9,12 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from sampled_vehicles import sample_vehicles
 
 from sb3_quad.agents.agent_settings import env_kwargs, unlike_trained
 from sb3_quad.cli import main
 from sb3_quad.cli.commands.check_vehicle import warnings
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
-from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, load_vehicle
 from sb3_quad.evaluation.flights import fly

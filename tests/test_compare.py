@@ -18,10 +18,6 @@ def hover(observation):
     return np.zeros((len(observation), 4), dtype=np.float32)
 
 
-def action_cost(state, actions):
-    return -np.square(actions).sum(axis=1)
-
-
 def test_each_flies_as_it_was_trained_through_the_same_episodes():
     controllers = {
         "hover": hover,
@@ -31,17 +27,15 @@ def test_each_flies_as_it_was_trained_through_the_same_episodes():
         "PID": "pid",
         "object": PIDExpert("crazyflie"),
     }
-    result = compare(controllers, ["state_recovery"], n_episodes=6, seed=3, reward=action_cost)
+    result = compare(controllers, ["state_recovery"], n_episodes=6, seed=3)
     metrics = {label: result[label]["state_recovery"] for label in controllers}
     assert metrics["zip"] == metrics["model"] != metrics["other"]
     # Those that do not say how they fly take the vehicle of the first agent.
     assert metrics["PID"] == metrics["object"]
     for label, name in (("zip", "crazyflie-recovery"), ("other", "itm-robust")):
         settings = FlightSettings(task="state_recovery", **env_kwargs(name))
-        flights = fly_settings(load_pretrained(name), settings, row_seeds(3, 6), reward=action_cost)
+        flights = fly_settings(load_pretrained(name), settings, row_seeds(3, 6))
         assert metrics[label].reward.value == pytest.approx(flights.reward.mean(), abs=1e-12)
-        own = flights.own_reward.mean()
-        assert metrics[label].own_reward.value == pytest.approx(own, abs=1e-12)
     assert "hover flies crazyflie" in result.tables[0].caption
     assert "other flies itm" in result.tables[0].caption
 
@@ -86,9 +80,9 @@ def test_settings_for_all_override_those_of_the_agents():
 def test_a_comparison_is_plain_text_and_a_table_in_notebooks():
     tasks = ["target_tracking", {"target_tracking": 1, "state_recovery": 3}]
     both = {"still": hover, "PID": "pid"}
-    result = compare(both, tasks, 4, reward=action_cost, max_episode_steps=20)
+    result = compare(both, tasks, 4, max_episode_steps=20)
     text = str(result)
-    for part in ("75% state_recovery", "survival, %", "mean own reward"):
+    for part in ("75% state_recovery", "survival, %", "mean reward"):
         assert part in text
     assert "\x1b" not in text and "thesis" not in text
     assert result._repr_markdown_().count("| mean reward |") == 2

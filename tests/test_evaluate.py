@@ -2,7 +2,6 @@
 line.
 """
 
-import csv
 import importlib
 import sys
 
@@ -81,11 +80,6 @@ def evaluate(*arguments: str, folder: str = "out", suite: str = "small.yaml") ->
     return main(["evaluate", *arguments, "--suite", suite, "-o", folder, "--no-report"])
 
 
-def rows(folder: str = "out") -> list[dict[str, str]]:
-    with open(f"{folder}/episodes.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def times_of_change(folder):
     return {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))}
 
@@ -97,7 +91,7 @@ def test_the_physical_limit_is_that_of_each_agents_vehicle(here):
     assert [entry.physical_limit for entry in load_results("out").entries] == [*limits, None, None]
 
 
-def test_table_results_and_episodes_agree(here, capsys):
+def test_table_results_and_flights_agree(here, capsys):
     assert evaluate("pid", "still=my_controllers:hover") == 0
     text = capsys.readouterr().out
     for part in ("pid", "still", "paper: expert", "2 to 3", "tilt 60"):
@@ -107,28 +101,22 @@ def test_table_results_and_episodes_agree(here, capsys):
     names = [scenario.name for scenario in results.scenarios]
     assert names == ["tracking", "course", "starts.0", "starts.60"]
     assert len(results.entries) == 8 and not results.failures
-    episodes = rows()
-    assert len(episodes) == 2 * (5 + 2 + 3 + 3)
+    begun = {}
     for entry in results.entries:
-        own = []
-        for row in episodes:
-            if (row["scenario"], row["controller"]) == (entry.scenario, entry.controller):
-                own.append(row)
-        assert len(own) == entry.metrics.n
-        assert np.mean([row["outcome"] == "success" for row in own]) == entry.metrics.success.value
-        reward = np.mean([float(row["reward"]) for row in own])
-        assert reward == pytest.approx(entry.metrics.reward.value)
         arrays = read_flights(f"out/{entry.flights}")
-        assert arrays["episode_seed"].tolist() == [int(row["seed"]) for row in own]
-        assert arrays["position"].shape[:2] == (min(len(own), 8), len(arrays["time"]))
-    # The same starts and targets for both.
-    columns = [name for name in episodes[0] if name.startswith(("start_", "target_"))]
-    begun = {"pid": [], "still": []}
-    for row in episodes:
-        begun[row["controller"]].append([row[name] for name in columns])
-    assert begun["pid"] == begun["still"]
-    reached = [row["waypoints_reached"] for row in episodes if row["scenario"] == "course"]
-    assert reached == ["2", "2", "0", "0"]
+        n = len(arrays["episode_seed"])
+        assert n == entry.metrics.n
+        assert np.mean(arrays["episode_outcome"] == "success") == entry.metrics.success.value
+        assert arrays["episode_reward"].mean() == pytest.approx(entry.metrics.reward.value)
+        assert arrays["position"].shape[:2] == (min(n, 8), len(arrays["time"]))
+        # The same starts and targets for both.
+        place = np.hstack([arrays["episode_start"], arrays["episode_target"]])
+        np.testing.assert_array_equal(begun.setdefault(entry.scenario, place), place)
+    reached = [
+        np.isfinite(read_flights(f"out/flights/{label}/course.npz")["episode_waypoints"]).sum()
+        for label in ("pid", "still")
+    ]
+    assert reached == [4, 0]
     assert results.entry("pid", "course").metrics.course.completed.value == 1.0
 
 
@@ -139,7 +127,7 @@ def test_files_that_are_no_results_are_kept(here, capsys):
     assert "report.md" in capsys.readouterr().err
 
 
-def test_a_folder_of_results_is_kept_or_written_anew(here, capsys):
+def test_a_folder_of_results_is_kept(here, capsys):
     both = ["a=pid", "b=pid", "--scenario", "tracking", "starts"]
     assert evaluate(*both) == 0
     before = times_of_change(here)
@@ -148,17 +136,11 @@ def test_a_folder_of_results_is_kept_or_written_anew(here, capsys):
     capsys.readouterr()
     assert evaluate("a=pid", "--scenario", "tracking") == 2
     error = capsys.readouterr().err
-    assert "out" in error and "--overwrite" in error and error.count("\n") == 1
+    assert "out" in error and "-o" in error and error.count("\n") == 1
     assert times_of_change(here) == before
-    # A reader's own files stay.
-    own = [here / "out/notes.md", here / "out/flights/b/mine.npz", here / "out/flights/mine.txt"]
-    for path in own:
-        path.write_text("mine")
-    assert evaluate("a=pid", "--scenario", "tracking", "--seed", "7", "--overwrite") == 0
-    assert {path.read_text() for path in own} == {"mine"}
-    seeds = {str(each) for each in row_seeds(seed_for("suite", 7), 5)}
-    assert {row["seed"] for row in rows()} == seeds
-    assert len(load_results("out").entries) == 1
+    assert evaluate("a=pid", "--scenario", "tracking", "--seed", "7", folder="other") == 0
+    seeds = read_flights("other/flights/a/tracking.npz")["episode_seed"]
+    assert seeds.tolist() == row_seeds(seed_for("suite", 7), 5)
 
 
 def test_an_interrupted_evaluation_goes_on_by_the_same_command_alone(here):

@@ -11,14 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_quad import load_pretrained
-from sb3_quad.base.errors import ConfigError, ControllerError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation import statistics
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly, fly_settings
 from sb3_quad.evaluation.following import FOLLOWED
-from sb3_quad.evaluation.hooks import Hook
 from sb3_quad.evaluation.hover import HOVERED
 from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
@@ -115,72 +114,6 @@ def test_hovering_covers_no_distance_and_time_zero_is_the_start():
     np.testing.assert_allclose(flights.final_error, 0.3)
 
 
-def test_an_own_reward_is_summed_over_the_control_steps_of_each_flight():
-    class Tilts(Hook):
-        """The z axis after each step, which a flight's last step has, too."""
-
-        def on_start(self, state, vehicle):
-            self.seen = []
-
-        def after_step(self, step, state, actions, flying):
-            self.seen.append(np.square(actions).sum(axis=1) + state.position[:, 2])
-
-    hook = Tilts()
-    flights = fly(
-        fall,
-        "state_recovery",
-        4,
-        hooks=[hook],
-        reward=lambda state, actions: np.square(actions).sum(axis=1) + state.position[:, 2],
-    )
-    assert not flights.survival.any() and len(set(flights.length)) > 1
-    for row, length in enumerate(flights.length):
-        expected = sum(values[row] for values in hook.seen[:length])
-        assert flights.own_reward[row] == pytest.approx(expected, rel=1e-12)
-    assert np.isnan(fly(fall, "state_recovery", 4).own_reward).all()
-    # Nobody asks about a flight that was lost before, and is below ground or far away now.
-    lost = fly(fall, "state_recovery", 4, reward=Height(flights.length))
-    assert np.isfinite(lost.own_reward).all()
-    assert (
-        fly(fall, n_episodes=2, max_episode_steps=3, reward=Changes).own_reward == [1.0, 1.0]
-    ).all()
-
-
-class Height:
-    """A reward that is none where the flight is over, by its length."""
-
-    def __init__(self, length):
-        self.left = length.copy()
-
-    def __call__(self, state, actions):
-        self.left -= 1
-        return np.where(self.left >= 0, 1.0, np.nan)
-
-
-class Changes:
-    """A reward that remembers: by how much the first action changes, from hover."""
-
-    last = 0.0
-
-    def __call__(self, state, actions):
-        change = abs(actions[:, 0] - self.last)
-        self.last = actions[:, 0]
-        return change
-
-
-@pytest.mark.parametrize(
-    "reward",
-    [
-        lambda state, actions: 1.0,
-        lambda state, actions: state.nothing,
-        lambda state, actions: np.full(3, np.inf),
-    ],
-)
-def test_an_own_reward_that_does_not_fit_is_named(reward):
-    with pytest.raises(ControllerError, match="reward <lambda>"):
-        fly(hover, n_episodes=3, max_episode_steps=2, reward=reward)
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -230,7 +163,6 @@ def test_metrics_and_tables_say_how_many_arrived():
         survival=np.array([True, True, False, True]),
         collision=np.array([False, False, True, False]),
         reward=np.full(n, -8.0),
-        own_reward=np.full(n, np.nan),
         length=np.full(n, 1500),
         flown=np.full(n, 15.0),
         time_to={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 5.0, np.nan, 6.0])},

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sampled_vehicles import sample_vehicles
 
-from sb3_quad import envs, sample_vehicles
+from sb3_quad import envs
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.simulation.batch import QuadcopterBatch

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sampled_vehicles import sample_vehicles
 
 from sb3_quad.agents.agent_settings import settings_of_model
 from sb3_quad.agents.zips import load_model
@@ -11,7 +12,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
-from sb3_quad.envs.simulation.sampled_vehicles import sample_vehicles
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import BODY_RATES, QUATERNION, ROTOR_SPEEDS, P
 from sb3_quad.envs.vehicles.rates import RATE_PARAMETERS

@@ -8,29 +8,16 @@ from pathlib import Path
 import pytest
 from conftest import HYPERPARAMS, TINY
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from sb3_quad.cli import main
 
 TRAIN = ["train", "--algo", "dagger", *TINY, "--hyperparams", *HYPERPARAMS["dagger"]]
 
 
-def hyperparameters(folder):
-    """What TensorBoard shows under HPARAMS: the settings by name."""
-    data = EventAccumulator(str(folder)).Reload().PluginTagToContent("hparams")
-    start = HParamsPluginData.FromString(data["_hparams_/session_start_info"])
-    return {
-        name: getattr(value, value.WhichOneof("kind"))
-        for name, value in start.session_start_info.hparams.items()
-    }
-
-
-def test_tensorboard_has_the_hyperparameters_and_the_evaluations(tmp_path):
+def test_tensorboard_has_the_evaluations(tmp_path):
     folders = ["-f", str(tmp_path / "logs"), "-tb", str(tmp_path / "tb")]
     assert main([*TRAIN, *folders, "--seed", "3"]) == 0
     (folder,) = (tmp_path / "tb").iterdir()
-    values = hyperparameters(folder)
-    assert (values["algo"], values["seed"], values["n_steps"]) == ("dagger", 3, 50)
     assert len(EventAccumulator(str(folder)).Reload().Scalars("eval/success_rate")) == 2
 
 
@@ -48,8 +35,7 @@ def test_weights_and_biases_has_settings_and_evaluations(tmp_path, monkeypatch, 
     monkeypatch.setenv("WANDB_MODE", "offline")
     assert main([*TRAIN, "--track", "-tb", "runs", "--seed", "3"]) == 0
     assert capsys.readouterr().err.count("eval/mean_reward") == 2  # history and summary
-    (events,) = Path("wandb").glob("offline-run-*/files/runs/*/events.*")
-    assert hyperparameters(events.parent)["seed"] == 3
+    assert [*Path("wandb").glob("offline-run-*/files/runs/*/events.*")]
 
     def refuse(**settings):
         raise wandb.errors.UsageError("no key,\nsee wandb login")

@@ -30,7 +30,6 @@ from sb3_quad.training.algorithms import (
     constructor_parameters,
     convert,
     get_algorithm,
-    takes_whole,
 )
 from sb3_quad.training.config import (
     SETTINGS,
@@ -303,9 +302,6 @@ def test_the_types_of_every_algorithm_are_resolved(algorithm):
     assert {name: convert(each.default, each, name) for name, each in given.items()} == {
         name: each.default for name, each in given.items()
     }
-    assert not takes_whole(parameters["learning_rate"])
-    assert "gamma" not in parameters or not takes_whole(parameters["gamma"])
-    assert takes_whole(parameters["n_steps" if "n_steps" in parameters else "batch_size"])
 
 
 def test_the_types_are_resolved_whichever_algorithm_is_asked_first():

@@ -148,6 +148,8 @@ plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert,
 class CalmActions(VecEnvWrapper):
     """Subtract ``cost`` times the mean squared change of the action from each reward."""
 
+    changes = ""  # neither observations nor actions
+
     def __init__(self, venv, cost):
         super().__init__(venv)
         self.cost = cost

@@ -29,11 +29,7 @@ from sb3_quad.envs.simulation.kernel import (
     rotor_wrenches,
     step,
 )
-from sb3_quad.envs.simulation.observation import (
-    DEFAULT_MEAN,
-    DEFAULT_STD,
-    OBSERVATION_SIZE,
-)
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.envs.simulation.random import STEP, new_streams
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.recordings import (
@@ -197,7 +193,8 @@ class QuadcopterBatch:
         is_calm = self.task_parameters[:, T.calm_cost].any()
         self.last_actions = np.zeros((n * is_calm, 4), np.float32)
         self.outcome = np.zeros(n, dtype=OUTCOME)
-        self._set_scaling(settings)
+        # μ and σ of Eq. 3.16, then the levels of the noise
+        self.scaling_of_rows = np.vstack([*settings.scaling(n), np.zeros((2, n))])
         self.set_noise(settings.noise)
         with compile_notice():
             self.observe()
@@ -559,23 +556,6 @@ class QuadcopterBatch:
         self.scaling_of_rows[-2, chosen] = per_row("noise", relative, chosen.size)
         self.scaling_of_rows[-1, chosen] = additive
         self._bind()
-
-    def _set_scaling(self, settings: FlightSettings) -> None:
-        """Set μ and σ of Eq. 3.16, (18,) or (n, 18) each; the levels of the noise follow them."""
-        mean: Any = settings.observation_mean
-        std: Any = settings.observation_std
-        if mean is None:
-            mean = DEFAULT_MEAN
-        if std is None:
-            std = DEFAULT_STD
-        means = per_row("observation_mean", mean, self.n, OBSERVATION_SIZE)
-        stds = per_row("observation_std", std, self.n, OBSERVATION_SIZE)
-        # Beyond these, features would vanish or overflow.
-        if not ((stds >= 1e-6) & (stds <= 1e6)).all():
-            raise ConfigError("observation_std: every value must be from 1e-6 to 1e6")
-        if not (np.abs(means) <= 1e6).all():
-            raise ConfigError("observation_mean: every value must be from -1e6 to 1e6")
-        self.scaling_of_rows = np.vstack([means, stds, np.zeros((2, self.n))])
 
     def _bind(self) -> None:
         self.scaling = self.scaling_of_rows

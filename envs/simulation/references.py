@@ -219,7 +219,7 @@ class Reference(Frozen):
         :raises ValueError: the function returns something other than positions.
         """
         # If it loops, add two steps on each side, so that both differences have their neighbours.
-        more = 2 if loops else 0
+        more = 2 * loops
         times = dt * np.arange(-more, steps + more, dtype=np.float64)
         if not loops:
             times = np.minimum(times, end)

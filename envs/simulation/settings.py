@@ -15,8 +15,10 @@ from sb3_quad.base.plugins import FLIGHT_SETTINGS
 from sb3_quad.base.types import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs import MAX_EPISODE_STEPS
+from sb3_quad.envs.simulation.checks import per_row
 from sb3_quad.envs.simulation.estimator import EstimatorError
 from sb3_quad.envs.simulation.frames import ObservationSettings
+from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
@@ -128,6 +130,21 @@ class FlightSettings(ObservationSettings):
                     f"vehicle of row {row}: physics_step and control_step must be those of row 0"
                 )
         return vehicles
+
+    def scaling(self, n: int) -> tuple[FloatArray, FloatArray]:
+        """Return μ and σ of Eq. 3.16 in n rows, (18, n) each.
+
+        :raises ConfigError: other shapes, or numbers with which features would vanish or overflow.
+        """
+        mean: Any = DEFAULT_MEAN if self.observation_mean is None else self.observation_mean
+        std: Any = DEFAULT_STD if self.observation_std is None else self.observation_std
+        means = per_row("observation_mean", mean, n, OBSERVATION_SIZE)
+        stds = per_row("observation_std", std, n, OBSERVATION_SIZE)
+        if not ((stds >= 1e-6) & (stds <= 1e6)).all():
+            raise ConfigError("observation_std: every value must be from 1e-6 to 1e6")
+        if not (np.abs(means) <= 1e6).all():
+            raise ConfigError("observation_mean: every value must be from -1e6 to 1e6")
+        return means, stds
 
     @property
     def longest_episode(self) -> int:

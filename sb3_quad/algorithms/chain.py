@@ -1,28 +1,21 @@
 """The chain of wrappers between an agent and the simulator: what it changes, and what is unknown.
 
 This is the only place that looks into wrappers. Those of Gymnasium and Stable-Baselines3 are known
-by name. Any other that touches observations or actions is tried: a copy of the environment flies
-for a while, and what enters and leaves the copy is compared with what the simulator in it gets and
-gives. A copy is only possible of an environment of this package that lives in this process.
+by name. Any other that touches observations or actions may change both, unless its class says what
+it changes by an attribute ``changes``, such as ``changes = ""`` for a reward of your own.
 """
 
 import copy
-import random
 import re
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import gymnasium
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
     SubprocVecEnv,
     VecEnv,
     VecEnvWrapper,
@@ -32,7 +25,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.plugins import FLIGHT_SETTINGS
-from sb3_quad.base.types import AnyArray, Float32Array
+from sb3_quad.base.types import Float32Array
 
 WRAPPERS = "wrappers"
 """The attribute by which a model's zips say behind which wrappers it was trained: those that change
@@ -55,13 +48,11 @@ _NAMES = {
     "os": "MaxAndSkipObservation MaxAndSkipEnv AtariPreprocessing",
 }
 _KNOWN = {name: letters for letters, names in _NAMES.items() for name in names.split()}
-# A wrapper that is not known may do both.
+# A wrapper that is not known, and does not say, may do both.
 _ANY = "oa"
 _MAKERS = ("gymnasium", "stable_baselines3")
 # A wrapper that has its own version of one of these does something that its base does not.
-_METHODS = {"step", "reset", "step_async", "step_wait", "action", "observation"}
-# Control steps of a trial.
-N_STEPS = 100
+_METHODS = {"step", "reset", "step_async", "step_wait"}
 
 
 @dataclass(frozen=True)
@@ -104,10 +95,7 @@ _described: "WeakKeyDictionary[VecEnv, Chain]" = WeakKeyDictionary()
 
 
 def describe(env: VecEnv) -> Chain:
-    """Return what lies between an environment and its simulator.
-
-    Where a wrapper is not known and no copy can be flown, it stays unknown.
-    """
+    """Return what lies between an environment and its simulator."""
     if env not in _described:
         _described[env] = _describe(env)
     return _described[env]
@@ -130,16 +118,14 @@ def _describe(env: VecEnv) -> Chain:
         # "<Outer<Inner<Env<id>>>>", or "<Outer<Inner<Env instance>>>"
         text = at.env_method("__str__", indices=[0])[0]
         links |= {name: _KNOWN.get(name, _ANY) for name in re.findall(r"(\w+)(?=<\w+[< ])", text)}
-    if _ANY in links.values() and not outside:
-        flown = try_out(env, at_random)
-        # Another wrapper may make the same change. Only a known scale explains what is found.
-        changes = _ANY if flown is None else "".join(flown[0] - ({*links.values()} & {"s"}))
-        links = {name: changes if letters == _ANY else letters for name, letters in links.items()}
     return Chain(links, tuple(outside))
 
 
 def _changes(wrapper: Any) -> str:
     """Return the letters for a wrapper."""
+    declared = getattr(type(wrapper), "changes", None)
+    if declared is not None:
+        return str(declared)
     for kind in type(wrapper).__mro__:
         maker = kind.__module__.partition(".")[0]
         if maker == "sb3_quad":
@@ -189,7 +175,8 @@ def refuse_wrapped(name: str, record: Any, here: list[str]) -> None:
         raise ConfigError(
             f"{name}: was trained with wrappers that change what it sees or does, or may do so"
             f" ({record!r}), without which it flies otherwise; use it in an environment"
-            " that has them, such as by evaluate_policy, or train without them"
+            " that has them, such as by evaluate_policy, or train without them; if a wrapper of"
+            ' yours changes neither, let its class say so by changes = ""'
         )
 
 
@@ -205,127 +192,6 @@ def refuse_other_wrappers(model: Any, env: VecEnv) -> None:
             f"{', '.join(sorted(missing))}: only one of the environments of training and evaluation"
             " has this wrapper, which changes what an agent sees or does"
         )
-
-
-# A trial
-
-
-def try_out(
-    env: VecEnv, pilot: Callable[[VecEnv], Callable[[Any], AnyArray]], bare: bool = False
-) -> tuple[set[str], float] | None:
-    """Fly a copy of an environment, which stays as it is, like all random numbers.
-
-    :param pilot: returns a function from observations to actions, for the copy.
-    :param bare: without its wrappers.
-    :return: the letters of all that the wrappers change, and the return. None: no copy can be made,
-        or it fails.
-    """
-    base: Any = env.unwrapped
-    if isinstance(base, SubprocVecEnv) or not base.has_attr(FLIGHT_SETTINGS):
-        return None
-    if "human" in base.get_attr("render_mode"):
-        return None
-    # A user's wrapper may raise anything.
-    with untouched(), suppress(Exception), closing(_copy(env, {}, bare)) as twin:
-        return _fly(twin, pilot(twin))
-    return None
-
-
-def _copy(env: Any, copies: dict[int, Any], bare: bool) -> Any:
-    """Return a copy of an environment without the wrappers that change nothing.
-
-    :param copies: those of its parts, by their id, as of ``copy.deepcopy``.
-    """
-    is_batch = isinstance(env, VecEnvWrapper)
-    if is_batch or isinstance(env, gymnasium.Wrapper):
-        made = _copy(env.venv if is_batch else env.env, copies, bare)
-        if not bare and _changes(env):
-            # SB3's wrappers cannot be copied as a whole, nor what they note of their class.
-            made = object.__new__(type(env))
-            copies[id(env)] = made
-            for name, value in vars(env).items():
-                is_of_class = name == "class_attributes"
-                vars(made)[name] = value if is_of_class else copy.deepcopy(value, copies)
-    elif isinstance(env, DummyVecEnv):
-        rows = [_copy(row, copies, bare) for row in env.envs]
-        made = DummyVecEnv([lambda row=row: row for row in rows])  # type: ignore[misc]
-    else:
-        made = copy.deepcopy(env)
-    copies[id(env)] = made
-    return made
-
-
-def _fly(env: Any, act: Callable[[Any], AnyArray]) -> tuple[set[str], float]:
-    """Fly, and return the letters of all that the wrappers change, and the return."""
-    below = env.unwrapped
-    simulators = [row.unwrapped for row in getattr(below, "envs", ())] or [below]
-    received: list[AnyArray] = []
-    observed: dict[int, AnyArray] = {}
-    for number, simulator in enumerate(simulators):
-        _listen(simulator, number, received, observed)
-    low, high = limits_of(env.action_space)
-    least, most = limits_of(simulators[0].action_space)
-    changes = set() if np.array_equal((low, high), (least, most)) else {"s"}
-    total = 0.0
-    observation = env.reset()
-    for _ in range(N_STEPS):
-        received.clear()
-        actions = act(observation)
-        observation, rewards, *_ = env.step(actions)
-        total += float(rewards.mean())
-        wanted = least + (actions.reshape(-1, low.size) - low) / (high - low) * (most - least)
-        # Each row may receive an action several times.
-        times = len(received) // len(simulators)
-        wanted = wanted.reshape(len(simulators), -1).repeat(times, axis=0)
-        got = np.reshape(received, (len(received), -1)).clip(least.min(), most.max())
-        if times != 1:
-            changes.add("s")
-        if got.shape != wanted.shape or not np.allclose(got, wanted, atol=1e-4):
-            changes.add("a")
-        if not np.array_equal(np.ravel([*observed.values()]), np.ravel(observation)):
-            changes.add("o")
-    return changes, total
-
-
-def _listen(
-    simulator: Any, number: int, received: list[AnyArray], observed: dict[int, AnyArray]
-) -> None:
-    """Note all actions that a batch or a row gets, and the last observation that it gives."""
-
-    def noting(method: Callable[..., Any]) -> Callable[..., Any]:
-        def noted(*arguments: Any, **keywords: Any) -> Any:
-            received.extend(map(np.array, arguments))
-            results = method(*arguments, **keywords)
-            if results is not None:
-                observed[number] = np.array(results[0] if isinstance(results, tuple) else results)
-            return results
-
-        return noted
-
-    steps = ("step_async", "step_wait") if isinstance(simulator, VecEnv) else ("step",)
-    for name in ("reset", *steps):
-        setattr(simulator, name, noting(getattr(simulator, name)))
-
-
-def at_random(env: VecEnv) -> Callable[[Any], AnyArray]:
-    """Return a pilot of random actions."""
-    space: Any = env.action_space
-    shape = (env.num_envs, *space.shape)
-    rng = np.random.default_rng(0)
-    return lambda observation: rng.uniform(space.low, space.high, shape).astype(space.dtype)
-
-
-@contextmanager
-def untouched() -> Iterator[None]:
-    """Leave the global random numbers as they are, and warn of nothing."""
-    kept = np.random.get_state(), random.getstate()  # noqa: NPY002
-    with th.random.fork_rng(devices=[]), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            yield
-        finally:
-            np.random.set_state(kept[0])  # noqa: NPY002
-            random.setstate(kept[1])
 
 
 # Statistics

@@ -271,14 +271,6 @@ class ExpertMixin(BaseAlgorithm):
                 " expert; wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
 
-    def _log_expert(self) -> None:
-        """Log the return that the expert itself reaches."""
-        # It takes flights, which would be in vain without a log.
-        if not (self.check_expert and self._labeller and self.logger.output_formats):
-            return
-        if self._labeller.expert_return is not None:
-            self.logger.record("rollout/expert_return", self._labeller.expert_return)
-
     def _log_update(self, history: History) -> None:
         """Log the mean of each term of an update."""
         for name, values in history.items():

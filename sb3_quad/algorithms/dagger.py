@@ -400,7 +400,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
 
         self.logger.record("dagger/beta", beta)
         self.logger.record("dagger/dataset_size", len(self.dataset))
-        self._log_expert()
         self.logger.record("rollout/expert_fraction", by_expert.mean())
         callback.update_locals(locals())
         callback.on_rollout_end()

@@ -1,18 +1,13 @@
 """Labels for imitation: what an expert would do in the present states of an environment."""
 
-import copy
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from functools import cached_property
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import (
     VecEnv,
     VecEnvWrapper,
@@ -21,16 +16,9 @@ from stable_baselines3.common.vec_env import (
 )
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_quad.algorithms.chain import (
-    Chain,
-    chain_of,
-    describe,
-    limits_of,
-    try_out,
-    untouched,
-)
+from sb3_quad.algorithms.chain import Chain, chain_of, describe, limits_of
 from sb3_quad.algorithms.controller import Controller
-from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
 from sb3_quad.base.types import AnyArray, BoolArray, Float32Array
 
@@ -66,7 +54,6 @@ class Labeller:
 
     :param expert: the expert. A name is resolved for the vehicle of row 0.
     :param check: whether to refuse an expert whose labels the environment's wrappers would falsify.
-        Where it takes a flight to find out, a copy of the environment flies.
     :raises ConfigError: an unknown name; an environment whose actions go beyond [-1, 1]; a model
         that was trained behind other wrappers; a wrapper around VecNormalize.
     :raises ExpertError: no expert, one of the wrong kind, or one whose spaces or labels do not fit
@@ -148,37 +135,17 @@ class Labeller:
                 f" normalise by VecNormalize instead, or give {GO_ON} if it was"
             )
         elif "a" in changes:
-            self._refuse_actions(chain)
+            raise ExpertError(
+                f"{name}: its actions may not reach the simulator through"
+                f" {', '.join(chain.record)}; scale actions by RescaleAction, say in the class of a"
+                f' wrapper what it changes (changes = "" if it is only the reward), or give {GO_ON}'
+            )
         elif "s" not in changes and not np.allclose(self._own_limits, self._limits):
             raise ExpertError(
                 f"{name}: its actions are of {source.action_space}, the environment's of"
                 f" {self.env.action_space}; no wrapper such as RescaleAction converts one into the"
                 " other"
             )
-
-    def _refuse_actions(self, chain: Chain) -> None:
-        """:raises ExpertError: wrappers that give the simulator other actions than the expert's."""
-        name = self._controller.name
-        flights = [try_out(self.env, self._pilot, bare) for bare in (False, True)]
-        returns = [f"{flight[1]:.2f}" for flight in flights if flight]
-        if len(returns) == 2:
-            tried = "in a trial, its labels return {} there, and {} without".format(*returns)
-        else:
-            tried = "no copy of it can be flown to find that out"
-        raise ExpertError(
-            f"{name}: its actions may not reach the simulator through"
-            f" {', '.join(chain.record)}: {tried}; scale actions by RescaleAction, or give {GO_ON}"
-        )
-
-    def _pilot(self, env: VecEnv) -> Callable[[Any], AnyArray]:
-        """Return what acts in a copy of the environment as the expert does here."""
-        source = self._controller.source
-        # An SB3 model remembers nothing, and may hold environments.
-        if not self._is_model:
-            source = copy.deepcopy(source)
-        labels = Labeller(source, env, check=False).labels
-        shape = (env.num_envs, *(env.action_space.shape or ()))
-        return lambda observation: labels(observation).reshape(shape)
 
     def look(self, observation: Any, episode_start: BoolArray) -> None:
         """Label the present states, which a callback may change before the next step.
@@ -212,27 +179,6 @@ class Labeller:
         if not np.array_equal(self._limits, self._own_limits):
             actions = low + (actions - least) * ((high - low) / (most - least))
         return actions.clip(low, high)
-
-    @cached_property
-    def expert_return(self) -> float | None:
-        """The mean return of 16 episodes of the expert, of at most 1,500 steps each, in a batch as
-        this one without its wrappers; the reward is the task's.
-
-        None: a function, an expert that fails there, or an environment that is no batch.
-        """
-        base: Any = self.env.unwrapped
-        is_function = self._true_state is None and not self._is_model
-        if is_function or not hasattr(base, FLIGHT_SETTINGS):
-            return None
-        settings = dict(getattr(base, FLIGHT_SETTINGS))
-        # Settings may hold a value for each row.
-        settings["max_episode_steps"] = int(min(np.max(settings["max_episode_steps"]), 1500))
-        with untouched(), suppress(SB3QuadError):
-            env = type(base)(16, seed=0, **settings)
-            act = self._pilot(env)
-            agent: Any = SimpleNamespace(predict=lambda seen, **keywords: (act(seen), None))
-            return float(np.mean(evaluate_policy(agent, env, 16, warn=False)[0]))
-        return None
 
 
 def labeller_for(

@@ -275,7 +275,6 @@ class PPOBC(ExpertMixin, PPO):
             buffer.expert_actions[buffer.pos] = self._labels(env)
 
         labelling = LabellingVecEnv(env, label, self._look)
-        self._log_expert()
         with network_of(self.policy).acting():
             return super().collect_rollouts(labelling, callback, buffer, n_rollout_steps)
 

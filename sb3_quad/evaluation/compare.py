@@ -17,7 +17,6 @@ from sb3_quad.evaluation.controllers import known_settings
 from sb3_quad.evaluation.flights import episode_seeds, fly_settings, warn_of_differences
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import Metrics, summarise
-from sb3_quad.evaluation.reward import Reward
 from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
@@ -50,7 +49,6 @@ def compare(
     tasks: Any = ("target_tracking", "state_recovery"),
     n_episodes: int = 240,
     seed: int | None = None,
-    reward: Reward | None = None,
     thesis_columns: Sequence[str] = (),
     **env_kwargs: Any,
 ) -> Comparison:
@@ -80,8 +78,6 @@ def compare(
     :param n_episodes: episodes of each task.
     :param seed: seed of the episodes, as for :func:`~sb3_quad.evaluation.flights.fly`; None: one
         that no training flies.
-    :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) as
-        :func:`~sb3_quad.evaluation.flights.fly` takes it. Its mean is shown below that of the task.
     :param thesis_columns: columns of the thesis to add if its vehicle flies one of its tasks:
         ``"expert"``, ``"IL-agent"``, ``"RL-agent"``.
     :param env_kwargs: fields of
@@ -91,7 +87,7 @@ def compare(
         its 95 % interval; ``print(result)`` shows the tables.
     :raises ConfigError: no controllers, an unknown name or keyword, several tasks of one name, a
         zip that cannot be read.
-    :raises ControllerError: a controller or reward that fails in flight.
+    :raises ControllerError: a controller that fails in flight.
     """
     if not isinstance(controllers, Mapping) or not controllers:
         raise ConfigError(
@@ -116,7 +112,7 @@ def compare(
         metrics = {}
         for label, own in settings.items():
             how = own.with_changes(task=task)
-            metrics[label] = summarise(fly_settings(pilots[label], how, seeds, reward=reward))
+            metrics[label] = summarise(fly_settings(pilots[label], how, seeds))
             comparison.setdefault(label, {})[name] = metrics[label]
         comparison.tables.append(
             _task_table(name, metrics, settings, suite, thesis_columns, n_episodes)

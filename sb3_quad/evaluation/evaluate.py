@@ -2,7 +2,6 @@
 folder.
 """
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,7 @@ from typing import Any
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError
-from sb3_quad.base.files import (
-    locked,
-    make_folder,
-    read_text,
-    refuse_existing,
-    refuse_outside,
-    write_arrays,
-    write_text,
-)
+from sb3_quad.base.files import locked, make_folder, refuse_outside, write_arrays, write_text
 from sb3_quad.base.types import Arrays, Report, StrMapping
 from sb3_quad.evaluation.controllers import ControllerSpec, controller_record, known_settings
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
@@ -30,12 +21,10 @@ from sb3_quad.evaluation.results import (
     FLIGHTS,
     REPORT,
     RESULTS,
-    WRITTEN,
     Entry,
     Results,
     file_name,
     load_results,
-    write_episodes,
 )
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
@@ -48,7 +37,6 @@ def evaluate(
     suite: Suite,
     controllers: Sequence[ControllerSpec],
     folder: str,
-    overwrite: bool = False,
     progress: Progress = lambda done, total, name: None,
     report: Report = lambda line: None,
 ) -> Results:
@@ -59,8 +47,6 @@ def evaluate(
     in between: those of factories and of references.
 
     :param folder: folder of the results.
-    :param overwrite: remove the results in the folder, instead of refusing it, and start from
-        scratch.
     :param report: gets a line for each agent that flies another vehicle than it was trained on, or
         does not say on which.
     :raises ConfigError: a controller that cannot be loaded; a folder that holds results of another
@@ -79,7 +65,7 @@ def evaluate(
     place = Path(folder)
     make_folder(place, "results folder", "-o")
     with locked(place, "folder"):
-        results.entries.extend(_flown_before(place, results, overwrite))
+        results.entries.extend(_flown_before(place, results))
         # Go scenario by scenario, so that even an interrupted suite compares all controllers.
         jobs = [(scenario, spec) for scenario in suite.scenarios for spec in controllers]
         for number, (scenario, spec) in enumerate(jobs):
@@ -98,7 +84,6 @@ def evaluate(
             write_text(place / RESULTS, results.model_dump_json(indent=2))
         progress(len(jobs), len(jobs), "")
         if results.entries:
-            write_episodes(place, results.entries)
             write_text(place / RESULTS, results.model_dump_json(indent=2))
     return results
 
@@ -134,34 +119,19 @@ def _flown_by(spec: ControllerSpec, scenario: Scenario) -> Scenario:
     return scenario.flown_by(spec.own.vehicle)
 
 
-def _flown_before(folder: Path, results: Results, overwrite: bool) -> list[Entry]:
+def _flown_before(folder: Path, results: Results) -> list[Entry]:
     """Return the entries that an interrupted call of the same evaluation has left.
 
-    :raises ConfigError: the folder holds other results that are not to be overwritten, or damaged
-        ones.
+    :raises ConfigError: the folder holds other results, or damaged ones.
     """
     for pattern in (FLIGHTS, f"{FLIGHTS}/*", FIGURES):
         for path in folder.glob(pattern):
             refuse_outside(path, str(folder), folder)
     if not (folder / RESULTS).is_file():
-        for name in WRITTEN:
-            refuse_existing(folder / name, overwrite)
+        if (folder / REPORT).exists():
+            raise ConfigError(f"{folder / REPORT}: exists already; give another folder with -o")
         return []
     before = load_results(folder)
-    if overwrite:
-        pictures: list[str] = []
-        if (folder / REPORT).is_file():
-            pictures = re.findall(rf"\({FIGURES}/([\w.-]+\.png)\)", read_text(folder / REPORT))
-        for name in WRITTEN:
-            (folder / name).unlink(missing_ok=True)
-        # Only files of the results; users may keep other files there.
-        made = [folder / entry.flights for entry in before.entries]
-        for file in (folder / FLIGHTS).glob("*/*.npz"):
-            if file in made:
-                file.unlink()
-        for name in pictures:
-            (folder / FIGURES / name).unlink(missing_ok=True)
-        return []
     # Code and files outside of this package may have changed in between.
     may_differ = [record.kind == "factory" for record in results.controllers]
     for scenario in results.scenarios:
@@ -169,8 +139,7 @@ def _flown_before(folder: Path, results: Results, overwrite: bool) -> list[Entry
     inputs = before.model_copy(update={"entries": [], "failures": []})
     if any(may_differ) or inputs.model_dump_json() != results.model_dump_json():
         raise ConfigError(
-            f"{folder}: holds results already; give another folder with -o,"
-            " or remove them with --overwrite"
+            f"{folder}: holds results already; give another folder with -o, or remove it"
         )
     return before.entries
 

@@ -45,7 +45,6 @@ from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.hooks import Arrivals, Course, Hook, Motion
 from sb3_quad.evaluation.hover import HOVERED, Hover
-from sb3_quad.evaluation.reward import OwnRewards, Reward
 from sb3_quad.evaluation.scenarios.sample import Plan
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
@@ -62,7 +61,6 @@ class Flights:
     survival: BoolArray  #: (n,), neither collision nor out of range: the thesis's success
     collision: BoolArray  #: (n,), touched the ground
     reward: FloatArray  #: (n,), sum of the rewards
-    own_reward: FloatArray  #: (n,), sum of your own reward; NaN if you gave none
     length: IntArray  #: (n,), control steps
     flown: FloatArray  #: (n,), time flown until the loss or the end, s
     #: By tolerance (m): time until |r - r_T| is first within it, s, (n,); NaN if it never was. On a
@@ -129,7 +127,6 @@ def fly(
     backend: str = "batch",
     tolerances: Sequence[float] | float = TOLERANCES,
     hooks: Sequence[Hook] = (),
-    reward: Reward | None = None,
     record: StrPath | None = None,
     **environment: Any,
 ) -> Flights:
@@ -151,15 +148,11 @@ def fly(
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param tolerances: of arrival, |r - r_T|, m; one or several.
     :param hooks: are called along the way.
-    :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
-        control step and the actions (n, 4); its sums are ``Flights.own_reward``. A class is
-        instantiated for these episodes and may remember.
     :param record: an ``.npz`` file for the observations and actions of all control steps, which
         ``DAgger(demonstrations=...)`` and ``dataset.load`` take; an existing one is replaced.
     :raises ConfigError: an unknown name, backend or keyword, a seed below 0, or fewer than one
         episode.
-    :raises ControllerError: a controller of another kind, or a controller or reward that fails in
-        flight.
+    :raises ControllerError: a controller of another kind, or one that fails in flight.
     """
     seeds = episode_seeds(seed, n_episodes)
     limits = per_row("tolerances", tolerances, np.size(tolerances))[0].tolist()
@@ -183,9 +176,7 @@ def fly(
     environment.setdefault("max_episode_steps", MAX_EPISODE_STEPS)
     settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
     warn_of_differences(name, controller, settings)
-    return fly_settings(
-        controller, settings, seeds, backend, limits, hooks, reward=reward, record=record
-    )
+    return fly_settings(controller, settings, seeds, backend, limits, hooks, record=record)
 
 
 def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
@@ -224,7 +215,6 @@ def fly_settings(
     hooks: Sequence[Hook] = (),
     plan: Plan | None = None,
     deterministic: bool = True,
-    reward: Reward | None = None,
     record: StrPath | None = None,
 ) -> Flights:
     """Fly the first episode of each seed, as :func:`fly` does, with one record of settings. PyTorch
@@ -254,7 +244,6 @@ def fly_settings(
             Motion(),
             Hover(course),
             following,
-            OwnRewards(reward),
         ]
         watching = [*measuring, *hooks]
         control_step = fleet.vehicle_list[0].control_step

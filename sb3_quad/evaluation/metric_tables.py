@@ -49,7 +49,6 @@ class Row(NamedTuple):
 SUCCESS = Row("success", "%")
 SURVIVAL = Row("survival", "%")
 REWARD = Row("mean reward")
-OWN_REWARD = Row("mean own reward")
 FLOWN = Row("time flown", "s")
 LIMIT = Row("physical limit of the settling time", "s")
 OVERSHOOT_RATE = Row("overshoot rate", "%")
@@ -80,7 +79,6 @@ ROWS = {
     "success": SUCCESS,
     "survival": SURVIVAL,
     "reward": REWARD,
-    "own_reward": OWN_REWARD,
     "flown": FLOWN,
     "path": PATH,
     "cross_track_error": CROSS_TRACK_ERROR,
@@ -234,19 +232,18 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 def _rows_of(scenario: Scenario) -> list[Row]:
     """The rows that have a meaning in a scenario."""
     shares = [SUCCESS, SURVIVAL]
-    rewards = [REWARD, OWN_REWARD]
     errors = [MEDIAN, QUANTILE, *HOVER]
     if scenario.waypoints:
         return [*shares, REACHED, COMPLETED, COURSE_TIME, *HOVER]
     if len(scenario.cell) > 1:
         return [SUCCESS]
     if scenario.reference is not None:
-        return [*shares, *rewards, *FOLLOWING]
+        return [*shares, REWARD, *FOLLOWING]
     if scenario.group is not None:
         return [*shares, MEDIAN, *HOVER]
     # An episode that starts at its target does not fly to it.
     if not scenario.has_way:
-        return [*shares, FLOWN, *rewards, RECOVERY_TIME, *errors]
+        return [*shares, FLOWN, REWARD, RECOVERY_TIME, *errors]
     settling = [settling_row(arrival_tolerance(scenario.tolerances)), LIMIT, OVERSHOOT_RATE]
     times = map(time_row, scenario.tolerances)
-    return [*shares, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, *errors]
+    return [*shares, REWARD, *settling, *times, PATH, CROSS_TRACK_ERROR, *errors]

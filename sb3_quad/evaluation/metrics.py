@@ -59,8 +59,6 @@ class Metrics(Frozen):
     """flights that left the range"""
     reward: Estimate
     """mean sum of rewards (Eqs. 4.5-4.9)"""
-    own_reward: Estimate | None
-    """mean sum of your own reward; None: no own reward was given"""
     flown: Estimate
     """mean time flown until the loss or the end, s"""
     arrivals: list[Arrival]
@@ -120,7 +118,6 @@ def summarise(flights: Flights) -> Metrics:
         collisions=int(flights.collision.sum()),
         out_of_range=int((~survived & ~flights.collision).sum()),
         reward=bootstrap(flights.reward),
-        own_reward=mean(flights.own_reward),
         flown=bootstrap(flights.flown),
         arrivals=[_arrival(flights, tolerance) for tolerance in sorted(flights.time_to)],
         path=mean(flights.path_length[survived]),

@@ -21,7 +21,7 @@ from sb3_quad.algorithms.chain import statistics_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import FloatArray
-from sb3_quad.envs.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.envs.simulation.observation import GROUPS, OBSERVATION_SIZE
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.evaluation.flights import fly
 
@@ -58,7 +58,7 @@ def correct_offset(
     if not scale > 0.0:
         raise ConfigError(f"scale {scale}: must be above 0; 1 leaves distances as they are")
     own = settings or settings_of_model(model) or FlightSettings()
-    std = DEFAULT_STD if own.observation_std is None else np.asarray(own.observation_std)
+    std = own.scaling(1)[1][:, 0]
     statistics = statistics_of(model)
     if statistics is not None:
         # VecNormalize scales what the environment has scaled.

@@ -2,41 +2,28 @@
 
 - ``results.json``, a :class:`Results`: scenarios, controllers, metrics with their intervals;
 - ``flights/<controller>/<scenario>.npz``, the flights as arrays, with sampled trajectories
-  (``flightlog.py``);
-- ``episodes.csv``, written at the end, one line per flight: seed, start, outcome, times, path,
-  final error.
+  (``flightlog.py``).
 
 A number that does not exist is None, never NaN.
 """
 
 import re
-from collections.abc import Iterable
-from itertools import count
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
-import pandas as pd
 from pydantic import FailFast
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays, write_text
-from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.types import StrPath
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import colours_of
 
 RESULTS = "results.json"
-EPISODES = "episodes.csv"
 FLIGHTS = "flights"
-# Files that are removed together with the results; a report writes the last two.
 REPORT = "report.md"
 FIGURES = "figures"
-WRITTEN = (RESULTS, EPISODES, REPORT)
-# Names of the columns of episodes.csv, for arrays of several numbers
-_START = "x y z qw qx qy qz vx vy vz rate_x rate_y rate_z"
-_PARTS = {"target": "xyz", "final_offset": "xyz", "start": _START.split()}
 
 
 class ControllerRecord(Frozen):
@@ -72,7 +59,7 @@ class Entry(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[10] = 10
+    schema_version: Literal[11] = 11
     suite: str
     title: str = ""
     """of the suite"""
@@ -113,34 +100,3 @@ def load_results(folder: StrPath) -> Results:
 def file_name(label: str) -> str:
     """Return a label as part of file names."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", label).strip("_.") or "_"
-
-
-def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
-    """Write ``episodes.csv``, with empty cells where there is no number.
-
-    :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
-    """
-    tables = []
-    for entry in entries:
-        arrays = read_arrays(folder / entry.flights, "episode_")
-        columns: StrDict = {
-            "controller": entry.controller,
-            "scenario": entry.scenario,
-            "episode": range(entry.metrics.n),
-            "waypoints_reached": np.isfinite(arrays["episode_waypoints"]).sum(axis=1),
-        }
-        tolerances = [f"{tolerance:g}" for tolerance in arrays.pop("episode_tolerances")]
-        parts = {**_PARTS, "time_to": tolerances, "settling_time": tolerances}
-        for key, values in arrays.items():
-            name = key.removeprefix("episode_")
-            if values.ndim == 1:
-                columns[name] = values
-                continue
-            # An array of several numbers becomes a column for each of them.
-            for part, column in zip(parts.get(name, count(1)), values.T, strict=False):
-                columns[f"{name}_{part}"] = column
-        tables.append(pd.DataFrame(columns))
-    # Scenarios differ in tolerances and waypoints, and so in their columns.
-    # Nine digits tell any two float32 apart.
-    table = pd.concat(tables).to_csv(index=False, float_format="%.9g", lineterminator="\n")
-    write_text(folder / EPISODES, table)

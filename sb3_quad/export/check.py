@@ -13,7 +13,7 @@ from sb3_quad.base.types import Float32Array, FloatArray
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.observation import GROUPS, OBSERVATION_SIZE, turn_features
 from sb3_quad.envs.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.envs.simulation.state import P, QuadcopterState, X
+from sb3_quad.envs.simulation.state import QuadcopterState, X
 from sb3_quad.envs.simulation.tasks import TASKS, Task
 from sb3_quad.envs.simulation.tracks import ACCELERATION_STD
 from sb3_quad.envs.vehicles.layout import find_turn
@@ -51,6 +51,7 @@ ROUNDING = 2e-6  # relative to the limits within which the position integral is 
 class TrainedPolicy:
     """A trained policy in its own environment, with which an exported file must agree.
 
+    :ivar action: what the policy's actions command.
     :ivar own: the vehicle in its own layout, which is the file's; ``vehicle``: in the layout that
         the policy knows.
     :ivar mean: μ of Eq. 3.16, (OBSERVATION_SIZE,), as in training; ``std``: σ, likewise;
@@ -64,7 +65,7 @@ class TrainedPolicy:
     :param vehicle: the vehicle that it flies; its layout may differ.
     :param output: ``thrusts`` (N) or ``speeds`` (rad/s) of the rotors; or ``rates``, the collective
         thrust (N) and body rates (rad/s), of a policy with ``action="rates"``.
-    :raises ConfigError: settings that the environment refuses; a layout that does not fit;
+    :raises ConfigError: a scaling that the environment refuses; a layout that does not fit;
         statistics for more than the present features; a policy of another output.
     """
 
@@ -76,16 +77,16 @@ class TrainedPolicy:
         output: str = "thrusts",
     ) -> None:
         layout = settings.layout
-        # A batch of one row checks the settings and resolves vehicle and scaling.
         settings = settings.with_changes(vehicle=vehicle, rotor_layout=layout)
-        row = QuadcopterBatch(1, settings, n_threads=1)
+        mean, std = settings.scaling(1)
         self.model = model
         self.output = output
+        self.action = settings.action
         self.own = vehicle
-        self.vehicle = row.vehicle_list[0]
-        self.mean = row.mean[:, 0]
-        self.std = row.std[:, 0]
-        self.observation = row.observation
+        self.vehicle = settings.load_vehicles()[0]
+        self.mean = mean[:, 0]
+        self.std = std[:, 0]
+        self.observation = settings.observation
         self.clip = 0.0
         statistics = statistics_of(model)
         if statistics is not None:
@@ -97,8 +98,8 @@ class TrainedPolicy:
         self.turn = find_turn(vehicle, layout)
         if settings.action == "rates":
             low, high = 4.0 * np.array(self.vehicle.thrust_range)
-            rates = row.vehicles[P.rate_limit_x : P.rate_limit_x + 3, 0]
-            self.limits = np.array([[low, *-rates], [high, *rates]])
+            rates, _ = self.vehicle.rate_limits_and_gains
+            self.limits = np.array([[low, *np.negative(rates)], [high, *rates]])
             if not np.allclose(self.turn.axes, np.eye(3)):
                 raise ConfigError(
                     f"{vehicle.name}: its axes are turned from those of the agent's body rates; "
@@ -155,7 +156,7 @@ def compare(
         observation_mean=trained.mean,
         observation_std=trained.std,
         vehicle=trained.vehicle,
-        action="rates" if trained.output == "rates" else "thrusts",
+        action=trained.action,
         max_episode_steps=ENDLESS,
         noise=0.0,
         reference=MOVING,

@@ -114,11 +114,6 @@ def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
     return schedule
 
 
-def takes_whole(parameter: inspect.Parameter) -> bool:
-    """Whether a constructor's parameter takes only whole numbers."""
-    return _takes(parameter.annotation, 2) and not _takes(parameter.annotation, 0.5)
-
-
 def _takes(kind: Any, value: Any) -> bool:
     with suppress(ConfigError):
         check(kind, value, "")

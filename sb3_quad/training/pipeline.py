@@ -372,7 +372,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
     assert handed is not None
     content["agent"] = os.path.relpath(handed.agent, log_folder)
     write_yaml(folder / STATUS_FILE, content)
-    exit_code = 1 if handed.problem else 0
+    exit_code = int(bool(handed.problem))
     return PipelineResult(folder, results, jobs[0], str(handed.agent), handed.problem, exit_code)
 
 

@@ -46,7 +46,6 @@ from sb3_quad.base.types import Report, StrDict
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel, ShouldContinue
 from sb3_quad.callbacks.every import Checkpoint, EpisodeLog, ProgressLine
-from sb3_quad.callbacks.hyperparameters import HyperparameterLog
 from sb3_quad.callbacks.snapshot import SnapshotFile
 from sb3_quad.training.algorithms import instance
 from sb3_quad.training.config import TrainingConfig, TrainingJob, build_config, load_agent
@@ -269,14 +268,6 @@ class _Training:
         self.callbacks: list[BaseCallback] = [
             self.snapshots,
             EpisodeLog(run.episodes, job.config.env_id),
-            HyperparameterLog(
-                {
-                    "algo": job.config.algo,
-                    "env": job.config.env_id,
-                    "seed": job.seed,
-                    **job.config.settings,
-                }
-            ),
         ]
         self.best: BestModel | None = None
         if self.eval_envs:

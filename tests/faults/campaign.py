@@ -174,8 +174,6 @@ def content(path: Path) -> object:
             return {key: (file[key].dtype.str, file[key].tobytes()) for key in kept}
     if path.name == "0.monitor.csv":
         return [line.split(",")[:2] for line in path.read_text().splitlines()[1:]]
-    if path.name == "episodes.csv":
-        return path.read_text()
     if path.name == "results.json":
         return re.sub(r'"(seconds|date)": [^,}\n]+', "", path.read_text())
     return None

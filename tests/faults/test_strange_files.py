@@ -22,7 +22,7 @@ from sb3_quad.envs.simulation.motions import LARGEST_TABLE, read_points
 from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.evaluate import _flown_before
-from sb3_quad.evaluation.results import Results, load_results
+from sb3_quad.evaluation.results import load_results
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.training.config import SETTINGS, build_config
 from sb3_quad.training.runs import refuse_elsewhere
@@ -177,31 +177,13 @@ def test_a_damaged_log_of_episodes_is_named(line):
     assert "\n" not in str(raised.value)
 
 
-def results_in(folder):
-    """Results of nothing, whose report shows a picture; another one is the user's."""
-    results = Results(suite="a", description="", package_version="1", controllers=[], scenarios=[])
-    (folder / "figures").mkdir(parents=True)
-    (folder / "results.json").write_text(results.model_dump_json())
-    (folder / "report.md").write_text("![a](figures/a_paths.png)\n![b](figures/../own.png)")
-    for name in ("figures/a_paths.png", "figures/own.png", "own.png"):
-        (folder / name).touch()
-    return results
-
-
-def test_pictures_of_former_results_leave_with_them(here):
-    results = results_in(here / "out")
-    assert _flown_before(here / "out", results, overwrite=True) == []
-    left = {str(path.relative_to(here)) for path in here.rglob("*.*")}
-    assert left == {"out/figures/own.png", "out/own.png"}
-
-
 @pytest.mark.parametrize("name", ["flights", "flights/pid", "figures"])
 def test_results_are_not_written_through_links(here, name):
     (here / "elsewhere").mkdir()
     (here / "out" / name).parent.mkdir(parents=True)
     (here / "out" / name).symlink_to(here / "elsewhere")
     with pytest.raises(ConfigError, match=name):
-        _flown_before(here / "out", None, overwrite=True)
+        _flown_before(here / "out", None)
 
 
 def test_a_removed_folder_and_too_little_memory_are_named(monkeypatch, capsys):

@@ -25,7 +25,7 @@ examples:
   sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery \
     --vehicle crazyflie -o evaluations/crazyflie
 
-The folder receives results.json, episodes.csv and a report. It holds the
+The folder receives results.json, all flights and a report. It holds the
 results of one command, so give all controllers at once. After an interruption,
 the same command continues where it stopped.
 """
@@ -38,7 +38,6 @@ from pydantic import NonNegativeInt, PositiveInt
 from sb3_quad.cli.parser import (
     PROGRESS,
     SEVERAL,
-    SWITCH,
     TRUST,
     YES_OR_NO,
     Flags,
@@ -57,7 +56,6 @@ FLAGS: Flags = {
     "-n --n-episodes N": (PositiveInt, "episodes of each scenario (the suite's number)"),
     "--seed N": (NonNegativeInt, "seed of each scenario (the suite's seed)"),
     "--vehicle": "vehicle, by name or YAML file (the suite's, else each agent's own)",
-    "--overwrite": (SWITCH, "remove the results that the folder holds"),
     "--report": (YES_OR_NO, True, "write report.md and its plots (yes)"),
     **TRUST,
     **PROGRESS,
@@ -81,13 +79,12 @@ def run(options: Namespace) -> int:
             suite,
             parse_controllers(options.controllers),
             folder,
-            options.overwrite,
             progress=show,
             report=warn,
         )
     if results.entries:
         console().print(*overview(results))
-        print(f"results in {folder}: results.json, episodes.csv, flights/")
+        print(f"results in {folder}: results.json, flights/")
         if options.report:
             # Matplotlib takes a second.
             from sb3_quad.evaluation.report import write_report

@@ -1,4 +1,4 @@
-"""Vehicles of a distribution, as records."""
+"""Vehicles of a distribution as records, for what compiled code samples."""
 
 from typing import Any
 
