@@ -26,6 +26,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+import sb3_quad
+
 # The first example of a test may compile, so no deadline. The same examples every time, except in
 # `make fuzz`.
 settings.register_profile(
@@ -166,6 +168,17 @@ def dagger_run(trained_runs, tmp_path):
     folder = tmp_path / "logs" / "dagger" / "QuadStateRecovery-v0_1"
     shutil.copytree(trained_runs("dagger"), folder)
     return folder
+
+
+@pytest.fixture
+def short_cards(monkeypatch):
+    """Let the flights for a card of publish.py end after 0.2 s."""
+    import publish
+
+    def fly(*arguments, **settings):
+        return sb3_quad.fly(*arguments, **{**settings, "max_episode_steps": 20})
+
+    monkeypatch.setattr(publish, "fly", fly)
 
 
 @pytest.fixture(scope="session")

@@ -24,7 +24,7 @@ from sb3_quad.envs.simulation.state import X
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SHORT = ("--timesteps", "100")  # a single rollout
 # Scripts with what makes them short, and a part of what they print. Others have tests below, or in
-# test_zoo.py, test_crazyflie_app.py and test_pretrained.py.
+# test_zoo.py, test_crazyflie_app.py, test_pretrained.py and test_zip_portability.py.
 SCRIPTS = {
     "two_stages.py": (("--timesteps", "100", "100"), "agent, target_tracking: success"),
     "own_expert.py": (SHORT, "agent: success"),
@@ -32,7 +32,6 @@ SCRIPTS = {
     "own_reward.py": (SHORT, "agent after training: mean reward"),
     "own_callback.py": (("--timesteps", "100000"), "crashed"),
     "sac_bc.py": (("quadcopter", *SHORT), "agent: success"),
-    "load_in_plain_sb3.py": ((str(sb3_quad.pretrained_path("itm-robust")),), "off a circle"),
 }
 
 
@@ -61,8 +60,16 @@ def few_flights(controller, task, n_episodes, seed, **settings):
     return fly(controller, task, 2, seed, max_episode_steps=50, **settings)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["own_expert", "own_vehicle", "own_reward", "own_callback"])
+WEEKLY = [pytest.mark.slow, pytest.mark.campaign]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("own_reward", marks=pytest.mark.slow),
+        *(pytest.param(f"own_{name}", marks=WEEKLY) for name in ("expert", "vehicle", "callback")),
+    ],
+)
 def test_an_agent_succeeds_as_it_is_shipped(run, name):
     output = run(f"{name}.py")
     shares = re.findall(r"^agent.*: .*success ([\d.]+)%", output, flags=re.MULTILINE)
@@ -70,7 +77,7 @@ def test_an_agent_succeeds_as_it_is_shipped(run, name):
 
 
 def test_a_batch_of_ones_own_learns(run):
-    output = run("own_batch.py", "--timesteps", "60000")
+    output = run("own_batch.py", "--timesteps", "30000")
     before, after = map(float, re.findall(r": ([\d.]+) of 200 steps upright", output))
     assert after > 1.2 * before
 

@@ -107,53 +107,6 @@ def test_any_text_on_the_command_line_is_a_value(text):
     assert value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))
 
 
-@pytest.mark.parametrize(
-    ("settings", "key"),
-    [
-        ({"n_setps": 100}, "n_steps"),
-        ({"n_envs": 0}, "n_envs"),
-        ({"n_envs": True}, "n_envs"),
-        ({"gamma": 2}, "gamma"),
-        ({"vf_coef": -1}, "vf_coef"),
-        ({"n_timesteps": "many"}, "n_timesteps"),
-        ({"n_steps": 2.5}, "n_steps"),
-        ({"n_steps": "lin_100"}, "n_steps"),
-        ({"n_steps": True}, "n_steps"),
-        ({"learning_rate": "fast"}, "learning_rate"),
-        ({"learning_rate": "lin_fast"}, "learning_rate"),
-        ({"learning_rate": float("nan")}, "learning_rate"),
-        ({"bc_loss": "mae"}, "bc_loss"),
-        ({"policy": "MlpPolciy"}, "MlpPolicy"),
-        ({"vec_env": "bath"}, "vec_env"),
-        ({"env_kwargs": {"nosie": 0}}, "noise"),
-        ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "nn.Tanh"),
-        ({"policy_kwargs": {"net_arhc": [8]}}, "net_arch"),
-        ({"policy_kwargs": {"net_arch": 8}}, "net_arch"),
-        ({"policy_kwargs": {"net_arch": {"pi": [8, 0]}}}, "net_arch"),
-        ({"normalize": "often"}, "normalize"),
-        ({"callback": 3}, "callback"),
-    ],
-)
-def test_a_bad_setting_is_one_line_that_names_the_key(settings, key):
-    with pytest.raises(ConfigError, match=key) as error:
-        build_model(TrainingJob(config=build(**settings)), QuadcopterVecEnv(2))
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("algo", "settings", "key"),
-    [
-        ("ppo", {"n_steps": 0}, "n_steps"),
-        ("sac", {"train_freq": 0}, "train_freq"),
-        ("ppo", {"expert": "pid"}, "expert"),
-        ("ppo", {"noise_type": "normal"}, "noise_type"),
-    ],
-)
-def test_so_it_is_for_algorithms_of_sb3(algo, settings, key):
-    with pytest.raises(ConfigError, match=key):
-        build(algo, **settings)
-
-
 class Broken(PPO):
     """Its constructor has a bug."""
 
