@@ -97,11 +97,19 @@ def pytest_sessionstart(session):
         # Workers would all compile the same code, and on a slow machine the first test of each
         # would take longer than a test may.
         compile_all = (
-            "from sb3_quad import APG, DAgger, QuadcopterVecEnv\n"
-            "env = QuadcopterVecEnv(1)\n"
+            "from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv\n"
+            "env = QuadcopterVecEnv(1, reference='circle')\n"
             "DAgger('MlpPolicy', env, expert='geometric', n_steps=2).learn(2)\n"
+            "PPOBC('MlpPolicy', env, expert='pid', n_steps=2, critic_warmup=0).learn(2)\n"
             "APG('MlpPolicy', env, n_steps=2).learn(2)\n"
         )
+        if importlib.util.find_spec("pybullet") is not None:
+            compile_all += (
+                "from sb3_quad.envs import QuadcopterEnv\n"
+                "env = QuadcopterEnv()\n"
+                "env.reset()\n"
+                "env.step(env.action_space.sample())\n"
+            )
         subprocess.run([sys.executable, "-c", compile_all], check=True)
 
 

@@ -11,6 +11,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_quad.evaluation.offset_correction
 from sb3_quad.cli.app import COMMANDS, make_parser
+from sb3_quad.envs.simulation.settings import FlightSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -64,7 +65,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def short_trainings(monkeypatch):
-    """End each training after a rollout and a few minibatches."""
+    """End each training after a rollout and a few minibatches, and each flight after 1 s."""
     learn = OnPolicyAlgorithm.learn
 
     def short(self, total_timesteps, *args, **kwargs):
@@ -75,6 +76,7 @@ def short_trainings(monkeypatch):
         return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args[:4], **kwargs)
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
+    monkeypatch.setattr(FlightSettings, "longest_episode", 100)
     # It needs an agent that flies.
     monkeypatch.setattr(
         sb3_quad.evaluation.offset_correction, "correct_offset", lambda *arguments: None

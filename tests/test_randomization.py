@@ -207,7 +207,7 @@ def test_a_wrench_that_is_set_lasts_until_the_next_episode_brings_its_own():
 
 
 def test_sampled_vehicles_are_valid_and_fill_the_ranges():
-    vehicles = sample_vehicles("raptor", 2000, seed=1)
+    vehicles = sample_vehicles("raptor", 1000, seed=1)
     inertia = np.array([each.inertia for each in vehicles])
     metrics = {  # with the ranges of the file
         "size": (np.cbrt([each.mass for each in vehicles]), np.cbrt([0.02, 5.0])),
@@ -225,7 +225,7 @@ def test_sampled_vehicles_are_valid_and_fill_the_ranges():
         np.testing.assert_allclose(
             np.quantile(share, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.05, err_msg=name
         )
-    np.testing.assert_allclose(inertia / inertia[:, :1], np.tile([1.0, 1.024, 1.854], (2000, 1)))
+    np.testing.assert_allclose(inertia / inertia[:, :1], np.tile([1.0, 1.024, 1.854], (1000, 1)))
     np.testing.assert_allclose([each.thrust_limits[0] for each in vehicles], 0.05)
     assert np.std(
         np.log([each.arm_length / np.cbrt(each.mass) for each in vehicles])

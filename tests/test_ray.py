@@ -51,8 +51,7 @@ class NotesNode(BaseCallback):
 @pytest.fixture
 def cluster(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT}/tests")
-    # A busy machine starts Ray slowly, and hardly runs its workers, which have a niceness of 15.
-    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "300")
+    # Beside other tests, a worker with Ray's niceness of 15 would hardly run.
     monkeypatch.setenv("RAY_worker_niceness", "0")
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     made.add_node(num_cpus=1)

@@ -1,6 +1,7 @@
 """Bad input is one line that names the key: ``corpus.yaml`` holds what is given, and the key."""
 
 import errno
+import logging
 import shlex
 import signal
 import subprocess
@@ -60,6 +61,8 @@ def compiled():
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    # Optuna logs to the stderr of the test that has imported it, which may be closed.
+    monkeypatch.setattr(logging, "raiseExceptions", False)
     return tmp_path
 
 
