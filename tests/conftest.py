@@ -189,28 +189,6 @@ def short_cards(monkeypatch):
     monkeypatch.setattr(publish, "fly", fly)
 
 
-@pytest.fixture(scope="session")
-def results_folder(tmp_path_factory):
-    """The results of evaluating two experts on a suite of two short scenarios.
-
-    The folder is shared: read it, and do not write there.
-    """
-    from sb3_quad.cli import main
-
-    folder = tmp_path_factory.mktemp("results")
-    suite = folder / "small.yaml"
-    suite.write_text(
-        "name: small\n"
-        "scenarios:\n"
-        "- {name: hover, task: state_recovery, duration: 0.5, n_episodes: 3}\n"
-        "- {name: far, target: [1, 0, 15], duration: 1, n_episodes: 2}\n"
-    )
-    out = folder / "out"
-    command = ["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out)]
-    assert main([*command, "--no-report"]) == 0
-    return out
-
-
 def legends_cover_nothing(figure):
     """Assert that a figure's legends lie within it and outside of its axes."""
     figure.draw_without_rendering()

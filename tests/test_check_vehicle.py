@@ -114,7 +114,7 @@ def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, cap
         "thrust_factors": [1.0, 0.95, 1.0, 1.0],
     }
     own = written(tmp_path / "own.yaml", name="own", mass=1.5, **limits, **air)
-    assert main(["check-vehicle", own, "-n", "8"]) == 0
+    assert main(["check-vehicle", own, "-n", "4"]) == 0
     printed = capsys.readouterr().out
     vehicle = load_vehicle(own)
     assert f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed

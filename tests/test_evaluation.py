@@ -34,12 +34,12 @@ def hover(observation):
     return np.zeros((len(observation), 4), dtype=np.float32)
 
 
-def same(a, b, tolerances=TOLERANCES):
+def same(a, b):
     for name in ("success", "survival", "length"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
     for name in ("reward", "path_length", "final_error"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-6)
-    for tolerance in tolerances:
+    for tolerance in TOLERANCES:
         np.testing.assert_allclose(a.time_to[tolerance], b.time_to[tolerance], atol=1e-9)
 
 

@@ -8,7 +8,6 @@ import pytest
 
 from sb3_quad import envs, sample_vehicles
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import QUATERNION, P, W
@@ -151,18 +150,6 @@ def test_an_episode_is_random_within_the_ranges():
     assert torque[:2] == pytest.approx(0.1, abs=0.01) and torque[2] == pytest.approx(
         0.033, abs=0.003
     )
-
-
-def test_a_share_of_zero_changes_no_flight():
-    envs = [
-        QuadcopterVecEnv(64, task="state_recovery", seed=4, **keywords)
-        for keywords in ({}, {"randomize": {"mass": [0.6, 1.2], "share": 0.0}})
-    ]
-    actions = np.random.default_rng(0).uniform(-1, 1, (200, 64, 4)).astype(np.float32)
-    np.testing.assert_array_equal(*(env.reset() for env in envs))
-    for action in actions:
-        for ours, theirs in zip(*(env.step(action)[:3] for env in envs), strict=True):
-            np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize(

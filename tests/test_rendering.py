@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from sb3_quad.base.errors import ConfigError
@@ -16,7 +15,6 @@ from sb3_quad.envs.rendering.window import Client
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 HOVER = np.zeros(4, dtype=np.float32)
-Picture = npt.NDArray[np.uint8]
 
 
 @pytest.fixture
