@@ -29,7 +29,7 @@ help:
 	@echo "make test           run the tests that a change is likely to break, in minutes"
 	@echo "make test-all       run these and the slow ones: pages that train, wheels, compilers"
 	@echo "make test-portable  run those of make test as an older processor would"
-	@echo "make campaign       kill commands at random moments, and give them values at random that nobody should give"
+	@echo "make campaign       kill commands at random moments, resume them and compare"
 	@echo "make coverage       run those of make test, and show which lines of the packages they do not reach"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
@@ -52,8 +52,9 @@ install: $(INSTALLED)
 train: $(INSTALLED)
 	$(PY) -m sb3_quad.cli train $(ARGS)
 
-# A file's tests share what its fixtures made, so that a file goes to one worker.
-PYTEST := $(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile --durations=15
+# A file's tests share what its fixtures made, so that a file goes to one worker; in the order of their names, since the files with
+# the fewest tests, which xdist would leave for the end, take longest.
+PYTEST := $(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations=15
 
 test: $(INSTALLED)
 	$(PYTEST) -m "not slow" $(ARGS)
@@ -61,7 +62,7 @@ test: $(INSTALLED)
 test-all: $(INSTALLED)
 	$(PYTEST) $(ARGS)
 
-# Weekly in CI. SB3_QUAD_KILLS=50 SB3_QUAD_INPUTS=all: more of both.
+# Weekly in CI. SB3_QUAD_KILLS=50: more of them.
 campaign: $(INSTALLED)
 	$(PY) -m pytest -m campaign -o timeout=0 $(ARGS)
 

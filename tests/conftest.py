@@ -26,6 +26,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+import sb3_quad
+
 # The first example of a test may compile, so no deadline. The same examples every time, except in
 # `make fuzz`.
 settings.register_profile(
@@ -95,11 +97,19 @@ def pytest_sessionstart(session):
         # Workers would all compile the same code, and on a slow machine the first test of each
         # would take longer than a test may.
         compile_all = (
-            "from sb3_quad import APG, DAgger, QuadcopterVecEnv\n"
-            "env = QuadcopterVecEnv(1)\n"
+            "from sb3_quad import APG, PPOBC, DAgger, QuadcopterVecEnv\n"
+            "env = QuadcopterVecEnv(1, reference='circle')\n"
             "DAgger('MlpPolicy', env, expert='geometric', n_steps=2).learn(2)\n"
+            "PPOBC('MlpPolicy', env, expert='pid', n_steps=2, critic_warmup=0).learn(2)\n"
             "APG('MlpPolicy', env, n_steps=2).learn(2)\n"
         )
+        if importlib.util.find_spec("pybullet") is not None:
+            compile_all += (
+                "from sb3_quad.envs import QuadcopterEnv\n"
+                "env = QuadcopterEnv()\n"
+                "env.reset()\n"
+                "env.step(env.action_space.sample())\n"
+            )
         subprocess.run([sys.executable, "-c", compile_all], check=True)
 
 
@@ -168,26 +178,15 @@ def dagger_run(trained_runs, tmp_path):
     return folder
 
 
-@pytest.fixture(scope="session")
-def results_folder(tmp_path_factory):
-    """The results of evaluating two experts on a suite of two short scenarios.
+@pytest.fixture
+def short_cards(monkeypatch):
+    """Let the flights for a card of publish.py end after 0.2 s."""
+    import publish
 
-    The folder is shared: read it, and do not write there.
-    """
-    from sb3_quad.cli import main
+    def fly(*arguments, **settings):
+        return sb3_quad.fly(*arguments, **{**settings, "max_episode_steps": 20})
 
-    folder = tmp_path_factory.mktemp("results")
-    suite = folder / "small.yaml"
-    suite.write_text(
-        "name: small\n"
-        "scenarios:\n"
-        "- {name: hover, task: state_recovery, duration: 0.5, n_episodes: 3}\n"
-        "- {name: far, target: [1, 0, 15], duration: 1, n_episodes: 2}\n"
-    )
-    out = folder / "out"
-    command = ["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out)]
-    assert main([*command, "--no-report"]) == 0
-    return out
+    monkeypatch.setattr(publish, "fly", fly)
 
 
 def legends_cover_nothing(figure):

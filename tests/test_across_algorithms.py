@@ -152,35 +152,6 @@ def test_numbers_of_numpy_do_not_keep_a_zip_from_being_read(algorithm, keywords,
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "arguments"),
-    [
-        (PPOBC, {"bc_coef": -1.0}),
-        (PPOBC, {"bc_filter": "advantage"}),
-        (PPOBC, {"critic_warmup": -5}),
-        (PPOBC, {"gamma": 1.5}),
-        (PPOBC, {"l2_coef": "x"}),
-        (PPOBC, {"vf_coef": [1.0]}),
-        (DAgger, {"beta": 1.5}),
-        (DAgger, {"beta_final": 0.9}),
-        (DAgger, {"beta_decay": -1.0}),
-        (DAgger, {"bc_loss": "mae"}),
-        (DAgger, {"dataset_capacity": 10}),
-        (DAgger, {"gradient_steps": 0}),
-        (DAgger, {"batch_size": 10**9}),
-        (APG, {"substeps": 1.5}),
-        (APG, {"n_steps": 20.0}),
-        (APG, {"cost": 3}),
-        (APG, {"max_row_ratio": 0.5}),
-        (APG, {"learning_rate": -1.0}),
-    ],
-)
-def test_an_argument_that_does_not_fit_is_named_in_one_line(algorithm, arguments):
-    with pytest.raises(ConfigError, match=next(iter(arguments))) as raised:
-        algorithm("MlpPolicy", QuadcopterVecEnv(2, seed=0), **arguments)
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
     ("algorithm", "name"), [(PPOBC, "ppo_bc"), (DAgger, "dagger"), (APG, "apg")]
 )
 def test_a_recipe_repeats_no_default(algorithm, name):

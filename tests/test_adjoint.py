@@ -1,6 +1,4 @@
-"""Gradients of recorded flights: what autograd of the same equations gives, and what differences of
-flights do.
-"""
+"""Gradients of recorded flights: what autograd of the same equations gives."""
 
 from copy import deepcopy
 
@@ -307,38 +305,6 @@ def test_rows_of_different_noise_have_the_gradients_of_their_own():
     tape = FlightTape(batch, 20, 2)
     begin(tape)
     record_and_compare(tape, random_actions(20, batch.n, 0), 0)
-
-
-@pytest.mark.parametrize(("vehicle", "substeps"), [("itm", 4), ("l2f_crazyflie", 2)])
-def test_the_gradient_by_the_start_is_that_of_differences(vehicle, substeps):
-    torque = {"magnitude": 0.03, "unit": "weight", "frame": "world"}
-    batch = new_batch(
-        4, 3, vehicle=vehicle, randomize={"drag": [0.2, 1.0], "wind": 3.0, "torque": torque}
-    )
-    tape, actions = FlightTape(batch, 20, substeps), random_actions(20, batch.n, 0)
-    begin(tape)
-    start = batch.snapshot()
-    for action in actions:
-        tape.step(action)
-    # Observations are float32, which no difference of 1e-6 survives.
-    cost = LinearCost(tape, 1, observed=False)
-    _, grad_start = gradients(tape, cost)
-
-    def costs(row, change):
-        batch.restore(start)
-        batch.state[row] += change
-        states = []
-        for action in actions:
-            batch.step_on(action, substeps)
-            states.append(batch.state.copy())
-        return (cost.states * states).sum(axis=(0, 1))
-
-    for row, scale in enumerate(SCALE):
-        h = 1e-3 * scale
-        # Exact but for h⁴
-        slope = 8 * (costs(row, h) - costs(row, -h)) - (costs(row, 2 * h) - costs(row, -2 * h))
-        error = np.abs(slope / (12 * h) - grad_start[row]) * scale
-        assert (error <= 1e-6 * np.abs(grad_start * SCALE[:, None]).max(axis=0)).all(), row
 
 
 def test_the_number_of_threads_changes_no_bit():

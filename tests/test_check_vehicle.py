@@ -114,7 +114,7 @@ def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, cap
         "thrust_factors": [1.0, 0.95, 1.0, 1.0],
     }
     own = written(tmp_path / "own.yaml", name="own", mass=1.5, **limits, **air)
-    assert main(["check-vehicle", own, "-n", "8"]) == 0
+    assert main(["check-vehicle", own, "-n", "4"]) == 0
     printed = capsys.readouterr().out
     vehicle = load_vehicle(own)
     assert f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed
@@ -139,14 +139,6 @@ def test_a_mass_in_grams_is_blamed_on_the_mass_and_leaves_with_1(name, limits, t
     assert main(["check-vehicle", grams, "-n", "0"]) == 1
     error = capsys.readouterr().err
     assert "grams.yaml" in error and "mass" in error and "inertia" not in error
-
-
-def test_bad_files_leave_with_2(tmp_path, capsys):
-    for key, value in (("mas", 1.0), ("inertia", [0.1, 0.1, 0.5])):
-        path = written(tmp_path / "bad.yaml", **{key: value})
-        assert main(["check-vehicle", path]) == 2
-        error = capsys.readouterr().err
-        assert key in error and path in error and error.count("\n") == 1
 
 
 def test_agents_say_which_ranges_a_vehicle_leaves(tmp_path, capsys):

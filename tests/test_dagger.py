@@ -258,12 +258,6 @@ def test_the_dataset_grows_to_its_capacity(capacity, sizes):
 # ------------------------------------------------------------------------------------------
 
 
-def test_a_seed_decides_the_run():
-    first, again, other = (parameters(build(seed=seed).learn(ROLLOUT * 2)) for seed in (3, 3, 4))
-    assert th.equal(first, again)
-    assert not th.equal(first, other)
-
-
 def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
     settings = {
         "beta_decay": 0.05,

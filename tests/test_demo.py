@@ -416,6 +416,7 @@ def test_the_page_differentiates_its_physics(changes, tmp_path):
 
 @node
 @pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(900)
 def test_a_network_trained_by_the_page_recovers(tmp_path):
     vehicle = load_vehicle("itm").model_dump(mode="json")

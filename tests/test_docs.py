@@ -11,6 +11,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_quad.evaluation.offset_correction
 from sb3_quad.cli.app import COMMANDS, make_parser
+from sb3_quad.envs.simulation.settings import FlightSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -39,14 +40,14 @@ LONG = (
 )
 
 
-def blocks(page: str, language: str) -> list[str]:
+def blocks(page, language):
     """The code of a page's blocks, in order, each on the lines that it has in the page."""
     text = (ROOT / page).read_text(encoding="utf-8")
     found = re.finditer(rf"^```{language}\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
     return ["\n" * text.count("\n", 0, match.start(1)) + match.group(1) for match in found]
 
 
-def run(page: str) -> dict[str, object]:
+def run(page):
     """Run a page's blocks in order, in the current folder. Returns their namespace."""
     scope: dict[str, object] = {"__name__": page}
     for number, code in enumerate(blocks(page, "python")):
@@ -64,7 +65,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def short_trainings(monkeypatch):
-    """End each training after a rollout and a few minibatches."""
+    """End each training after a rollout and a few minibatches, and each flight after 1 s."""
     learn = OnPolicyAlgorithm.learn
 
     def short(self, total_timesteps, *args, **kwargs):
@@ -75,6 +76,7 @@ def short_trainings(monkeypatch):
         return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args[:4], **kwargs)
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
+    monkeypatch.setattr(FlightSettings, "longest_episode", 100)
     # It needs an agent that flies.
     monkeypatch.setattr(
         sb3_quad.evaluation.offset_correction, "correct_offset", lambda *arguments: None
@@ -124,12 +126,19 @@ CHECKS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", CHECKS)
+@pytest.mark.parametrize(
+    "page",
+    [
+        "docs/dagger.md",
+        "docs/environments.md",
+        pytest.param("docs/tutorial.md", marks=pytest.mark.campaign),
+    ],
+)
 def test_a_page_gives_what_it_says(page):
     CHECKS[page](run(page))
 
 
-def command_lines(text: str):
+def command_lines(text):
     """The arguments of each ``sb3-quad`` line, without remarks."""
     text = re.sub(r"\\\n\s*", " ", text)
     for line in re.findall(r"^[ $]*(?:\w+=\S+ +)*sb3-quad (\w.*)$", text, flags=re.MULTILINE):

@@ -100,12 +100,6 @@ def test_an_expert_flies_by_the_estimate():
     assert np.sqrt(np.square(found.final_offset).mean()) == pytest.approx(0.1, rel=0.25)
 
 
-def test_both_simulators_sample_the_same_errors():
-    keywords = {"n_episodes": 2, "noise": {"estimator": TRUE_SIZES}, "max_episode_steps": 60}
-    batch, bullet = (fly("geometric", backend=name, **keywords) for name in ("batch", "pybullet"))
-    np.testing.assert_allclose(bullet.final_offset, batch.final_offset, atol=1e-9)
-
-
 def test_set_noise_leaves_the_errors_as_they_are():
     env = QuadcopterVecEnv(2, noise={"estimator": TRUE_SIZES}, **HOVER)
     env.reset()

@@ -16,14 +16,13 @@ from sb3_quad.envs.simulation.frames import PositionIntegral
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SHORT = ("--timesteps", "100")  # a single rollout
 # Scripts with what makes them short, and a part of what they print. Others have tests below, or in
-# test_zoo.py, test_crazyflie_app.py and test_pretrained.py.
+# test_zoo.py, test_crazyflie_app.py, test_pretrained.py and test_zip_portability.py.
 SCRIPTS = {
     "two_stages.py": (("--timesteps", "100", "100"), "agent, target_tracking: success"),
     "own_expert.py": (SHORT, "agent: success"),
     "own_vehicle.py": (SHORT, "agent: success"),
     "own_reward.py": (SHORT, "agent after training: mean reward"),
     "own_callback.py": (("--timesteps", "100000"), "crashed"),
-    "load_in_plain_sb3.py": ((str(sb3_quad.pretrained_path("itm-robust")),), "m from the target"),
 }
 
 
@@ -52,8 +51,16 @@ def few_flights(controller, task, n_episodes, seed, **settings):
     return fly(controller, task, 2, seed, max_episode_steps=50, **settings)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["own_expert", "own_vehicle", "own_reward", "own_callback"])
+WEEKLY = [pytest.mark.slow, pytest.mark.campaign]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("own_reward", marks=pytest.mark.slow),
+        *(pytest.param(f"own_{name}", marks=WEEKLY) for name in ("expert", "vehicle", "callback")),
+    ],
+)
 def test_an_agent_succeeds_as_it_is_shipped(run, name):
     output = run(f"{name}.py")
     shares = re.findall(r"^agent.*: .*success ([\d.]+)%", output, flags=re.MULTILINE)

@@ -3,7 +3,6 @@ package.
 """
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -19,7 +18,6 @@ from hovering import teach_to_hover
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import A2C, PPO, SAC, TD3
-from test_extending import DIFFS, ROOT, apply
 
 from sb3_quad import DAgger
 from sb3_quad.base.errors import ConfigError, ExportError
@@ -412,50 +410,6 @@ def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, c
     np.testing.assert_allclose(
         [float(word) for word in done], np.ravel(scope["thrust"][:1]), atol=1e-5
     )
-
-
-FEATURE = next(diff for diff in DIFFS if "FEATURES = (" in diff)
-EXPORT = """
-from stable_baselines3 import PPO
-from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.export.policy import export_policy
-from sb3_quad.envs.simulation.settings import FlightSettings
-
-sees = {"history": [0, 2], "last_action": True, "position_integral": {}}
-env = QuadcopterVecEnv(1, seed=0, **sees)
-model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [16]}, seed=0, device="cpu")
-FlightSettings(**sees).write_into(model)
-model.save("agent.zip")
-for vehicle in ("itm", "hummingbird"):
-    exported = export_policy("agent.zip", "onnx", vehicle=vehicle, n_observations=2000)
-    print(exported.metadata["observation"])
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1300)
-def test_a_policy_that_sees_a_further_feature_exports(tmp_path):
-    """The feature of docs/extending.md, also for rotors in another order and turned axes."""
-    for name in ("sb3_quad", "envs", "callbacks", "zoo_configs"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
-    apply(FEATURE, tmp_path)
-    # As installed: the checkout's finder would give its own otherwise.
-    for name in ("envs", "callbacks", "zoo_configs"):
-        (tmp_path / "sb3_quad" / name).symlink_to(tmp_path / name)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", EXPORT],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
-    assert len(lines) == 2
-    for line in lines:
-        assert line.startswith("22 numbers")
-        assert "15-17 body rates, body frame, rad/s; 18-21 rotor_speeds, rad/s" in line
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ EXPERT = GeometricExpert()
 seeds = st.integers(0, 2**32 - 1)
 
 
-def random_states(seed: int, n: int = 32) -> np.ndarray:
+def random_states(seed, n=32):
     random = np.random.default_rng(seed)
     array = np.zeros((STATE_SIZE, n))
     array[POSITION] = random.normal(0, 5, (3, n))
@@ -38,31 +38,17 @@ def random_states(seed: int, n: int = 32) -> np.ndarray:
     return array
 
 
-def actions(array: np.ndarray) -> np.ndarray:
+def actions(array):
     return EXPERT.actions(QuadcopterState(array))
 
 
-def mostly_close(one: np.ndarray, other: np.ndarray) -> bool:
+def mostly_close(one, other):
     """Whether actions agree to rounding, apart from states between the two ways round."""
     return int((np.abs(one - other).max(axis=1) > 1e-4).sum()) <= 1
 
 
-@given(seeds, st.floats(-np.pi, np.pi))
-def test_turning_the_world_about_the_vertical_changes_nothing(seed: int, angle: float) -> None:
-    array = random_states(seed)
-    c, s = np.cos(angle), np.sin(angle)
-    turned = array.copy()
-    for rows in (POSITION, TARGET, VELOCITY):
-        x, y, _ = array[rows]
-        turned[rows][0], turned[rows][1] = c * x - s * y, s * x + c * y
-    w, x, y, z = array[QUATERNION]
-    c, s = np.cos(angle / 2), np.sin(angle / 2)
-    turned[QUATERNION] = c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
-    assert mostly_close(actions(turned), actions(array))
-
-
 @given(seeds)
-def test_the_mirrored_vehicle_gives_mirrored_actions(seed: int) -> None:
+def test_the_mirrored_vehicle_gives_mirrored_actions(seed):
     """Exchange left and right: y, roll, yaw and their rates change sign; rotors 0 and 1, 2 and 3
     change places.
     """
@@ -76,18 +62,7 @@ def test_the_mirrored_vehicle_gives_mirrored_actions(seed: int) -> None:
 
 
 @given(seeds)
-def test_what_cannot_be_observed_does_not_matter(seed: int) -> None:
-    array = random_states(seed)
-    other = array.copy()
-    other[ROTOR_SPEEDS] = np.random.default_rng(seed + 1).uniform(
-        *ITM.rotor_speed_range, (4, array.shape[1])
-    )
-    other[QUATERNION] *= -1
-    np.testing.assert_array_equal(actions(other), actions(array))
-
-
-@given(seeds)
-def test_hover_at_the_target_is_an_equilibrium_in_any_heading(seed: int) -> None:
+def test_hover_at_the_target_is_an_equilibrium_in_any_heading(seed):
     array = random_states(seed)
     yaw = np.random.default_rng(seed).uniform(-np.pi, np.pi, array.shape[1])
     array[TARGET] = array[POSITION]
@@ -97,7 +72,7 @@ def test_hover_at_the_target_is_an_equilibrium_in_any_heading(seed: int) -> None
 
 
 @given(seeds)
-def test_upside_down_it_turns_with_its_greatest_moment(seed: int) -> None:
+def test_upside_down_it_turns_with_its_greatest_moment(seed):
     """The greatest moment leaves the middle thrust only, and some rotor is at its limit."""
     array = random_states(seed)
     array[VELOCITY] = array[BODY_RATES] = 0.0
@@ -110,7 +85,7 @@ def test_upside_down_it_turns_with_its_greatest_moment(seed: int) -> None:
     assert (moments[:, 0] < 0).all()  # back the way it came, which is the shorter one
 
 
-def test_it_recovers_from_nearly_every_start_and_is_quick_to_a_target() -> None:
+def test_it_recovers_from_nearly_every_start_and_is_quick_to_a_target():
     recovery = fly(EXPERT, "state_recovery", 480, 13, max_episode_steps=600, noise=0.0)
     tracking = fly(EXPERT, "target_tracking", 96, 13, max_episode_steps=800, noise=0.0)
     assert recovery.success.mean() >= 0.98
@@ -118,7 +93,7 @@ def test_it_recovers_from_nearly_every_start_and_is_quick_to_a_target() -> None:
     assert tracking.final_error.max() < 0.01
 
 
-def changed(**changes: object) -> GeometricExpert:
+def changed(**changes):
     return GeometricExpert(ITM.model_copy(update=changes))
 
 
@@ -138,8 +113,8 @@ def changed(**changes: object) -> GeometricExpert:
     ids=["slow motors", "weak", "late", "palm-sized plus"],
 )
 def test_derived_gains_fly_vehicles_unlike_those_of_the_search(
-    expert: GeometricExpert,
-) -> None:
+    expert,
+):
     vehicle = expert.vehicle
     assert expert.gains == derived_gains(vehicle)
     tracking = fly(

@@ -66,13 +66,16 @@ def test_an_agent_of_the_hub_is_read_as_data_and_flies_as_it_was_trained(shelf, 
 
 
 @pytest.mark.slow
-def test_published_for_the_hub_an_agent_has_what_the_hub_shows(shelf, tmp_path):
+def test_published_for_the_hub_an_agent_has_what_the_hub_shows(
+    shelf, tmp_path, monkeypatch, short_cards
+):
+    monkeypatch.setattr(publish, "FILM", ("-n", "20", "--size", "64x64"))
     command = ["itm-recovery", "--name", "racer", "--hub", "--episodes", "2", "-o", str(tmp_path)]
     assert publish.main(command) == 0
     folder = tmp_path / "racer"
     front = (folder / "README.md").read_text(encoding="utf-8").split("---\n")[1]
     assert yaml.safe_load(front)["library_name"] == "stable-baselines3"
-    assert (folder / "replay.mp4").stat().st_size > 10_000
+    assert (folder / "replay.mp4").stat().st_size > 1000
     shelf["/me/racer/racer.zip"] = (folder / "racer.zip").read_bytes()
     assert sb3_quad.load_pretrained("hf:me/racer").num_timesteps
     assert publish.main(command) == 2

@@ -234,62 +234,6 @@ def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "module", "keywords"),
-    [
-        (
-            PPOBC,
-            ppo_bc,
-            {
-                "bc_loss": "huber_mse",
-                "bc_coef": 1.0,
-                "bc_filter": "none",
-                "critic_warmup": 1,
-                "clip_range_vf": 0.2,
-            },
-        ),
-        (
-            DAgger,
-            dagger,
-            {
-                "bc_loss": "nll",
-                "dataset_capacity": 2000,
-                "gradient_steps": 30,
-            },
-        ),
-    ],
-)
-def test_a_training_is_the_one_by_autograd(monkeypatch, algorithm, module, keywords):
-    def train():
-        sizes = {"n_steps": 50, "batch_size": 400, "n_epochs": 3, "learning_rate": 1e-3}
-        env, policy_kwargs = QuadcopterVecEnv(16, seed=0), {"log_std_init": -1.0}
-        model = algorithm(
-            "MlpPolicy",
-            env,
-            expert=GeometricExpert(),
-            policy_kwargs=policy_kwargs,
-            seed=0,
-            **sizes,
-            **keywords,
-        )
-        model.learn(1600)
-        logged = {
-            name: value
-            for name, value in model.logger.name_to_value.items()
-            if name.startswith("train/")
-        }
-        return logged, [parameter.detach() for parameter in model.policy.parameters()]
-
-    ours, compiled = train()
-    monkeypatch.setattr(module, "network_of", Network)
-    theirs, plain = train()
-    assert "train/loss" in ours and ours == pytest.approx(theirs, rel=1e-2, abs=1e-4)
-    assert (
-        max(float((one - other).abs().max()) for one, other in zip(compiled, plain, strict=True))
-        < 1e-4
-    )
-
-
-@pytest.mark.parametrize(
     ("keywords", "computed"),
     [
         ({"activation_fn": nn.ReLU, "net_arch": [20]}, True),

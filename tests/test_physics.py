@@ -251,9 +251,8 @@ def test_flight_of_the_shipped_vehicles_is_pybullets(name, tmp_path):
     assert worst_difference(vehicle, tmp_path, state, actions, wrench).max() < 1e-9
 
 
-@pytest.mark.parametrize("physics_step", [0.0005, 0.002])
-def test_other_physics_steps(physics_step, tmp_path):
-    vehicle = ITM.model_copy(update={"physics_step": physics_step, "control_step": 0.01})
+def test_another_physics_step(tmp_path):
+    vehicle = ITM.model_copy(update={"physics_step": 0.0005, "control_step": 0.01})
     rng = np.random.default_rng(3)
     state, actions = random_state(rng, vehicle), random_actions(rng, 200)
     assert worst_difference(vehicle, tmp_path, state, actions, np.zeros(12)).max() < 1e-9
@@ -283,19 +282,6 @@ def test_rows_do_not_depend_on_the_batch():
         np.testing.assert_array_equal(alone[:, :, 0], together[:, :, row])
 
 
-def test_vehicles_may_differ_by_row():
-    heavy = ITM.model_copy(update={"mass": 3.0, "motor_gain": 40.0, "drag": (0.3, 0.4, 0.5)})
-    rng = np.random.default_rng(6)
-    states = np.stack([random_state(rng, ITM), random_state(rng, heavy)], axis=1)
-    actions = np.stack([random_actions(rng, 50) for _ in range(2)], axis=1)
-    batch = batch_of([ITM, heavy], states, np.zeros((12, 2)))
-    for action in actions:
-        batch.step(action)
-    for row, vehicle in enumerate((ITM, heavy)):
-        alone = fly(vehicle, states[:, [row]], actions[:, [row]], np.zeros((12, 1)))[-1, :, 0]
-        np.testing.assert_array_equal(alone, batch.state[:, row])
-
-
 @pytest.mark.parametrize("delay", [0, 1, 3])
 def test_a_command_acts_after_the_delay(delay):
     vehicle = ITM.model_copy(update={"delay": delay})
@@ -306,10 +292,3 @@ def test_a_command_acts_after_the_delay(delay):
     speeds = fly(vehicle, state, actions, np.zeros((12, 1)))[:, ROTOR_SPEEDS, 0]
     moved = np.abs(speeds - vehicle.hover_rotor_speed).max(axis=1) > 1e-6
     assert moved.tolist() == [step >= 1 + delay for step in range(6)]
-
-
-def test_hover_stays_where_it_is():
-    state = np.zeros((STATE_SIZE, 1))
-    state[3], state[2], state[ROTOR_SPEEDS] = 1.0, 15.0, ITM.hover_rotor_speed
-    flown = fly(ITM, state, np.zeros((1500, 1, 4), dtype=np.float32), np.zeros((12, 1)))
-    assert np.abs(flown[-1] - state).max() < 1e-9

@@ -110,49 +110,6 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job, require)
     assert not (tmp_path / "logs" / "ppo_bc").exists()
 
 
-@pytest.mark.parametrize(
-    ("changes", "key"),
-    [
-        ({"algoo": "dagger"}, "algo"),
-        ({"algo": "daggr"}, "dagger"),
-        ({"settings": {"n_stepz": 3}}, "n_steps"),
-        ({"require": {"success": 1}}, "success_rate"),
-        ({"correct_offset": 1.0, "conf_file": "robust/dagger.yml"}, "correct_offset"),
-        ({"correct_offset": "position"}, "correct_offset"),
-        ({"correct_offset": 0}, "correct_offset"),
-        (
-            {"env": "Pendulum-v1", "conf_file": "pendulum.yml", "correct_offset": 1},
-            "correct_offset",
-        ),
-        ({"name": "two"}, "name"),
-    ],
-)
-def test_a_bad_stage_is_one_line_that_names_the_key(tmp_path, monkeypatch, changes, key, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "pendulum.yml").write_text("Pendulum-v1: {n_timesteps: 10}")
-    write(tmp_path, {**ONE, **changes}, TWO)
-    assert main(["train", "--conf-file", "stages.yml"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert key in line
-    assert not (tmp_path / "logs").exists()
-
-
-@pytest.mark.parametrize(
-    ("flags", "key"),
-    [
-        (["-n", "100"], "n_timesteps"),
-        (["--conf-file", "two_stage.yml", "--algo", "dagger"], "algo"),
-        (["--algo", "dagger", "--hyperparams", "n_timesteps:100", "-n", "200"], "n_timesteps"),
-        (["--thesis", "--conf-file", "two_stage.yml"], "--thesis"),
-        (["--env-kwargs", "noise:0", "--env-kwargs", "noise:1"], "noise"),
-    ],
-)
-def test_flags_that_would_be_ignored_are_refused(flags, key, capsys):
-    assert main(["train", *flags]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert key in line
-
-
 def test_an_interrupted_pipeline_resumes_from_anywhere_to_the_same_agents(
     tmp_path, capsys, monkeypatch
 ):

@@ -27,10 +27,8 @@ from sb3_quad.algorithms.losses import CloningLoss
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.simulation.settings import KEY
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
-from sb3_quad.training.config import load_config
 
 STOCK = {
     name: parameter.default
@@ -109,13 +107,6 @@ def test_with_a_vanishing_addition_it_is_ppo_to_rounding(settings):
     assert ours._n_updates == stock._n_updates
 
 
-def test_labelling_alone_changes_nothing():
-    """An expert whose weight is zero is not asked, and takes no random numbers from training."""
-    stock = PPO("MlpPolicy", "UnitPendulum-v0", **SIZES).learn(256)
-    ours = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=0.0, **SMALL).learn(256)
-    assert th.equal(parameters(stock), parameters(ours))
-
-
 def error(**settings):
     """Mean squared difference of actions from the expert's, after a short training."""
     changes = {**SMALL, "learning_rate": 3e-3, **settings}
@@ -135,24 +126,6 @@ def error_without_cloning():
 @pytest.mark.parametrize("bc_loss", get_args(CloningLoss))
 def test_cloning_pulls_towards_the_expert(bc_loss, error_without_cloning):
     assert error(expert=swing_back, bc_coef=5.0, bc_loss=bc_loss) < 0.5 * error_without_cloning
-
-
-def test_labels_belong_to_the_state_before_the_step():
-    model = PPOBC("MlpPolicy", "UnitPendulum-v0", expert=swing_back, bc_coef=1.0, **SMALL)
-    seen = []
-    original = model.rollout_buffer.add
-
-    def add(obs, *args, **kwargs):
-        seen.append(
-            (obs.copy(), model.rollout_buffer.expert_actions[model.rollout_buffer.pos].copy())
-        )
-        return original(obs, *args, **kwargs)
-
-    model.rollout_buffer.add = add
-    model.learn(64)
-    assert len(seen) == 64
-    for observation, label in seen:
-        np.testing.assert_allclose(label, np.clip(swing_back(observation), -1, 1), rtol=1e-6)
 
 
 class Swing:
@@ -477,34 +450,6 @@ def test_learn_takes_sb3s_arguments_by_position(algorithm, given, tmp_path):
         assert ours[name].kind == parameter.kind
         expected = algorithm.__name__ if name == "tb_log_name" else parameter.default
         assert ours[name].default == expected
-
-
-def test_settings_of_the_thesis_take_no_recommended_default():
-    """Each argument of the tables' files whose default is recommended instead of printed."""
-    printed = {"bc_loss": "nll", "gamma": 0.998, "gae_lambda": 0.95, "n_steps": 1500}
-    stage_two = {"bc_filter": "none", "critic_warmup": 0, "n_epochs": 6, "batch_size": 120_000}
-    stage_two |= {"learning_rate": 7.5e-4, **printed}
-    tables = {
-        "thesis/dagger.yml": {
-            "learning_rate": 5e-5,
-            "batch_size": 45_000,
-            "n_epochs": 12,
-            "gradient_steps": None,
-            "dataset_capacity": 0,
-            **printed,
-        },
-        "thesis/ppo_bc.yml": {"bc_coef": 0.005, **stage_two},
-        "thesis/reference.yml": {"bc_coef": 0.0, **stage_two},
-    }
-    for file, values in tables.items():
-        algo = "dagger" if "dagger" in file else "ppo_bc"
-        for env in ENVIRONMENTS:
-            config = load_config(algo, env, file)
-            assert {name: config.hyperparams[name] for name in values} == values
-            if file == "thesis/ppo_bc.yml":  # the deviation of stage one
-                assert "log_std_init" not in config.policy_kwargs
-            if file == "thesis/reference.yml":  # SB3's
-                assert config.policy_kwargs["log_std_init"] == 0.0
 
 
 @pytest.mark.parametrize("kind", ["model", "zip", "name"])

@@ -24,7 +24,7 @@ from sb3_quad.evaluation.flights import fly
 
 FAST = ("itm-recovery", "any-quadcopter")
 MARKED = [
-    pytest.param(name, marks=[] if name in FAST else pytest.mark.slow)
+    pytest.param(name, marks=[] if name in FAST else [pytest.mark.slow, pytest.mark.campaign])
     for name in pretrained_names()
 ]
 # What the pickles of a zip may name, so that all versions of SB3 since 2.4 load it.
@@ -96,7 +96,9 @@ def test_names_stand_where_zips_do(capsys):
     assert not any_quadcopter.notice("crazyflie")
 
 
-def test_publish_copies_the_policy_and_writes_where_it_comes_from(dagger_run, tmp_path, capsys):
+def test_publish_copies_the_policy_and_writes_where_it_comes_from(
+    dagger_run, tmp_path, short_cards, capsys
+):
     source = dagger_run / "QuadStateRecovery-v0.zip"
     (dagger_run / "QuadStateRecovery-v0" / "command.txt").write_text("typed\n```\nso\n")
     command = [str(source), "--name", "mine", "-o", str(tmp_path), "--episodes", "4"]
@@ -121,7 +123,7 @@ def test_the_robust_one_ends_at_its_target_under_disturbances():
     worlds = {"mass": [0.8, 1.2], "motor_gain": [0.7, 1.5], "force": {"magnitude": [0, 3]}}
     for randomize, largest in (({"force": force}, 0.04), (worlds, 0.1)):
         agent = sb3_quad.load_pretrained("itm-robust")
-        flights = fly(agent, "target_tracking", 240, 32_000_000, **{**own, "randomize": randomize})
+        flights = fly(agent, "target_tracking", 60, 32_000_000, **{**own, "randomize": randomize})
         assert (
             flights.survival.mean() > 0.98
             and np.quantile(flights.final_error[flights.survival], 0.95) < largest

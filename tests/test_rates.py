@@ -13,7 +13,7 @@ from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.simulation.state import BODY_RATES, QUATERNION, ROTOR_SPEEDS, P
+from sb3_quad.envs.simulation.state import BODY_RATES, ROTOR_SPEEDS, P
 from sb3_quad.envs.vehicles.rates import RATE_PARAMETERS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.compare import compare
@@ -43,22 +43,8 @@ def slow_actions(steps, n, seed):
     return held.repeat(10, axis=0)[:steps].astype(np.float32)
 
 
-@pytest.mark.parametrize("vehicle", ["itm", "cf21B_500"])
-def test_a_row_of_the_batch_flies_as_on_pybullet(vehicle):
-    keywords = {"vehicle": vehicle, "randomize": {**LOOPS, "delay": [0, 2], "drag": 0.3}}
-    batch = new_batch(1, noise=0.05, **keywords)
-    env = QuadcopterEnv("state_recovery", action="rates", **keywords)
-    for seed in (1, 2):
-        batch.seed([seed])
-        seen = batch.reset()[0], env.reset(seed=seed)[0]
-        for action in slow_actions(60, 1, seed):
-            np.testing.assert_allclose(*seen, rtol=1e-5, atol=1e-6)
-            seen = batch.step(action)[0][0], env.step(action[0])[0]
-            # A quaternion and its negative are the same attitude.
-            states = [np.delete(each.state, QUATERNION, 0) for each in (env.batch, batch)]
-            np.testing.assert_allclose(*states, rtol=1e-9, atol=1e-9)
-            rates = env.batch.filtered_rates
-            np.testing.assert_allclose(rates, batch.filtered_rates, atol=1e-9)
+def test_a_start_that_is_given_begins_the_filter():
+    env = QuadcopterEnv("state_recovery", action="rates")
     env.reset(options={"state": {"body_rates": [1.0, -2.0, 3.0]}})
     np.testing.assert_array_equal(env.batch.filtered_rates[:, 0], [1.0, -2.0, 3.0])
 

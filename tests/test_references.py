@@ -11,7 +11,6 @@ import pytest
 
 from sb3_quad.agents.agent_settings import settings_of_record
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.envs.simulation.motions import read_points
 from sb3_quad.envs.simulation.references import Reference
@@ -172,39 +171,6 @@ def test_what_does_not_loop_rests_at_its_end(fields, csv):
 # Environments
 
 
-@pytest.mark.parametrize(
-    "reference",
-    [
-        {"curve": "helix", "heading": 1, "heading_rate": 2},
-        {"curve": "random_smooth", "heading": "random", "heading_rate": 2},
-        "csv",
-    ],
-    ids=str,
-)
-def test_moving_targets_are_the_same_in_pybullet(reference, request):
-    from sb3_quad.envs import QuadcopterEnv
-
-    if reference == "csv":
-        reference = request.getfixturevalue("csv")
-    how = {"task": "state_recovery", "reference": reference, "preview": [0, 5]}
-    many = QuadcopterVecEnv(3, seed=0, **how)
-    single = QuadcopterEnv(**how)
-    expert = GeometricExpert()
-    one = single.reset(seed=row_seeds(0, 3)[1])[0]
-    several = many.reset()
-    for _ in range(60):
-        np.testing.assert_allclose(one, several[1], rtol=1e-6, atol=1e-6)  # float32
-        state = many.true_state().array[:, 1].copy()
-        other = single.true_state().array[:, 0]
-        # q and -q are one attitude.
-        state[QUATERNION] *= np.sign(state[QUATERNION] @ other[QUATERNION])
-        np.testing.assert_allclose(other, state, rtol=1e-9, atol=1e-9)
-        one, reward, *_ = single.step(expert.actions(single.true_state())[0])
-        several, rewards, *_ = many.step(expert.actions(many.true_state()))
-        assert reward == pytest.approx(rewards[1], abs=1e-7)
-    single.close()
-
-
 def test_rows_have_references_of_their_own():
     env = QuadcopterVecEnv(4, seed=0, reference="circle")
     env.reset()
@@ -246,17 +212,6 @@ def test_a_scenario_moves_its_own_target():
     moved = (5.0, 0.0, 15.0) + table[:301:2, :3]
     np.testing.assert_allclose(arrays["target"][0], moved, atol=1e-5)
     assert (flights.rms_error > 0).all() and (flights.target == (5, 0, 15)).all()
-
-
-def test_both_backends_measure_the_same():
-    flown = scenario(
-        "task_kwargs: {target_distance: 0}, n_episodes: 2, duration: 3,"
-        "reference: {curve: lissajous, heading: path}"
-    )
-    batch = fly_scenario(GeometricExpert(), flown)
-    pybullet = fly_scenario(GeometricExpert(), flown, "pybullet")
-    for name in FOLLOWED:
-        np.testing.assert_allclose(getattr(batch, name), getattr(pybullet, name), atol=1e-7)
 
 
 def test_files_of_a_reference_lie_beside_the_suite(csv, tmp_path):

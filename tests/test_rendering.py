@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from sb3_quad.base.errors import ConfigError
@@ -16,29 +15,28 @@ from sb3_quad.envs.rendering.window import Client
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 HOVER = np.zeros(4, dtype=np.float32)
-Picture = npt.NDArray[np.uint8]
 
 
 @pytest.fixture
-def env() -> Any:
+def env():
     made = QuadcopterEnv(render_mode="rgb_array", noise=0.0, render_width=160, render_height=120)
     yield made
     made.close()
 
 
-def _greenest(picture: Picture) -> npt.NDArray[np.bool_]:
+def _greenest(picture):
     """Where the target marker's green is."""
     red, green, blue = picture.astype(int).transpose(2, 0, 1)
     return np.asarray((green > 70) & (green - red > 50) & (green - blue > 35))
 
 
-def _orange(picture: Picture) -> npt.NDArray[np.bool_]:
+def _orange(picture):
     """Where the vehicle's front is."""
     red, green, blue = picture.astype(int).transpose(2, 0, 1)
     return np.asarray((red - green > 60) & (red - blue > 80))
 
 
-def test_picture_of_the_asked_size() -> None:
+def test_picture_of_the_asked_size():
     size = 161, 97
     env = gymnasium.make(
         "QuadTargetTracking-v0",
@@ -57,9 +55,7 @@ def test_picture_of_the_asked_size() -> None:
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (-0.6, 0.6, 0.5), (0, 0, 1), (0, 0, -1)])
-def test_vehicle_and_target_are_in_the_picture(
-    env: QuadcopterEnv, direction: tuple[float, float, float]
-) -> None:
+def test_vehicle_and_target_are_in_the_picture(env, direction):
     env.reset(seed=0, options={"target": np.array([0, 0, 15.0]) + 8.0 * np.array(direction)})
     picture = env.render()
     assert picture is not None
@@ -67,7 +63,7 @@ def test_vehicle_and_target_are_in_the_picture(
     assert _greenest(picture).sum() > 1
 
 
-def test_pictures_do_not_touch_the_flight(env: QuadcopterEnv) -> None:
+def test_pictures_do_not_touch_the_flight(env):
     plain = QuadcopterEnv(noise=0.0)
     actions = np.random.default_rng(0).uniform(-1, 1, (30, 4)).astype(np.float32)
     for each in (env, plain):
@@ -84,9 +80,7 @@ def test_pictures_do_not_touch_the_flight(env: QuadcopterEnv) -> None:
     plain.close()
 
 
-def test_human_mode_without_a_display_still_flies(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_human_mode_without_a_display_still_flies(monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     env = QuadcopterEnv(render_mode="human")
@@ -96,7 +90,7 @@ def test_human_mode_without_a_display_still_flies(
     env.close()
 
 
-def test_render_without_a_mode_warns() -> None:
+def test_render_without_a_mode_warns():
     env = QuadcopterEnv()
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
@@ -105,12 +99,12 @@ def test_render_without_a_mode_warns() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 5000, 64.0, True])
-def test_bad_size_is_refused(size: Any) -> None:
+def test_bad_size_is_refused(size):
     with pytest.raises(ConfigError, match=r"render_width .*to 2048"):
         QuadcopterEnv(render_mode="rgb_array", render_width=size)
 
 
-def test_the_body_has_the_numbers_of_the_vehicle() -> None:
+def test_the_body_has_the_numbers_of_the_vehicle():
     vehicle = load_vehicle("itm")
     body = BulletBody(vehicle, Client())
     mass, _, inertia, *at = body.client.getDynamicsInfo(body.body, -1)[:5]
@@ -120,5 +114,5 @@ def test_the_body_has_the_numbers_of_the_vehicle() -> None:
     body.close()
 
 
-def test_any_name_of_a_vehicle_will_do() -> None:
+def test_any_name_of_a_vehicle_will_do():
     QuadcopterEnv(vehicle=load_vehicle("itm").model_copy(update={"name": '"& ü'})).close()

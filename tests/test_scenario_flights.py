@@ -14,11 +14,10 @@ from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.offset_correction import hover_offset
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
-from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.experts.pid import PIDExpert
 
 
-def scenario(entry: str) -> Scenario:
+def scenario(entry):
     return parse_suite(f"name: mine\nscenarios:\n  - {{name: s, {entry}}}\n", "x").scenarios[0]
 
 
@@ -161,7 +160,7 @@ def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_
     assert arrays["episode_outcome"].tolist() == ["collision"] * 2
 
 
-def specified(name: str, n_episodes: int = 1):
+def specified(name, n_episodes=1):
     flown = load_suite("thesis").scenario(name)
     return summarise(fly_scenario(PIDExpert(), flown.model_copy(update={"n_episodes": n_episodes})))
 

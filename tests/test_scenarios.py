@@ -17,14 +17,14 @@ from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.scenarios.load import SUITES, axis_name, load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
-from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
+from sb3_quad.evaluation.scenarios.scenario import Suite
 
 
-def suite(entry: str) -> Suite:
+def suite(entry):
     return parse_suite(f"name: mine\nscenarios:\n  - {{name: s, {entry}}}\n", "x")
 
 
-def scenario(entry: str) -> Scenario:
+def scenario(entry):
     return suite(entry).scenarios[0]
 
 

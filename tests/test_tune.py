@@ -102,27 +102,6 @@ def test_pruned_trials_end_early(command, monkeypatch):
     assert not (folder() / "best.yml").exists()
 
 
-@pytest.mark.parametrize(
-    ("key", "space", "flags"),
-    [
-        ("TPESample", SPACE, ["--sampler", "TPESample"]),
-        ("Median", SPACE, ["--pruner", "Median"]),
-        ("broken.log", SPACE, ["--storage", "broken.log"]),
-        ("learning_rat", {"learning_rat": [1]}, []),
-        ("beta", {"beta": {"low": 1.0, "high": 0.0}}, []),
-        ("low", {"beta": {"high": 1.0}}, []),
-        ("bc_loss", {"bc_loss": "mse"}, []),
-        ("space.yml", {}, []),
-    ],
-)
-def test_bad_input_is_one_line_that_names_it(command, key, space, flags, capsys):
-    write(space)
-    Path("broken.log").write_text("no journal\n")
-    assert main([*command, *flags]) == 2
-    # Optuna logs, too.
-    assert key in capsys.readouterr().err.split("error: ")[1]
-
-
 def test_without_optuna_it_names_the_extra_to_install(command, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert main(command) == 2

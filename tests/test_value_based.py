@@ -9,7 +9,6 @@ from stable_baselines3 import SAC
 
 from sb3_quad import QuadcopterVecEnv
 from sb3_quad.agents.zips import load_model, load_zip, saved_algorithm
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.training.config import TrainingJob, build_config, describe, load_config
 from sb3_quad.training.trainer import resume, train
 
@@ -70,17 +69,3 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
     assert short.rollout_steps == 1
     # Of the returns: they stay.
     assert short.keyword("n_steps") == config.keyword("n_steps")
-
-
-@pytest.mark.parametrize(
-    ("algo", "changes", "named"),
-    [
-        ("sac", {"expert": "pid"}, "expert"),
-        ("td3", {"noise_type": "pink"}, "noise_type"),
-        ("sac", {"ent_coef": "much"}, "much"),
-    ],
-)
-def test_bad_settings_are_one_line(tmp_path, algo, changes, named):
-    with pytest.raises(ConfigError, match=named) as raised:
-        train(make_job(tmp_path, algo, **changes))
-    assert "\n" not in str(raised.value)

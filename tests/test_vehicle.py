@@ -1,8 +1,5 @@
 """Vehicles: derived values, thrust and actions, and files that are wrong in every way."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import yaml
@@ -23,12 +20,10 @@ ITM = load_vehicle("itm")
 finite = st.floats(-2.0, 2.0)
 
 
-def vehicles() -> st.SearchStrategy[Vehicle]:
+def vehicles():
     """Vehicles unlike the default one: other sizes, masses, limits and rotor order."""
 
-    def build(
-        scale: float, mass: float, low: float, high: float, wide: float, long: float, mirrored: bool
-    ) -> Vehicle:
+    def build(scale, mass, low, high, wide, long, mirrored):
         sign = -1 if mirrored else 1
         return ITM.model_copy(
             update={
@@ -53,14 +48,14 @@ def vehicles() -> st.SearchStrategy[Vehicle]:
     )
 
 
-def write(path: Path, **changes: Any) -> Path:
+def write(path, **changes):
     data = yaml.safe_load(yaml.safe_dump(ITM.model_dump(mode="json")))
     data.update(changes)
     path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not ...}))
     return path
 
 
-def test_default_vehicle_is_the_specified_one() -> None:
+def test_default_vehicle_is_the_specified_one():
     assert {"itm", "crazyflie", "hummingbird"} < {*VEHICLES.names()}
     assert (ITM.mass, ITM.inertia, ITM.moment_thrust_ratio) == (
         1.727,
@@ -82,13 +77,13 @@ def test_default_vehicle_is_the_specified_one() -> None:
 
 
 @given(vehicles(), st.tuples(finite, finite, finite, finite))
-def test_mixer_inverse(vehicle: Vehicle, wrench: tuple[float, ...]) -> None:
+def test_mixer_inverse(vehicle, wrench):
     thrusts = vehicle.mixer_inverse @ np.array(wrench)
     np.testing.assert_allclose(vehicle.mixer @ thrusts, wrench, atol=1e-9)
 
 
 @given(vehicles())
-def test_hover_carries_the_weight_and_nothing_else(vehicle: Vehicle) -> None:
+def test_hover_carries_the_weight_and_nothing_else(vehicle):
     wrench = vehicle.mixer @ np.full(4, vehicle.hover_thrust)
     np.testing.assert_allclose(wrench, [vehicle.mass * vehicle.gravity, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(
@@ -99,7 +94,7 @@ def test_hover_carries_the_weight_and_nothing_else(vehicle: Vehicle) -> None:
 
 
 @given(vehicles(), st.lists(st.floats(-1, 1), min_size=1, max_size=8))
-def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -> None:
+def test_thrust_and_action_are_inverse(vehicle, actions):
     action = np.array(actions)
     thrust = vehicle.action_to_thrust(action)
     low, high = vehicle.thrust_range
@@ -111,7 +106,7 @@ def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -
     )
 
 
-def test_frozen_and_copies_are_validated() -> None:
+def test_frozen_and_copies_are_validated():
     with pytest.raises(ValidationError):
         ITM.mass = 2.0  # type: ignore[misc]
     heavier = ITM.model_copy(update={"mass": 2.0})
@@ -121,7 +116,7 @@ def test_frozen_and_copies_are_validated() -> None:
         ITM.model_copy(update={"mass": -2.0})
 
 
-def test_gains_stay_with_the_vehicle_they_were_found_for() -> None:
+def test_gains_stay_with_the_vehicle_they_were_found_for():
     assert ITM.geometric_gains is not None and ITM.geometric_gains.measured is not None
     assert ITM.model_copy(update={"name": "other"}).geometric_gains == ITM.geometric_gains
     assert ITM.model_copy(update={"mass": 2.0}).geometric_gains is None
@@ -129,14 +124,14 @@ def test_gains_stay_with_the_vehicle_they_were_found_for() -> None:
     assert ITM.model_copy(update=given).geometric_gains == ITM.geometric_gains
 
 
-def test_file_round_trip(tmp_path: Path) -> None:
+def test_file_round_trip(tmp_path):
     assert load_vehicle(write(tmp_path / "same.yaml")) == ITM
     assert load_vehicle(str(write(tmp_path / "other.yml", mass=2.5))).mass == 2.5
     assert load_vehicle(ITM) is ITM
 
 
 @pytest.mark.parametrize("name", VEHICLES.names())
-def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
+def test_shipped_vehicles_hold_what_was_measured_with_them(name):
     vehicle = load_vehicle(name)
     assert vehicle.name == name
     assert vehicle.geometric_gains is None or vehicle.geometric_gains.measured is not None
@@ -144,7 +139,7 @@ def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
 
 
 @given(vehicles())
-def test_limits_in_newtons_and_rotor_speeds_are_the_same_limits(vehicle: Vehicle) -> None:
+def test_limits_in_newtons_and_rotor_speeds_are_the_same_limits(vehicle):
     data = vehicle.model_dump(exclude={"thrust_limits"})
     for key, limits in (
         ("rotor_thrust_limits", vehicle.thrust_range),
@@ -161,9 +156,7 @@ def test_limits_in_newtons_and_rotor_speeds_are_the_same_limits(vehicle: Vehicle
     "limits",
     [{"thrust_limits": [0.1, 0.9]}, {"rotor_thrust_limits": [0.1, 4.0], "thrust_limits": ...}],
 )
-def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(
-    tmp_path: Path, limits: dict[str, Any]
-) -> None:
+def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path, limits):
     with pytest.raises(CannotHover, match="hover"):
         load_vehicle(write(tmp_path / "weak.yaml", **limits))
     with pytest.raises(ConfigError) as caught:
@@ -171,7 +164,7 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(
     assert not isinstance(caught.value, CannotHover)
 
 
-def shifted(vehicle: Vehicle, x: float, y: float = 0.0) -> Vehicle:
+def shifted(vehicle, x, y=0.0):
     """The vehicle with its centre of mass moved, by shares of its arm's length."""
     place = np.array([x, y]) * vehicle.arm_length
     return vehicle.model_copy(
@@ -180,9 +173,7 @@ def shifted(vehicle: Vehicle, x: float, y: float = 0.0) -> Vehicle:
 
 
 @given(vehicles(), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
-def test_hover_about_another_centre_of_mass_takes_four_thrusts(
-    vehicle: Vehicle, x: float, y: float
-) -> None:
+def test_hover_about_another_centre_of_mass_takes_four_thrusts(vehicle, x, y):
     changes = {"thrust_limits": (0.0, 5.0), "thrust_factors": (0.9, 1.1, 1.0, 0.95)}
     moved = shifted(vehicle.model_copy(update=changes), x, y)
     weight = moved.mass * moved.gravity
@@ -193,13 +184,13 @@ def test_hover_about_another_centre_of_mass_takes_four_thrusts(
     assert [values[f"hover_share_{k}"] for k in range(4)] == moved.hover_shares.tolist()
 
 
-def test_a_centre_of_mass_about_which_it_cannot_hover_is_refused() -> None:
+def test_a_centre_of_mass_about_which_it_cannot_hover_is_refused():
     assert shifted(ITM, -0.34).hover_shares.max() < 1.5
     with pytest.raises(ValidationError, match="rotor_positions"):
         shifted(ITM, -0.36)
 
 
-def test_episodes_begin_in_hover_about_any_centre_of_mass() -> None:
+def test_episodes_begin_in_hover_about_any_centre_of_mass():
     unequal = ITM.model_copy(update={"thrust_factors": (0.95, 1.05, 1.0, 0.9)})
     vehicle = shifted(unequal, -0.1, 0.05)
     batch = QuadcopterBatch(3, FlightSettings(vehicle=vehicle, noise=0.0), seed=0)
@@ -213,7 +204,7 @@ def test_episodes_begin_in_hover_about_any_centre_of_mass() -> None:
     assert np.abs(batch.state[:17] - start).max() < 1e-3
 
 
-def test_an_unknown_coefficient_changes_rotor_speeds_alone(tmp_path: Path) -> None:
+def test_an_unknown_coefficient_changes_rotor_speeds_alone(tmp_path):
     path = write(tmp_path / "v.yaml", thrust_coefficient=..., geometric_gains=None)
     unknown = load_vehicle(path)
     assert unknown.hover_rotor_speed == 1000.0 and unknown.thrust_coefficient == 0.0
@@ -222,7 +213,7 @@ def test_an_unknown_coefficient_changes_rotor_speeds_alone(tmp_path: Path) -> No
     np.testing.assert_allclose(flown[0].final_error, flown[1].final_error, atol=1e-9)
 
 
-def rotors(vehicle: Vehicle, turn: float = 0.0) -> set[tuple[complex, int]]:
+def rotors(vehicle, turn=0.0):
     """Where the rotors are after a turn of the body, rad, and which way they turn."""
     places = np.array(vehicle.rotor_positions) @ (1.0, 1.0j) * np.exp(1j * turn)
     return {
@@ -232,7 +223,7 @@ def rotors(vehicle: Vehicle, turn: float = 0.0) -> set[tuple[complex, int]]:
 
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird"])
-def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(name: str) -> None:
+def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(name):
     own = load_vehicle(name)
     turned = own.in_layout_of(ITM)
     assert np.sign(turned.rotor_positions).tolist() == np.sign(ITM.rotor_positions).tolist()
@@ -245,7 +236,7 @@ def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(na
     )
 
 
-def test_what_the_air_does_turns_with_the_layout() -> None:
+def test_what_the_air_does_turns_with_the_layout():
     changes = {
         "rotor_drag": (1e-4, 2e-4, 3e-4),
         "airspeed_moment": (1e-5, -2e-5),
@@ -265,7 +256,7 @@ def test_what_the_air_does_turns_with_the_layout() -> None:
         plus.in_layout_of(ITM)
 
 
-def test_a_layout_that_cannot_be_had_is_refused() -> None:
+def test_a_layout_that_cannot_be_had_is_refused():
     plus = load_vehicle("hummingbird").model_copy(update={"inertia": (2e-3, 4e-3, 5e-3)})
     with pytest.raises(ConfigError, match="inertia"):
         plus.in_layout_of(ITM)
@@ -276,7 +267,7 @@ def test_a_layout_that_cannot_be_had_is_refused() -> None:
         long.in_layout_of(ITM)
 
 
-def test_the_least_time_is_of_this_vehicle_alone() -> None:
+def test_the_least_time_is_of_this_vehicle_alone():
     other = ITM.model_copy(update={"name": "mine", "geometric_gains": None})
     assert ITM.time_optimal and other.time_optimal == ITM.time_optimal
     assert ITM.model_copy(update={"mass": 2.0}).time_optimal is None

@@ -1,6 +1,7 @@
 """Saved and shipped zips fly in stock Stable-Baselines3, where sb3_quad is not installed."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,8 +39,6 @@ RUN = (
     "import runpy, sys; sys.modules['sb3_quad'] = None; "
     "runpy.run_path(sys.argv.pop(1), run_name='__main__')"
 )
-# Agents that do not end at their target, and the greatest distance that is allowed, m.
-NEXT_TO_TARGET = {"thesis-ppo": 1.5, "thesis-printed-recovery": 1.0, "thesis-printed-ppo": 9.0}
 SMALL = {
     "n_steps": 32,
     "batch_size": 128,
@@ -89,15 +88,12 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_example_flies_every_zip_where_sb3_quad_cannot_be_imported(tmp_path):
-    names = [name for name in pretrained_names() if not name.endswith("-rates")]
-    zips = [sb3_quad.pretrained_path(name) for name in names]
+def test_the_example_flies_zips_where_sb3_quad_cannot_be_imported(tmp_path):
+    zips = [sb3_quad.pretrained_path(name) for name in ("itm-recovery", "any-quadcopter")]
     result = run(RUN, EXAMPLE, *zips)
     assert result.returncode == 0, result.stderr
-    lines = [line for line in result.stdout.splitlines() if " m from" in line]
-    for name, line in zip(names, lines, strict=True):
-        distance = float(line.rpartition(": ")[2].split(" m from")[0])
-        assert distance < NEXT_TO_TARGET.get(name, 0.1), name
+    distances = re.findall(r": ([\d.]+) m from", result.stdout)
+    assert len(distances) == 2 and max(map(float, distances)) < 0.1
     silent = tmp_path / "silent.zip"
     PPO("MlpPolicy", QuadcopterVecEnv(4), seed=0, device="cpu").save(silent)
     result = run(RUN, EXAMPLE, silent)

@@ -63,23 +63,10 @@ def test_the_flags_that_the_page_calls_the_same_are_there(command):
 def run(*arguments, cwd, **environment):
     """Output of a command of this interpreter that must succeed."""
     path = os.pathsep.join(map(str, (ROOT, ROOT / "examples" / "zoo_bridge")))
-    given = {
-        **os.environ,
-        "PYTHONPATH": path,
-        "OMP_NUM_THREADS": "1",
-        "MPLBACKEND": "Agg",
-        **environment,
-    }
+    given = {**os.environ, "PYTHONPATH": path, **environment}
     command = [sys.executable, *map(str, arguments)]
-    result = subprocess.run(
-        command,
-        cwd=cwd,
-        env=given,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    how = {"cwd": cwd, "env": given, "stdin": subprocess.DEVNULL, "capture_output": True}
+    result = subprocess.run(command, **how, text=True, check=False)
     assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
     return result.stdout
 
@@ -105,67 +92,20 @@ def session(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("zoo")
     (folder / "small.yml").write_text(yaml.safe_dump({ENV: SETTINGS}))
-    ours = [
-        "train",
-        "--algo",
-        "ppo_bc",
-        "--env",
-        ENV,
-        "-conf",
-        folder / "small.yml",
-        "-f",
-        folder / "ours",
+    ours = f"train --algo ppo_bc --env {ENV} -conf {folder}/small.yml -f {folder}/ours"
+    assert main([*ours.split(), "--eval-episodes", "2", "--env-kwargs", "noise:0"]) == 0
+    common = f"--env {ENV} -conf small.yml -f logs --device cpu --seed 1 --verbose 1"
+    often = "--eval-freq 400 --eval-episodes 2 --save-freq 400"
+    from_dagger = f"--eval-freq -1 -i logs/dagger/{ENV}_1/{ENV}.zip"
+    shown = f"--env {ENV} --no-render -n 40"
+    lines = [
+        f"train --algo dagger {common} {often} -params dataset_capacity:1000",
+        f"train --algo ppo_bc {common} {from_dagger} -params vec_env:'dummy' n_envs:2",
+        f"enjoy --algo dagger {shown} -f logs --load-best",
+        f"enjoy --algo ppo_bc {shown} -f ours",
     ]
-    assert (
-        main([str(part) for part in [*ours, "--eval-episodes", "2", "--env-kwargs", "noise:0"]])
-        == 0
-    )
-    common = [
-        "--env",
-        ENV,
-        "-conf",
-        "small.yml",
-        "-f",
-        "logs",
-        "--device",
-        "cpu",
-        "--seed",
-        "1",
-        "--verbose",
-        "1",
-    ]
-    evaluation = ["--eval-freq", "400", "--eval-episodes", "2"]
-    dagger = [
-        "train",
-        "--algo",
-        "dagger",
-        *common,
-        *evaluation,
-        "--save-freq",
-        "400",
-        "-params",
-        "dataset_capacity:1000",
-    ]
-    agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
-    ppo_bc = ["train", "--algo", "ppo_bc", *common]
-    commands = [
-        [*dagger, "--env-kwargs", "noise:0.1"],
-        [*ppo_bc, "--eval-freq", "-1", "-i", agent, "-params", "vec_env:'dummy'", "n_envs:2"],
-        [
-            "enjoy",
-            "--algo",
-            "dagger",
-            "--env",
-            ENV,
-            "-f",
-            "logs",
-            "--no-render",
-            "-n",
-            "40",
-            "--load-best",
-        ],
-        ["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", "ours", "--no-render", "-n", "40"],
-    ]
+    commands = [line.split() for line in lines]
+    commands[0] += ["--env-kwargs", "noise:0.1"]
     (folder / "commands.json").write_text(json.dumps(commands))
     parts = run("-c", SESSION, cwd=folder).split("COMMAND")[1:]
     assert len(parts) == len(commands)
@@ -231,22 +171,8 @@ def test_it_shows_its_runs_and_ours(session, which):
 @with_zoo
 def test_ours_shows_its_runs(session, capsys):
     folder, _ = session
-    assert (
-        main(
-            [
-                "enjoy",
-                "--algo",
-                "dagger",
-                "--env",
-                ENV,
-                "-f",
-                str(folder / "logs"),
-                "--no-render",
-                "--load-best",
-            ]
-        )
-        == 0
-    )
+    shown = f"enjoy --algo dagger --env {ENV} -f {folder}/logs --no-render --load-best"
+    assert main(shown.split()) == 0
     assert "after 0.20 s" in capsys.readouterr().out
 
 

@@ -57,11 +57,8 @@ NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline)_\d+"
 SUITE = """
 name: one
 scenarios:
-  - {name: near, target: {distance: 1}, duration: 2, episodes: 400}
-  - name: thrown
-    start: {attitude: {distribution: uniform}, velocity: {std: 2}}
-    duration: 2
-    episodes: 400
+  - {name: near, task_kwargs: {target_distance: 1}, duration: 2, n_episodes: 400}
+  - {name: thrown, task: state_recovery, duration: 2, n_episodes: 400}
 """
 STAGES = [
     {
@@ -84,7 +81,7 @@ STAGES = [
 ]
 
 
-def command(kind: str, folder: Path) -> list[str]:
+def command(kind, folder):
     """Arguments of a command of a few seconds, into ``folder``."""
     logs, settings = folder / "logs", folder / f"{kind}.yml"
     folder.mkdir(exist_ok=True)
@@ -100,7 +97,7 @@ def command(kind: str, folder: Path) -> list[str]:
     return ["train", *single, *more, *often.split()]
 
 
-def forked(arguments: list[str], log: Path, folder: str | Path = ".", seconds: int = 0) -> int:
+def forked(arguments, log, folder=".", seconds=0):
     """The process of a command that begins in ``folder``, reads nothing, and is ended after so many
     seconds, if any.
     """
@@ -122,7 +119,7 @@ def forked(arguments: list[str], log: Path, folder: str | Path = ".", seconds: i
         os._exit(code)
 
 
-def run(arguments: list[str], log: Path, kill_after: float | None = None) -> int | None:
+def run(arguments, log, kill_after=None):
     """The command's exit code; None if it was killed after so many seconds."""
     child = forked(arguments, log)
     end = np.inf if kill_after is None else time.monotonic() + kill_after
@@ -137,7 +134,7 @@ def run(arguments: list[str], log: Path, kill_after: float | None = None) -> int
         time.sleep(0.002)
 
 
-def again(kind: str, folder: Path) -> list[str]:
+def again(kind, folder):
     """What a user types after a kill: ``--resume``, or the same command if there is nothing to go
     on with yet.
     """
@@ -151,7 +148,7 @@ def again(kind: str, folder: Path) -> list[str]:
     return ["train", "--resume", str(place)]
 
 
-def never_began(path: Path) -> bool:
+def never_began(path):
     """Whether a file is in a folder of a command that was killed before it had written its
     settings, or in that of a run before its pipeline had noted it; it is nobody's.
     """
@@ -163,7 +160,7 @@ def never_began(path: Path) -> bool:
     return False
 
 
-def content(path: Path) -> object:
+def content(path):
     """Weights of an agent, all arrays and numbers but seconds and dates; None of other files."""
     if path.suffix == ".zip":
         weights = load_from_zip_file(path, device="cpu")[1]["policy"]
@@ -179,7 +176,7 @@ def content(path: Path) -> object:
     return None
 
 
-def outcome(folder: Path) -> dict[str, object]:
+def outcome(folder):
     """What a command has left, by file."""
     found: dict[str, object] = {}
     for path in sorted(folder.glob("logs/*/*/**/*")):
@@ -189,7 +186,7 @@ def outcome(folder: Path) -> dict[str, object]:
     return found
 
 
-def prepare() -> None:
+def prepare():
     """Make commands short: small closing tables, frequent snapshots, no offset correction.
 
     Agents that have hardly learnt crash on the way.
@@ -208,7 +205,7 @@ class Undisturbed(NamedTuple):
     outcome: dict[str, object]
 
 
-def undisturbed(kind: str, folder: Path) -> Undisturbed:
+def undisturbed(kind, folder):
     place = folder / f"whole_{kind}"
     log = folder / f"whole_{kind}.txt"
     start = time.monotonic()
@@ -216,7 +213,7 @@ def undisturbed(kind: str, folder: Path) -> Undisturbed:
     return Undisturbed(time.monotonic() - start, outcome(place))
 
 
-def campaign(folder: Path, kills: int, seed: int) -> int:
+def campaign(folder, kills, seed):
     """How many kills cost something."""
     prepare()
     rng = random.Random(seed)

@@ -23,22 +23,14 @@ def hover(vehicle):
     return lambda observation: np.zeros((len(observation), 4))
 
 
+def evaluation(controller):
+    return f"evaluate {controller} --suite suite.yaml -o out --no-report".split()
+
+
 def meanwhile(vehicle):
     """Another evaluation into the same folder, while this one is under way."""
     if not codes:
-        codes.append(
-            main(
-                [
-                    "evaluate",
-                    "other=test_folders:hover",
-                    "--suite",
-                    "suite.yaml",
-                    "-o",
-                    "out",
-                    "--no-report",
-                ]
-            )
-        )
+        codes.append(main(evaluation("other=test_folders:hover")))
     return hover(vehicle)
 
 
@@ -48,16 +40,7 @@ def test_of_two_evaluations_into_a_folder_at_once_neither_loses_its_results(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "suite.yaml").write_text(SUITE)
     codes.clear()
-    command = [
-        "evaluate",
-        "first=test_folders:meanwhile",
-        "--suite",
-        "suite.yaml",
-        "-o",
-        "out",
-        "--no-report",
-    ]
-    codes.append(main(command))
+    codes.append(main(evaluation("first=test_folders:meanwhile")))
     there = {entry.controller for entry in load_results("out").entries}
     assert there == {
         name for name, code in zip(("other", "first"), codes, strict=True) if code == 0
@@ -74,9 +57,10 @@ def disk_full(*arguments, **settings):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "code"), [(interrupted, 130), (disk_full, 2)])
-def test_publish_replaces_both_the_zip_and_its_card_or_neither(tmp_path, monkeypatch, fault, code):
+def test_publish_replaces_both_the_zip_and_its_card_or_neither(
+    tmp_path, monkeypatch, short_cards, fault, code
+):
     command = ["--name", "mine", "-o", str(tmp_path), "--episodes", "1"]
     assert publish.main(["itm-imitation", *command]) == 0
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}

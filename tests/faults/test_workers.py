@@ -37,39 +37,19 @@ class KillLastWorker(BaseCallback):
         return True
 
 
+def train(folder, settings, options):
+    """A command that trains PPO on Pendulum."""
+    file = folder / "settings.yml"
+    file.write_text(f"Pendulum-v1: {{{settings}}}")
+    command = f"train --algo ppo --env Pendulum-v1 -f {folder} --conf-file {file} --no-progress"
+    return [*command.split(), *options.split()]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(100)
 def test_a_training_whose_worker_dies_ends_saves_and_leaves_none_behind(tmp_path, capsys):
-    (tmp_path / "settings.yml").write_text(
-        "Pendulum-v1: {n_steps: 10, batch_size: 30, n_envs: 3, "
-        "callback: test_workers.KillLastWorker}"
-    )
-    command = [
-        "train",
-        "--algo",
-        "ppo",
-        "--env",
-        "Pendulum-v1",
-        "--vec-env",
-        "subproc",
-        "-n",
-        "6000",
-        "-f",
-        str(tmp_path),
-    ]
-    assert (
-        main(
-            [
-                *command,
-                "--conf-file",
-                str(tmp_path / "settings.yml"),
-                "--eval-episodes",
-                "0",
-                "--no-progress",
-            ]
-        )
-        == 2
-    )
+    settings = "n_steps: 10, batch_size: 30, n_envs: 3, callback: test_workers.KillLastWorker"
+    assert main(train(tmp_path, settings, "--vec-env subproc -n 6000 --eval-episodes 0")) == 2
     assert "worker process of the environments ended" in capsys.readouterr().err.splitlines()[-1]
     assert (tmp_path / "ppo" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
     assert len(KillLastWorker.processes) == 3 and not any(
@@ -95,36 +75,8 @@ class DropsInfo(gymnasium.Wrapper):
 
 @pytest.mark.timeout(100)
 def test_evaluations_that_would_never_end_say_why(tmp_path, capsys):
-    (tmp_path / "settings.yml").write_text(
-        "Pendulum-v1: {n_steps: 10, batch_size: 10, vec_env: dummy, "
-        "env_wrapper: test_workers.DropsInfo}"
-    )
-    command = [
-        "train",
-        "--algo",
-        "ppo",
-        "--env",
-        "Pendulum-v1",
-        "-n",
-        "20",
-        "-f",
-        str(tmp_path),
-        "--eval-freq",
-        "10",
-    ]
-    assert (
-        main(
-            [
-                *command,
-                "--conf-file",
-                str(tmp_path / "settings.yml"),
-                "--eval-episodes",
-                "1",
-                "--no-progress",
-            ]
-        )
-        == 2
-    )
+    settings = "n_steps: 10, batch_size: 10, vec_env: dummy, env_wrapper: test_workers.DropsInfo"
+    assert main(train(tmp_path, settings, "-n 20 --eval-freq 10 --eval-episodes 1")) == 2
     assert "info['episode']" in capsys.readouterr().err.splitlines()[-1]
 
 
