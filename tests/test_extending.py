@@ -106,8 +106,10 @@ def apply(diff, root):
 def extended(tmp_path_factory):
     root = tmp_path_factory.mktemp("extended")
     for name in ("sb3_quad", "envs", "callbacks", "zoo_configs"):
-        # With what is compiled already, for the modules that no diff changes
-        shutil.copytree(ROOT / name, root / name)
+        # With what is compiled already, for the modules that no diff changes, but without what
+        # another worker writes now
+        passing = shutil.ignore_patterns("*.tmp.*", "*.pyc.*")
+        shutil.copytree(ROOT / name, root / name, ignore=passing)
     shutil.copy(ROOT / "setup.cfg", root)
     for diff in DIFFS:
         apply(diff, root)

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 pytest.importorskip("ray.tune")
 
 import ray
-from ray._private import services
 from ray.cluster_utils import Cluster
 from test_sweep import NET, TINY
 
@@ -52,16 +50,6 @@ class NotesNode(BaseCallback):
 
 @pytest.fixture
 def cluster(monkeypatch):
-    ask = services.get_node
-
-    def ask_for_long(*arguments):
-        for _ in range(60):
-            with suppress(RuntimeError):
-                return ask(*arguments)
-        return ask(*arguments)
-
-    # A busy machine starts Ray slowly, and Ray itself gives up after 30 s.
-    monkeypatch.setattr(services, "get_node", ask_for_long)
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT}/tests")
     # Beside other tests, a worker with Ray's niceness of 15 would hardly run.
     monkeypatch.setenv("RAY_worker_niceness", "0")

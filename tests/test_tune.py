@@ -102,6 +102,13 @@ def test_pruned_trials_end_early(command, monkeypatch):
     assert not (folder() / "best.yml").exists()
 
 
+def test_a_log_that_is_no_journal_is_named(command, capsys):
+    Path("broken.log").write_text("no journal\n")
+    assert main([*command, "--storage", "broken.log"]) == 2
+    # Optuna logs, too.
+    assert "broken.log" in capsys.readouterr().err.split("error: ")[1]
+
+
 def test_without_optuna_it_names_the_extra_to_install(command, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert main(command) == 2
