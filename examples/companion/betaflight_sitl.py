@@ -122,6 +122,7 @@ class Sitl:
             with suppress(RuntimeError, BrokenPipeError):
                 for _ in range(1000):
                     self.advance(0.01, 0)
+                    time.sleep(0.005)
         self.process.wait(10.0)
 
     def sticks(self, values: list[int]) -> None:
