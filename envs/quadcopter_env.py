@@ -137,7 +137,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `is_success` | whether it is close enough now; at the end, whether the episode succeeded |
     | `survival` | whether it has not terminated so far; at the end, the thesis's success |
     | `distance` | distance from the target, m |
-    | `collision` | whether it touched the ground |
+    | `collision` | whether it touched the ground, other than by landing |
     | `out_of_range` | whether it is too far from the target |
 
     ## Arguments

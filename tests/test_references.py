@@ -118,6 +118,24 @@ def test_curves_loop_without_a_jump_at_the_speed_that_was_asked_for(curve, headi
         np.testing.assert_allclose(table[:, 11], rate, atol=math.radians(0.3))
 
 
+def test_take_off_rests_at_its_top_and_landing_sinks_evenly():
+    up = Reference(curve="take_off", speed=0.5).tracks(DT).table
+    assert np.linalg.norm(up[:, 3:6], axis=1).max() == pytest.approx(0.5, rel=5e-3)
+    np.testing.assert_allclose(up[-1, :6], (0.0, 0.0, 1.5, 0.0, 0.0, 0.0), atol=1e-9)
+    down = Reference(curve="landing").tracks(DT).table
+    np.testing.assert_allclose(down[:1000, 2], -0.2 * DT * np.arange(1000), atol=1e-9)
+    assert not down[:, :2].any()
+
+
+def test_an_expert_takes_off_and_lands():
+    task = {"target_distance": 0.0, "start_position": (0.0, 0.0, 0.2)}
+    up = fly("geometric", "target_tracking", 4, task_kwargs=task, reference="take_off")
+    assert up.success.all()
+    down = fly("geometric", "landing", 4, reference="landing")
+    assert down.success.all() and down.survival.all() and not down.collision.any()
+    assert (down.flown < 12.0).all()
+
+
 def test_random_motion_loops_within_its_limits():
     reference = Reference(curve="random_smooth", speed=3, acceleration=5, resting=0.25)
     tracks = reference.tracks(DT)

@@ -268,6 +268,25 @@ def test_tilt_is_exact_at_every_angle(angle):
     assert scores(rows)["reward"][0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
 
 
+def test_a_slow_level_touch_at_the_target_is_a_landing_and_any_other_a_collision():
+    rows = start(5, "landing", touchdown_speed=0.3)
+    rows.state[:] = 0.0
+    rows.state[QUATERNION.start] = 1.0
+    rows.state[2] = ITM.collision_radius - 1e-3
+    rows.state[0, :2] = 0.09, 0.11  # away from the target, which is further down
+    rows.state[TARGET.stop - 1] = -0.5
+    rows.state[VELOCITY.stop - 1] = -0.29, -0.29, -0.31, -0.29, 0.0
+    rows.state[QUATERNION.start + 1, 3] = 0.1  # tilted by 11 degrees
+    rows.state[2, 4] = 0.5  # above the ground
+    rows.state[TARGET.stop - 1, 4] = 0.5
+    rows.state[QUATERNION] /= np.linalg.norm(rows.state[QUATERNION], axis=0)
+    outcome = scores(rows)
+    assert outcome["success"].tolist() == [True, False, False, False, False]
+    assert outcome["collision"].tolist() == [False, True, True, True, False]
+    assert outcome["truncated"].tolist() == [False, False, False, False, True]
+    assert (outcome["reward"] > -1.0).tolist() == [True, False, False, False, True]
+
+
 # --- tasks as data
 
 

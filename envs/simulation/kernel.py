@@ -48,7 +48,7 @@ from sb3_quad.envs.simulation.rate_loop import (
     load_rate_loop,
 )
 from sb3_quad.envs.simulation.recordings import add_recording
-from sb3_quad.envs.simulation.reward import score, score_calm, succeeds
+from sb3_quad.envs.simulation.reward import lands, score, score_calm, succeeds
 from sb3_quad.envs.simulation.sampling import (
     add_gusts,
     advance_gusts,
@@ -86,7 +86,7 @@ OUTCOME = np.dtype(
         ("collision", "?"),
         ("out_of_range", "?"),
         ("truncated", "?"),  # neither of these: the flight survived
-        ("success", "?"),  # survived, and ended at its target
+        ("success", "?"),  # survived, and ended at its target; or landed there
     ],
     align=True,
 )
@@ -640,13 +640,18 @@ def _end_episodes(
         if autoreset and not dones[i]:
             continue
         end = outcome[i]
-        end.collision = height[lane] <= b.collision_radius[lane]
+        touches = height[lane] <= b.collision_radius[lane]
+        landed = touches and lands(b, lane)
+        spared = landed * b.collision_cost[lane]
+        rewards[i] = b.reward[lane] + spared
+        end.collision = touches and not landed
         end.out_of_range = distance[lane] > b.max_distance[lane]
-        end.truncated = not (end.collision or end.out_of_range)
-        end.success = end.truncated and succeeds(b, lane)
+        end.truncated = not (touches or end.out_of_range)
+        there = b.touchdown_speed[lane] == 0.0 and succeeds(b, lane, distance[lane])
+        end.success = landed or (end.truncated and there)
         end.distance = distance[lane]
-        end.total = returns[i]
-        end.reward = b.reward[lane]
+        end.total = returns[i] + spared
+        end.reward = b.reward[lane] + spared
         end.length = b.stream[STEP, lane]
         for k in range(observations.shape[1]):
             last_observations[i, k] = observations[i, k]

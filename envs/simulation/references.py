@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from sb3_quad.base.errors import ConfigError, raised_as
-from sb3_quad.base.types import FloatArray
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.base.validate import Frozen, Number
 from sb3_quad.envs.simulation.motions import (
     HARMONICS,
@@ -38,7 +38,12 @@ PIECES = 256
 PIECE_SECONDS = 10.0
 # Curves that need a field, and the name of that field
 NEEDED = {"polynomial": "waypoints", "file": "file", "function": "function"}
-CURVES = (*SINES, *NEEDED, "random_smooth")
+# Curves by the name of what they are for, whose other fields you may replace
+PRESETS: dict[str, tuple[str, StrDict]] = {
+    "take_off": ("polynomial", {"waypoints": ((0.0, 0.0, 1.5),), "speed": 1.0}),
+    "landing": ("helix", {"size": (0.0, 0.0, -1.0), "speed": 0.2}),
+}
+CURVES = (*SINES, *NEEDED, "random_smooth", *PRESETS)
 # Fields that only some curves use, and these curves
 USED_BY = {
     "speed": ("circle", "figure_eight", "helix", "lissajous", "polynomial", "random_smooth"),
@@ -88,6 +93,8 @@ class Reference(Frozen):
     - ``file``: cubic Hermite splines through the rows of a CSV file: t, x, y, z, maybe heading
     - ``function``: what ``function`` returns, for ``duration``
     - ``random_smooth``: one of 256 random sums of sines, which repeat after 10 s
+    - ``take_off``: a polynomial 1.5 m up, at up to 1 m/s
+    - ``landing``: straight down at 0.2 m/s, a helix without radius, through the ground
     """
 
     curve: Literal[CURVES] = "figure_eight"  # type: ignore[valid-type]
@@ -131,6 +138,9 @@ class Reference(Frozen):
         elif callable(data):
             data = {"function": data}
         if isinstance(data, dict):
+            if data.get("curve") in [*PRESETS]:
+                curve, fields = PRESETS[data["curve"]]
+                data = {**fields, **data, "curve": curve}
             for curve, field in NEEDED.items():
                 if data.get(field) is not None:
                     return {"curve": curve, **data}

@@ -42,11 +42,21 @@ def _tilt(sine2, cosine2):
 
 
 @inner
-def succeeds(b, lane):
-    """Return whether a flight that ends now is close enough to its target, and level enough."""
+def succeeds(b, lane, distance):
+    """Return whether a flight that ends now, at that distance from its target, is close and level
+    enough.
+    """
     _, qx, qy, _ = four(b.quaternion, lane)
     level = 1.0 - 2.0 * (qx * qx + qy * qy) >= math.cos(b.success_tilt[lane])
-    return level and b.distance[lane] <= b.success_distance[lane]
+    return level and distance <= b.success_distance[lane]
+
+
+@inner
+def lands(b, lane):
+    """Return whether a flight that touches the ground lands where and how it should."""
+    x, y, _ = subtract(vector(b.position, lane), vector(b.target, lane))
+    slow = _length(vector(b.velocity, lane)) < b.touchdown_speed[lane]
+    return slow and succeeds(b, lane, math.hypot(x, y))
 
 
 @fast

@@ -55,6 +55,10 @@ class Task(Frozen):
     """greatest final distance from the target that counts as a success, m"""
     success_tilt: PositiveFloat = np.pi
     """greatest final tilt that counts as a success, rad"""
+    touchdown_speed: Speed = 0.0
+    """if given, an episode succeeds by landing, which costs nothing: it touches the ground slower
+    than this, m/s, within success_tilt, and within success_distance across the ground
+    """
     position_cost: Cost = 0.003
     """per m and control step (Eq. 4.5)"""
     precision_cost: Cost = 0.0
@@ -124,6 +128,14 @@ TASKS: Mapping[str, Task] = {
     "recovery_and_tracking": Task(name="recovery_and_tracking", **_THROWN_AWAY),
     # Something hits the vehicle on its way to the target.
     "after_hit": Task(name="after_hit", **_THROWN_AWAY, hit_rates_std=25.0),
+    # It needs a reference that leads down to the ground.
+    "landing": Task(
+        name="landing",
+        start_position=(0.0, 0.0, 2.0),
+        velocity_std=0.5,
+        touchdown_speed=0.3,
+        success_tilt=np.radians(10.0),
+    ),
     "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
 }
 

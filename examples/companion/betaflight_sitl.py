@@ -114,14 +114,17 @@ class Sitl:
         with socket.create_connection(("127.0.0.1", 5761)) as terminal:
             for line in ["#", *(f"{line}\n" for line in typed)]:
                 terminal.sendall(line.encode())
-                time.sleep(0.05)  # the terminal's thread runs in real time
+                time.sleep(0.1)  # the terminal's thread runs in real time
                 for _ in range(20):
                     self.advance(0.01, 0)
             terminal.sendall(f"{save}\n".encode())
-            time.sleep(0.05)
+            time.sleep(0.1)
             with suppress(RuntimeError, BrokenPipeError):
                 for _ in range(1000):
                     self.advance(0.01, 0)
+                    time.sleep(0.005)
+        # It may hang at its end, when all is saved.
+        self.process.kill()
         self.process.wait(10.0)
 
     def sticks(self, values: list[int]) -> None:

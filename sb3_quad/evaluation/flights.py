@@ -56,10 +56,11 @@ LARGEST_SEED = 2**53  # Seeds that the package itself makes are smaller.
 class Flights:
     """The metrics of n episodes, one per row."""
 
-    #: (n,), survived and ended at the (last) target: the task's success_distance and success_tilt
+    #: (n,), survived and ended at the (last) target: the task's success_distance and success_tilt;
+    #: or landed there
     success: BoolArray
     survival: BoolArray  #: (n,), neither collision nor out of range: the thesis's success
-    collision: BoolArray  #: (n,), touched the ground
+    collision: BoolArray  #: (n,), touched the ground otherwise than by landing
     reward: FloatArray  #: (n,), sum of the rewards
     length: IntArray  #: (n,), control steps
     flown: FloatArray  #: (n,), time flown until the loss or the end, s
@@ -296,7 +297,7 @@ def fly_settings(
         offset = state.position - state.target
         return Flights(
             success=outcome["success"] & course.on_last,
-            survival=flying,
+            survival=flying | outcome["success"],
             collision=outcome["collision"],
             reward=total,
             length=outcome["length"],
