@@ -11,15 +11,16 @@ import pandas as pd
 import pytest
 import yaml
 from log_writers import write_blackbox, write_plain, write_ulog, write_usd
+from scipy.spatial.transform import Rotation
 
 from sb3_quad import GeometricExpert, QuadcopterVecEnv, load_vehicle
 from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.cli import main
 from sb3_quad.envs.simulation.state import QUATERNION
 from sb3_quad.identification import fit_vehicle, read_logs
-from sb3_quad.identification.curve import refuse_other_order
-from sb3_quad.identification.flight_log import THRUST_BY_VOLTAGE, motor_thrusts, rotated_by
-from sb3_quad.identification.open_loop import errors, open_loop
+from sb3_quad.identification.curve import Curve, refuse_other_order
+from sb3_quad.identification.flight_log import THRUST_BY_VOLTAGE, motor_thrusts
+from sb3_quad.identification.open_loop import open_loop
 
 CAPTURE_COLUMNS = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
 GYRO_COLUMNS = ["gyro_x", "gyro_y", "gyro_z"]
@@ -55,12 +56,12 @@ def turning(seconds=6.0, turn=3.0):
     time = STEP * np.arange(round(seconds / STEP))
     wobble = [0.4 * np.sin(5.0 * time), 0.3 * np.cos(3.0 * time)]
     rates = np.stack([*wobble, turn + 0.2 * np.sin(time)], axis=1)
-    attitude = [np.array([[1.0, 0.0, 0.0, 0.0]])]
+    attitude = [Rotation.identity()]
     for rotation in 0.5 * STEP * (rates[1:] + rates[:-1]):
-        attitude.append(rotated_by(attitude[-1], rotation[None]))
+        attitude.append(attitude[-1] * Rotation.from_rotvec(rotation))
     table = pd.DataFrame({"t": time, **dict.fromkeys(CAPTURE_COLUMNS, 0.0)})
     table["pz"] = 1.0
-    table[CAPTURE_COLUMNS[QUATERNION]] = np.concatenate(attitude)
+    table[["qx", "qy", "qz", "qw"]] = np.array([one.as_quat() for one in attitude])
     table[GYRO_COLUMNS] = rates
     return table.assign(**dict.fromkeys(THRUSTS, 0.1))
 
@@ -80,8 +81,8 @@ def folder(tmp_path_factory):
 
 def test_our_own_log_flown_again_is_nearly_the_same_flight(folder):
     # The calibration of motors and markers, which need none here, costs a little.
-    for _, predictions, end in open_loop(read_logs(folder, STEP), VEHICLE):
-        simulated, _, stays = (errors(prediction, end) for prediction in predictions)
+    curve = Curve("thrust", np.ones(1))
+    for _, (simulated, _, stays) in open_loop(read_logs(folder, STEP), VEHICLE, curve):
         assert (simulated < 0.7 * stays).all()
 
 
@@ -96,10 +97,10 @@ def test_the_clock_is_found_while_the_vehicle_turns(tmp_path, turn, late):
 @pytest.mark.parametrize("missing", [2, 7])
 def test_nothing_is_known_within_a_long_gap(tmp_path, missing):
     table = turning()
-    log = read_back(table.drop(range(200, 200 + missing)), tmp_path)
+    flying = read_back(table.drop(range(200, 200 + missing)), tmp_path).flying[:-1]
     is_long = (missing + 1) * STEP > 0.05
-    assert not log.flying[200 : 200 + missing].any() if is_long else log.flying.all()
-    assert log.flying[:199].all() and log.flying[201 + missing :].all()
+    assert not flying[200 : 200 + missing].any() if is_long else flying.all()
+    assert flying[:199].all() and flying[201 + missing :].all()
 
 
 def test_a_quaternion_and_its_negative_are_one_attitude(tmp_path):
@@ -112,11 +113,12 @@ def test_a_quaternion_and_its_negative_are_one_attitude(tmp_path):
 
 
 def test_pwm_becomes_the_thrust_that_the_firmware_expects():
-    pwm = np.array([[65535.0, 32767.5, 0.0, 70000.0]])
-    thrusts = motor_thrusts(pwm, np.array([[3.4]]))
+    time = np.arange(3.0)
+    shares = np.array([[1.0, 1.0, 1.0, 0.5], [1.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 1.1]])
+    valid, thrusts = motor_thrusts((time, shares), (time, np.full((3, 1), 3.4)))
     expected = sum(c * 3.4**k for k, c in enumerate(THRUST_BY_VOLTAGE))
-    assert thrusts[0, 0] == pytest.approx(expected) and 0.15 < expected < 0.16
-    assert 0.0 < thrusts[0, 1] < thrusts[0, 0] and np.isnan(thrusts[0, 2:]).all()
+    assert [*valid] == [0.0] and 0.15 < expected < 0.16
+    assert thrusts[0, 0] == pytest.approx(expected) and 0.0 < thrusts[0, 3] < expected
 
 
 def test_check_vehicle_prints_the_errors(folder, capsys):
@@ -250,7 +252,7 @@ def test_the_fit_gives_back_what_flew(tmp_path):
     commands = np.array([0.5, 0.8])
     expected = flew.thrust_range[1] * commands**2
     np.testing.assert_allclose(fit.curve.thrust(commands), expected, rtol=0.05)
-    held = {one.key[0]: one.reason for one in fit.estimates if one.reason}
+    held = {one.field: one.reason for one in fit.estimates if one.reason}
     assert "no velocity" in held["drag"]
 
 

@@ -7,31 +7,22 @@ the equations linearised at the optimum.
 """
 
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import savgol_filter
+from scipy.stats import t as student
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.imports import require
-from sb3_quad.base.types import FloatArray, StrDict
-from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from sb3_quad.base.types import FloatArray, IntArray, StrDict
+from sb3_quad.envs.simulation.state import QUATERNION, VELOCITY
 from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
 from sb3_quad.identification.curve import Curve, refuse_other_order, regress
 from sb3_quad.identification.flight_log import MOTION_SIZE, Log
-from sb3_quad.identification.open_loop import Windows, log_thrusts, turned
-from sb3_quad.identification.parameters import (
-    DELAY,
-    FASTEST,
-    FIELDS,
-    LARGEST_CHANGE,
-    Guess,
-    Key,
-    Scaling,
-    keys_for,
-    value,
-    with_values,
-)
+from sb3_quad.identification.open_loop import Windows, gaps, log_thrusts
+from sb3_quad.identification.parameters import FASTEST, TERMS, Guess, keys_for
 
 Show = Callable[[int, int, str], object]
 # s
@@ -64,10 +55,11 @@ LEAST_DELAY_WIDTH = 0.0015
 class Estimate:
     """A parameter by the logs."""
 
-    key: Key
+    field: str  #: of the vehicle, or ``curve`` or ``delay``
+    element: int
     value: float  #: in its unit
     width: float  #: half of the 95 % interval; NaN if the logs do not tell the parameter
-    reason: str = ""  #: why they do not
+    reason: str  #: why they do not
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,52 +76,44 @@ class Model:
 
     :param logs: the logs.
     :param start: what the vector changes.
-    :param keys: its elements.
     :param horizons: where predictions are compared, s.
     """
 
-    def __init__(
-        self, logs: Sequence[Log], start: Guess, keys: Sequence[Key], horizons: Sequence[float]
-    ) -> None:
+    def __init__(self, logs: Sequence[Log], start: Guess, horizons: Sequence[float]) -> None:
         self.logs = logs
-        self.scaling = Scaling(start, keys)
+        self.start = start
+        self.scale = start.sizes()
+        numbers = start.numbers()
+        counts = [len(one) for one in numbers.values()]
+        self.least = np.repeat([TERMS[field].least for field in numbers], counts)
+        self.most = np.repeat([TERMS[field].most for field in numbers], counts)
         self.has_motion = all(log.has_motion for log in logs)
         step = logs[0].step
         ends = sorted({max(round(horizon / step), 1) for horizon in horizons})
         rows = sum(log.flying.sum() for log in logs)
         # Windows of body rates alone share no sample.
-        stride = ends[-1] if not self.has_motion else max(1, round(rows / MOST_WINDOWS))
+        stride = max(1, round(rows / MOST_WINDOWS)) if self.has_motion else ends[-1]
         self.windows = Windows(logs, start.vehicle, ends, stride, WARM_UP)
         if self.has_motion:
             # The noise of where a window begins would grow with some parameters, and bias them.
             smooth = np.concatenate([_smoothed(log) for log in logs])
             self.windows.start = smooth[self.windows.rows]
-        self.force = None
-        if all(log.force is not None for log in logs):
-            self.force = np.concatenate([log.force for log in logs])
-        self.sizes = np.array(ERRORS)[:, None] * np.ones(len(ends))
-        self.calls = 0
+        self.force = np.concatenate([log.force for log in logs])
+        self.sizes = [np.full((len(ends), 1), size) for size in ERRORS]
 
     def parts(self, vector: FloatArray) -> list[FloatArray]:
-        """Return errors of position, velocity, attitude, body rates and specific force where they
-        are known, (windows, horizons, columns) each.
+        """Return errors of position, velocity, attitude, body rates and specific force, (windows,
+        horizons, columns) each.
         """
-        guess = self.scaling.guess(vector)
+        guess = self.start.moved(vector * self.scale)
         windows = self.windows
         thrusts = log_thrusts(self.logs, guess.vehicle, guess.curve, guess.delay)
-        found: list[list[FloatArray]] = [[] for _ in ERRORS]
+        found = []
         for end, flown in zip(windows.ends, windows.fly(guess.vehicle, thrusts), strict=True):
             rows = windows.rows + end
-            record = windows.record[rows]
-            gap = flown[:, :MOTION_SIZE] - record
-            if self.has_motion:
-                found[0].append(gap[:, POSITION])
-                found[1].append(gap[:, VELOCITY])
-                found[2].append(turned(flown[:, :MOTION_SIZE], record))
-            found[3].append(gap[:, BODY_RATES])
-            if self.force is not None:
-                found[4].append(flown[:, MOTION_SIZE:] - self.force[rows, None])
-        parts = [np.stack(one, axis=1) if one else np.zeros((0, 0, 0)) for one in found]
+            force = flown[:, MOTION_SIZE:] - self.force[rows, None]
+            found.append([*gaps(flown, windows.record[rows]), force])
+        parts = [np.stack(one, axis=1) for one in zip(*found, strict=True)]
         # The first body rate of a window is as noisy as the others: only changes count. Where the
         # airspeed is unknown, so are the moments of the air, which change slowly.
         times = np.array(windows.ends, float)
@@ -138,66 +122,66 @@ class Model:
         return parts
 
     def residuals(self, vector: FloatArray) -> FloatArray:
-        """Return all errors by their sizes, (windows, n)."""
-        self.calls += 1
-        scaled = []
-        for part, sizes in zip(self.parts(vector), self.sizes, strict=True):
-            if part.size:
-                scaled.append((part / sizes[None, :, None]).reshape(len(part), -1))
+        """Return the errors that logs tell by their sizes, (windows, n)."""
+        pairs = zip(self.parts(vector), self.sizes, strict=True)
+        scaled = [(part / size).reshape(len(part), -1) for part, size in pairs]
+        known = scaled if self.has_motion else scaled[3:]
         # Predictions that diverge must not become infinite.
-        return np.asarray(np.clip(np.nan_to_num(np.hstack(scaled), nan=1e3), -1e3, 1e3))
-
-    def slopes(self, vector: FloatArray) -> FloatArray:
-        """Return the derivatives of the errors, (windows, n, keys), by differences."""
-        here = self.residuals(vector)
-        columns = []
-        for k in range(len(vector)):
-            there = vector.copy()
-            there[k] += DIFFERENCE
-            columns.append((self.residuals(there) - here) / DIFFERENCE)
-        return np.stack(columns, axis=2)
+        return np.asarray(np.clip(np.nan_to_num(np.hstack(known), nan=1e3), -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each kind after each horizon."""
         for number, part in enumerate(self.parts(vector)):
-            if part.size:
-                spread = 1.4826 * np.median(np.abs(part), axis=(0, 2))
-                self.sizes[number] = np.maximum(spread, 1e-3 * ERRORS[number])
+            spread = 1.4826 * np.median(np.abs(part), axis=(0, 2))
+            self.sizes[number] = np.maximum(spread, 1e-3 * ERRORS[number])[:, None]
 
-    def solve(self, vector: FloatArray, evaluations: int) -> FloatArray:
-        """Return the vector with the least errors (soft L1) near a start."""
-        from scipy.optimize import least_squares
+    def solve(
+        self, vector: FloatArray, free: IntArray, evaluations: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Find the vector with the least errors (soft L1) near a start.
 
-        count = len(vector)
+        :param free: the elements of the vector that may change.
+        :return: the vector, the slopes of the errors, (windows, n, free), and the errors, (windows,
+            n), weighted so that their normal equations are those of soft L1.
+        """
+        found = vector.copy()
+
+        def residuals(values: FloatArray) -> FloatArray:
+            found[free] = values
+            return self.residuals(found).ravel()
+
+        def slopes(values: FloatArray) -> FloatArray:
+            here = residuals(values)
+            steps = DIFFERENCE * np.eye(len(free))
+            return np.stack([(residuals(values + h) - here) / DIFFERENCE for h in steps], axis=1)
+
+        limits = self.least[free], self.most[free]
         solution = least_squares(
-            lambda x: self.residuals(x).ravel(),
-            np.clip(vector, self.scaling.least, self.scaling.most),
-            jac=lambda x: self.slopes(x).reshape(-1, count),
-            bounds=(self.scaling.least, self.scaling.most),
+            residuals,
+            np.clip(vector[free], *limits),
+            slopes,
+            limits,
             loss="soft_l1",
             max_nfev=evaluations,
             xtol=1e-4,
             ftol=1e-5,
         )
-        return np.asarray(solution.x)
+        found[free] = solution.x
+        # SciPy has weighted the slopes, but not the errors.
+        weighted = solution.fun * (1.0 + solution.fun**2) ** 0.25
+        windows = len(self.windows.rows)
+        slopes_by_window = solution.jac.reshape(windows, -1, len(free))
+        return found, slopes_by_window, weighted.reshape(windows, -1)
 
-    def equations(self, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the normal equations of each block of the flights at a vector: (blocks, keys,
-        keys) and (blocks, keys).
-        """
-        errors = self.residuals(vector)
-        slopes = self.slopes(vector)
-        # Gauss and Newton's weights of soft L1
-        weights = 1.0 / np.sqrt(1.0 + errors**2)
-        block = np.arange(len(errors)) * BLOCKS // len(errors)
-        squares = []
-        products = []
-        for number in np.unique(block):
-            rows = block == number
-            weighted = weights[rows, :, None] * slopes[rows]
-            squares.append(np.einsum("wni,wnj->ij", weighted, slopes[rows]))
-            products.append(np.einsum("wni,wn->i", weighted, errors[rows]))
-        return np.array(squares), np.array(products)
+    def best_multiple(self, vector: FloatArray, places: IntArray) -> FloatArray:
+        """Return the vector with that multiple of some elements that fits best."""
+        trials = []
+        for factor in FACTORS:
+            trial = vector.copy()
+            trial[places] *= factor
+            trials.append(trial)
+        costs = [np.sqrt(1.0 + self.residuals(trial) ** 2).sum() for trial in trials]
+        return trials[int(np.argmin(costs))]
 
 
 def fit_vehicle(
@@ -211,54 +195,58 @@ def fit_vehicle(
     :param name: of the vehicle that is returned.
     :param show: called with what is done, the total, and what is being done.
     :raises ConfigError: the logs contradict the start, or do not fly for long enough.
-    :raises MissingExtra: SciPy is not installed.
     """
-    require("scipy.optimize", "fit", "fitting a vehicle")
     report = show or (lambda done, total, text: None)
-    report(0, 6, "regressions")
+    report(0, 5, "regressions")
     guess = first_guess(logs, start)
-    keys, held = keys_for(logs, guess)
+    reasons = keys_for(logs, guess)
+    keys = [*reasons]
+    fields = np.array([field for field, _ in keys])
+    free = np.flatnonzero([not reason for reason in reasons.values()])
     has_motion = all(log.has_motion for log in logs)
-    short = SHORT if has_motion else SHORT_RATES
-    long = LONG if has_motion else LONG_RATES
-    report(1, 6, "short horizons")
-    model = Model(logs, guess, keys, short)
-    vector = model.solve(_scaled_moments(model), 12)
-    report(2, 6, "all horizons")
-    model = Model(logs, guess, keys, long)
+    report(1, 5, "short horizons")
+    model = Model(logs, guess, SHORT if has_motion else SHORT_RATES)
+    vector = guess.vector() / model.scale
+    for field in ("inertia", "moment_thrust_ratio"):
+        vector = model.best_multiple(vector, np.flatnonzero(fields == field))
+    vector, *_ = model.solve(vector, free, 12)
+    report(2, 5, "all horizons")
+    # Sizes are those of what has been found, since damping grows with the inertia.
+    guess = guess.moved(vector * model.scale)
+    vector = guess.vector() / guess.sizes()
+    model = Model(logs, guess, LONG if has_motion else LONG_RATES)
     for _ in range(2):
         model.weigh(vector)
-        vector = model.solve(vector, 8)
-    report(3, 6, "intervals")
-    kept, reasons = _told(model, vector)
-    held |= reasons
-    known = {key: value(guess._replace(vehicle=start), key) for key in reasons}
-    model = _again(model, with_values(model.scaling.guess(vector), known), kept)
-    report(4, 6, "what the logs tell")
-    vector = model.solve(np.zeros(len(kept)), 8)
-    found = model.scaling.values(vector).tolist()
-    widths = model.scaling.widths(vector, jackknife(*model.equations(vector))).tolist()
+        vector, slopes, errors = model.solve(vector, free, 8)
+    report(3, 5, "what the logs tell")
+    reasons_held = _not_told(model, vector, free, slopes, errors)
+    known = guess._replace(vehicle=start).vector()
+    for place, reason in reasons_held.items():
+        vector[place] = known[place] / model.scale[place]
+        reasons[keys[place]] = reason
+    free = np.setdiff1d(free, [*reasons_held])
+    vector, slopes, errors = model.solve(vector, free, 8)
+    values = known.copy()
+    values[free] = (vector * model.scale)[free]
+    widths = np.full(len(keys), np.nan)
+    widths[free] = jackknife(slopes, errors) * model.scale[free]
+    widths = np.maximum(widths, np.where(fields == "delay", LEAST_DELAY_WIDTH, LEAST_WIDTH * values))
     estimates = []
-    for key, number, width in zip(kept, found, widths, strict=True):
-        least = LEAST_DELAY_WIDTH if key == DELAY else LEAST_WIDTH * abs(number)
-        estimates.append(Estimate(key, number, max(width, least)))
-    for key, reason in held.items():
-        estimates.append(Estimate(key, value(guess._replace(vehicle=start), key), np.nan, reason))
+    for (key, reason), value, width in zip(reasons.items(), values, widths, strict=True):
+        estimates.append(Estimate(*key, float(value), float(width), reason))
     # The delay of a vehicle is a whole number of control steps, and its lag makes up for the rest.
-    report(5, 6, "with whole steps of delay")
-    best = model.scaling.guess(vector)
-    steps = round(best.delay / start.control_step)
-    kept.remove(DELAY)
-    model = _again(model, best._replace(delay=steps * start.control_step), kept)
-    fitted = model.scaling.guess(model.solve(np.zeros(len(kept)), 5))
-    report(6, 6, "done")
+    report(4, 5, "with whole steps of delay")
+    is_delay = fields == "delay"
+    steps = round(values[is_delay].item() / start.control_step)
+    vector[is_delay] = steps * start.control_step / model.scale[is_delay]
+    vector, *_ = model.solve(vector, free[~is_delay[free]], 5)
+    fitted = guess.moved(vector * model.scale)
+    report(5, 5, "done")
     return Fit(_as_file(start, fitted, logs, steps, name), fitted.curve, estimates)
 
 
 def _smoothed(log: Log) -> FloatArray:
     """Return the motion of a log with position, attitude and velocity smoothed, (n, 13)."""
-    from scipy.signal import savgol_filter
-
     motion = log.motion.copy()
     slow = slice(0, VELOCITY.stop)
     size = 2 * round(0.5 * SMOOTHED / log.step) + 1
@@ -267,25 +255,17 @@ def _smoothed(log: Log) -> FloatArray:
     return motion
 
 
-def _again(model: Model, start: Guess, keys: Sequence[Key]) -> Model:
-    """Return a model of the same errors from another start."""
-    again = copy(model)
-    again.scaling = Scaling(start, keys)
-    return again
-
-
 def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     """Return what regressions of the specific force say about curve, lag and delay of the motors.
 
     :raises ConfigError: motors turn the vehicle otherwise than its file says.
     """
-    lags = [FASTEST] if logs[0].kind == "rotor_speed" else 1.0 / LAGS
-    found = []
-    for gain in lags:
-        for delay in DELAYS:
-            curve, rest = regress(logs, start, gain, delay)
-            found.append((rest, gain, delay, curve))
-    _, gain, delay, curve = min(found, key=lambda one: one[0])
+    gains = [FASTEST] if logs[0].kind == "rotor_speed" else 1.0 / LAGS
+    pairs = list(product(gains, DELAYS))
+    found = [regress(logs, start, *pair) for pair in pairs]
+    best = int(np.argmin([rest for _, rest in found]))
+    gain, delay = pairs[best]
+    curve, _ = found[best]
     commands = np.concatenate([log.mean_commands()[log.flying] for log in logs])
     strongest = float(curve.thrust(np.array(commands.max())))
     changes: StrDict = {
@@ -305,67 +285,48 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     return guess
 
 
-def _scaled_moments(model: Model) -> FloatArray:
-    """Return the vector with the moments of inertia, and then the yaw moment, that fit best among
-    multiples of the start's.
+def jackknife(slopes: FloatArray, errors: FloatArray) -> FloatArray:
+    """Return half of the 95 % intervals by leaving out one block of windows at a time, (keys,).
+
+    :param slopes: of the errors, (windows, n, keys).
+    :param errors: (windows, n).
     """
-    keys = model.scaling.keys
-    vector = np.zeros(len(keys))
-    for field in ("inertia", "moment_thrust_ratio"):
-        places = [k for k, key in enumerate(keys) if key[0] == field]
-        costs = []
-        for factor in FACTORS:
-            vector[places] = np.log(factor)
-            costs.append(np.sqrt(1.0 + model.residuals(vector) ** 2).sum())
-        vector[places] = np.log(FACTORS[np.argmin(costs)])
-    return vector
-
-
-def jackknife(squares: FloatArray, products: FloatArray) -> FloatArray:
-    """Return half of the 95 % intervals by leaving out one block at a time, (keys,).
-
-    :param squares: of the normal equations of each block, (blocks, keys, keys).
-    :param products: their right-hand sides, (blocks, keys).
-    """
-    from scipy.stats import t
-
-    count = len(squares)
+    count = min(BLOCKS, len(errors))
+    rows = np.array_split(np.arange(len(errors)), count)
+    squares = [np.einsum("wni,wnj->ij", slopes[one], slopes[one]) for one in rows]
+    products = [np.einsum("wni,wn->i", slopes[one], errors[one]) for one in rows]
     shifts = []
-    for one, other in zip(squares, products, strict=True):
-        left = squares.sum(axis=0) - one
-        shifts.append(-np.linalg.lstsq(left, products.sum(axis=0) - other, rcond=None)[0])
+    for square, right in zip(squares, products, strict=True):
+        left = sum(squares) - square
+        shifts.append(np.linalg.lstsq(left, right - sum(products), rcond=None)[0])
     spread = np.sqrt((count - 1) * np.var(shifts, axis=0))
-    return np.asarray(t.ppf(0.975, count - 1) * spread)
+    return np.asarray(student.ppf(0.975, count - 1) * spread)
 
 
-def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
-    """Return the parameters that the logs tell, and why they do not tell the others.
+def _not_told(
+    model: Model, vector: FloatArray, free: IntArray, slopes: FloatArray, errors: FloatArray
+) -> dict[int, str]:
+    """Return which elements of the vector the logs do not tell, and why.
 
     The least certain one is held first, which makes the others more certain.
     """
-    squares, products = model.equations(vector)
-    scaling = model.scaling
-    values = scaling.values(vector)
-    # A parameter near zero must still be certain.
-    allowed = np.maximum(LARGEST_WIDTH * np.abs(values), 1e-30)
-    allowed[[key[0] in ("curve", "delay") for key in scaling.keys]] = np.inf
-    reasons = {}
     # A value that runs away says nothing.
-    limits = np.minimum(scaling.high, scaling.begin * np.exp(0.99 * LARGEST_CHANGE))
-    is_free = scaling.sizes == 0.0
-    far = is_free & ((values > 0.98 * limits) | (vector < -0.99 * LARGEST_CHANGE))
-    for k in np.flatnonzero(far):
-        reasons[scaling.keys[int(k)]] = f"it would run to {values[k]:.2g}"
-    kept = np.flatnonzero(~far)
+    far = (vector < 1.02 * model.least) | (vector > 0.98 * model.most)
+    held = {}
+    for place in free[(far & (model.least > 0.0))[free]].tolist():
+        held[place] = f"it would run to {vector[place] * model.scale[place]:.2g}"
     while True:
-        half = np.zeros(len(vector))
-        half[kept] = jackknife(squares[:, kept][:, :, kept], products[:, kept])
-        widths = scaling.widths(vector, half)
-        worst = int(np.argmax(widths / allowed))
-        if widths[worst] <= allowed[worst]:
-            return [scaling.keys[int(k)] for k in kept], reasons
-        reasons[scaling.keys[worst]] = f"its interval would be ± {widths[worst]:.2g}"
-        kept = kept[kept != worst]
+        kept = np.flatnonzero(~np.isin(free, [*held]))
+        places = free[kept]
+        widths = jackknife(slopes[:, :, kept], errors)
+        shares = widths / np.maximum(np.abs(vector[places]), 1e-9)
+        # Thrust and delay are always fitted.
+        shares[: len(model.start.curve.coefficients) + 1] = 0.0
+        worst = int(np.argmax(shares))
+        if shares[worst] <= LARGEST_WIDTH:
+            return held
+        place = int(places[worst])
+        held[place] = f"its interval would be ± {widths[worst] * model.scale[place]:.2g}"
 
 
 def _as_file(start: Vehicle, fitted: Guess, logs: Sequence[Log], delay: int, name: str) -> Vehicle:
@@ -374,7 +335,7 @@ def _as_file(start: Vehicle, fitted: Guess, logs: Sequence[Log], delay: int, nam
     :raises ConfigError: no vehicle can be like this.
     """
     changes: StrDict = {"name": name, "motor_integration": "exact", "delay": delay}
-    for field in FIELDS:
+    for field in [*TERMS][2:]:
         changes[field] = getattr(fitted.vehicle, field)
     changes["motor_gain_down"] = changes["motor_gain_up"]
     curve = fitted.curve

@@ -3,9 +3,10 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import FloatArray, IntArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import (
@@ -14,12 +15,11 @@ from sb3_quad.envs.simulation.state import (
     QUATERNION,
     ROTOR_SPEEDS,
     VELOCITY,
-    rotation_matrices,
 )
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.identification.curve import Curve, fit_curve
-from sb3_quad.identification.flight_log import MOTION_SIZE, Log, rotated_by, rotor_columns
+from sb3_quad.identification.flight_log import MOTION_SIZE, Log, attitudes, rotor_columns
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s
@@ -49,17 +49,10 @@ class Windows:
         self.ends = ends
         self.before = round(warm_up / vehicle.control_step)
         length = self.before + ends[-1] + 1
-        starts: list[IntArray] = []
-        first = 0
-        for log in logs:
-            # A window is valid only if all of its rows fly.
-            flying = np.concatenate([[0], np.cumsum(log.flying)])
-            whole = np.flatnonzero(flying[length:] - flying[:-length] == length)
-            starts.append(first + self.before + whole[::stride])
-            first += len(log.flying)
-        self.rows = np.concatenate(starts).astype(np.int64)
-        #: (windows,), the log of each
-        self.log = np.repeat(np.arange(len(logs)), [len(one) for one in starts])
+        # A window is valid only if all of its rows fly, and are of one log.
+        flying = np.concatenate([np.append(log.flying[:-1], False) for log in logs])
+        whole = np.convolve(flying, np.ones(length), "valid") > length - 0.5
+        self.rows = self.before + np.flatnonzero(whole)[::stride]
         if self.rows.size == 0:
             seconds = length * vehicle.control_step
             raise ConfigError(f"no log flies for {seconds:.3g} s without a gap")
@@ -108,86 +101,73 @@ def log_thrusts(
     commands balances that of the air.
     """
     found = []
-    still = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
+    arms = np.vstack([np.ones(4), vehicle.rotor_arms])
     for log in logs:
         thrusts = curve.thrust(log.mean_commands(delay))[:, rotor_columns(log, vehicle)]
         mean = thrusts[log.flying].mean(axis=0)
         x, y, _ = log.mean_velocity * 4.0 * vehicle.hover_rotor_speed
         roll, pitch = vehicle.airspeed_moment
-        wanted = still.mixer_inverse @ [mean.sum(), -roll * y, pitch * x, 0.0]
+        wanted = np.linalg.solve(arms, [mean.sum(), -roll * y, pitch * x, 0.0])
         found.append(thrusts * wanted / mean)
     return np.concatenate(found)
 
 
 def open_loop(
-    logs: Sequence[Log], vehicle: Vehicle, curve: Curve | None = None, stride: int = 1
-) -> Iterator[tuple[float, list[FloatArray], FloatArray]]:
+    logs: Sequence[Log], vehicle: Vehicle, curve: Curve
+) -> Iterator[tuple[float, FloatArray]]:
     """Fly recorded commands from recorded states.
 
     Each row from which a log flies on for long enough begins a window. Its rotors begin with the
     speeds that the commands of the preceding ``WARM_UP`` lead to.
 
     :param logs: logs with rows at the vehicle's control step.
-    :param curve: thrust of a motor over its command; None: fitted to these logs.
-    :param stride: rows from one window to the next.
-    :return: for each horizon: its time, s; the predictions in the order of ``HEADINGS``; and the
-        recorded motion, each (windows, 13) as in ``Log.motion``.
+    :param curve: thrust of a motor over its command.
+    :return: for each horizon: its time, s, and the root mean squares of the errors, (predictions,
+        quantities), in the order of ``HEADINGS`` and ``QUANTITIES``.
     :raises ConfigError: no log flies for long enough, or the rotors are not placed as those of the
         log.
     """
-    step = vehicle.control_step
-    curve = curve or fit_curve(logs, vehicle)
-    ends = [round(horizon / step) for horizon in HORIZONS]
-    windows = Windows(logs, vehicle, ends, stride)
+    ends = [round(horizon / vehicle.control_step) for horizon in HORIZONS]
+    windows = Windows(logs, vehicle, ends)
     start = windows.start
     thrusts = log_thrusts(logs, vehicle, curve)
     # They are calibrated already.
     vehicle = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
     for end, flown in zip(ends, windows.fly(vehicle, thrusts), strict=True):
-        time = end * step
+        time = end * vehicle.control_step
         stays = start.copy()
         stays[:, POSITION] += start[:, VELOCITY] * time
-        stays[:, QUATERNION] = rotated_by(start[:, QUATERNION], start[:, BODY_RATES] * time)
-        yield time, [flown[:, :MOTION_SIZE], start, stays], windows.record[windows.rows + end]
+        rotation = attitudes(start) * Rotation.from_rotvec(start[:, BODY_RATES] * time)
+        stays[:, QUATERNION] = rotation.as_quat()[:, [3, 0, 1, 2]]
+        record = windows.record[windows.rows + end]
+        yield time, np.array([errors(motion, record) for motion in (flown, start, stays)])
 
 
-def errors(prediction: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the root mean squares of the errors, in the order of ``QUANTITIES``, (4,)."""
-    gap = prediction - end
-    angle = np.degrees(np.linalg.norm(turned(prediction, end), axis=1))
-    position, velocity, rates = (
-        np.linalg.norm(gap[:, part], axis=1) for part in (POSITION, VELOCITY, BODY_RATES)
-    )
-    return np.asarray(np.sqrt(np.square([position, velocity, angle, rates]).mean(axis=1)))
-
-
-def turned(prediction: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the rotation vectors from recorded attitudes to predicted ones, (n, 3), rad, recorded
-    body axes.
+def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
+    """Return how far predictions (n, 13) are off what was recorded, (n, 3) each, in the order and
+    units of ``QUANTITIES`` but rad: attitudes as rotation vectors in recorded body axes.
     """
-    matrices = [rotation_matrices(motion[:, QUATERNION]) for motion in (end, prediction)]
-    between = np.einsum("nji,njk->nik", *matrices)
-    skew = 0.5 * (between - between.transpose(0, 2, 1))[:, [2, 0, 1], [1, 2, 0]]
-    sine = np.linalg.norm(skew, axis=1)
-    cosine = 0.5 * (np.trace(between, axis1=1, axis2=2) - 1.0)
-    angle = np.arctan2(sine, cosine)
-    return np.asarray(skew * (angle / np.maximum(sine, 1e-12))[:, None])
+    turned = (attitudes(record).inv() * attitudes(motion)).as_rotvec()
+    gap = motion[:, :MOTION_SIZE] - record
+    return [gap[:, POSITION], gap[:, VELOCITY], turned, gap[:, BODY_RATES]]
+
+
+def errors(motion: FloatArray, record: FloatArray) -> FloatArray:
+    """Return the root mean squares of how far predictions are off, (4,), see ``QUANTITIES``."""
+    squares = np.square(gaps(motion, record)).sum(axis=2).mean(axis=1)
+    return np.asarray(np.sqrt(squares) * [1.0, 1.0, 180.0 / np.pi, 1.0])
 
 
 def error_table(logs: Sequence[Log], vehicle: Vehicle, curve: Curve | None = None) -> Table:
-    """Return the errors of a vehicle in open loop, over all windows of all logs."""
+    """Return the errors of a vehicle in open loop, over all windows of all logs.
+
+    :param curve: thrust of a motor over its command; None: fitted to these logs.
+    """
     curve = curve or fit_curve(logs, vehicle)
     rows = []
     # Without motion, body rates are all that is known.
     known = 0 if all(log.has_motion for log in logs) else len(QUANTITIES) - 1
-    for time, predictions, end in open_loop(logs, vehicle, curve):
-        values = [errors(prediction, end) for prediction in predictions]
-        for number, quantity in enumerate(QUANTITIES[known:], known):
-            texts = [f"{value[number]:.3g}" for value in values]
-            rows.append([f"{quantity}, after {time:g} s", *texts])
-    title = f"{vehicle.name}: {len(end)} windows of {len(logs)} logs, open loop"
-    thrusts = log_thrusts(logs, vehicle, curve)
-    flying = np.concatenate([log.flying for log in logs])
-    clipped = (np.abs(vehicle.thrust_to_action(thrusts[flying])) > 1.0).mean()
-    caption = f"{clipped:.1%} of the commands are beyond the rotors' limits, and clipped"
-    return Table(HEADINGS, rows, title, caption)
+    for time, values in open_loop(logs, vehicle, curve):
+        for quantity, numbers in zip(QUANTITIES[known:], values.T[known:], strict=True):
+            rows.append([f"{quantity}, after {time:g} s", *(f"{one:.3g}" for one in numbers)])
+    return Table(HEADINGS, rows, f"{vehicle.name}: {len(logs)} logs, open loop")
