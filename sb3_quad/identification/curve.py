@@ -36,9 +36,7 @@ def powers(kind: str, commands: FloatArray) -> FloatArray:
 def lagged(values: FloatArray, gain: float, step: float) -> FloatArray:
     """Return the response of a first-order lag to values, (n, columns), that begins at rest."""
     kept = np.exp(-gain * step)
-    response, _ = lfilter(
-        [1.0 - kept], [1.0, -kept], values, axis=0, zi=kept * values[:1]
-    )
+    response, _ = lfilter([1.0 - kept], [1.0, -kept], values, axis=0, zi=kept * values[:1])
     return np.asarray(response)
 
 
@@ -94,9 +92,7 @@ def refuse_other_order(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> None:
     if wrong == [2]:
         advice = "props that turn the other way (rotor_directions) would fit"
     axes = " and ".join(("roll", "pitch", "yaw")[axis] for axis in wrong)
-    raise ConfigError(
-        f"{log.path}: {axes}: turns against its motors by {vehicle.name}: {advice}"
-    )
+    raise ConfigError(f"{log.path}: {axes}: turns against its motors by {vehicle.name}: {advice}")
 
 
 def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
@@ -104,13 +100,12 @@ def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     up to 0.1 s where it is largest.
     """
     moments = lagged(thrusts, 30.0, log.step) @ vehicle.mixer[1:].T
+    rates = log.motion[:, BODY_RATES]
     near = max(round(0.02 / log.step), 1)
+    turned = np.roll(rates, -near, axis=0) - rates
     found = []
-    for lag in range(0, round(0.1 / log.step), near):
-        rates = log.motion[lag:, BODY_RATES]
-        turned = rates[near:] - rates[:-near]
-        rows = log.flying[: len(turned)]
-        pairs = np.corrcoef(turned[rows], moments[: len(turned)][rows], rowvar=False)
-        found.append(np.diagonal(pairs, 3))
-    best = np.array(found)
-    return best[np.abs(best).argmax(axis=0), range(3)]
+    for lag in range(0, 5 * near, near):
+        both = np.hstack([np.roll(turned, -lag, axis=0), moments])[log.flying]
+        found.append(np.corrcoef(both, rowvar=False).diagonal(3))
+    best = np.abs(found).argmax(axis=0)
+    return np.array(found)[best, range(3)]

@@ -7,43 +7,40 @@ the equations linearised at the optimum.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import least_squares
-from scipy.signal import savgol_filter
+from scipy.signal import detrend, savgol_filter
 from scipy.stats import t as student
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray, IntArray, StrDict
-from sb3_quad.envs.simulation.state import QUATERNION, VELOCITY
+from sb3_quad.envs.simulation.state import VELOCITY
 from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
 from sb3_quad.identification.curve import Curve, refuse_other_order, regress
 from sb3_quad.identification.flight_log import MOTION_SIZE, Log
 from sb3_quad.identification.open_loop import Windows, gaps, log_thrusts
-from sb3_quad.identification.parameters import FASTEST, TERMS, Guess, keys_for
+from sb3_quad.identification.parameters import FASTEST, Guess, parameters_of
 
 Show = Callable[[int, int, str], object]
-# s
-SHORT = (0.02, 0.05, 0.1)
-LONG = (0.05, 0.1, 0.2, 0.3, 0.5)
-SHORT_RATES = (0.02, 0.04, 0.06, 0.08, 0.1)
-LONG_RATES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14, 0.16, 0.18, 0.2)
-WARM_UP = 0.25
-SMOOTHED = 0.1
-MOST_WINDOWS = 1500
+# Short and long horizons of logs with velocity, and of body rates alone, s
+HORIZONS = (0.02, 0.05, 0.1), (0.05, 0.1, 0.2, 0.3, 0.5)
+HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
+WARM_UP = 0.25  # s
+SMOOTHED = 0.1  # s
+MOST_WINDOWS = 600
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
 ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
 # Lags and delays that the regression tries, s
 LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
 DELAYS = np.arange(0.0, 0.035, 0.005)
-FACTORS = 2.0 ** np.arange(-3.0, 3.5, 0.5)
 DIFFERENCE = 2e-3
 BLOCKS = 20
-# Half an interval, as a part of a positive parameter or of a typical linear one, beyond which the
-# logs do not tell it
+# Half an interval, as a part of its value, beyond which the logs do not tell a parameter
 LARGEST_WIDTH = 0.4
 # No interval is narrower than this part of its value, or this many seconds of a delay: simulated
 # logs with noise show such errors beyond the jackknife's intervals.
@@ -51,24 +48,14 @@ LEAST_WIDTH = 0.03
 LEAST_DELAY_WIDTH = 0.0015
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A parameter by the logs."""
-
-    field: str  #: of the vehicle, or ``curve`` or ``delay``
-    element: int
-    value: float  #: in its unit
-    width: float  #: half of the 95 % interval; NaN if the logs do not tell the parameter
-    reason: str  #: why they do not
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(NamedTuple):
     """A vehicle from logs."""
 
     vehicle: Vehicle
     curve: Curve  #: thrust of a motor over its command
-    estimates: Sequence[Estimate]
+    #: a row for each parameter: its field, name and unit, start, value, width, which is half of the
+    #: 95 % interval, and the reason why the logs do not tell it, if so
+    estimates: pd.DataFrame
 
 
 class Model:
@@ -79,20 +66,21 @@ class Model:
     :param horizons: where predictions are compared, s.
     """
 
-    def __init__(self, logs: Sequence[Log], start: Guess, horizons: Sequence[float]) -> None:
+    def __init__(
+        self, logs: Sequence[Log], start: Guess, horizons: Sequence[float] | FloatArray
+    ) -> None:
         self.logs = logs
         self.start = start
-        self.scale = start.sizes()
-        numbers = start.numbers()
-        counts = [len(one) for one in numbers.values()]
-        self.least = np.repeat([TERMS[field].least for field in numbers], counts)
-        self.most = np.repeat([TERMS[field].most for field in numbers], counts)
-        self.has_motion = all(log.has_motion for log in logs)
+        self.table = parameters_of(logs, start)
+        self.scale = self.table["size"].to_numpy()
+        self.limits = self.table[["least", "most"]].to_numpy()
+        self.has_motion = logs[0].has_motion
         step = logs[0].step
         ends = sorted({max(round(horizon / step), 1) for horizon in horizons})
-        rows = sum(log.flying.sum() for log in logs)
         # Windows of body rates alone share no sample.
-        stride = max(1, round(rows / MOST_WINDOWS)) if self.has_motion else ends[-1]
+        stride = ends[-1]
+        if self.has_motion:
+            stride = max(1, sum(log.flying.sum() for log in logs) // MOST_WINDOWS)
         self.windows = Windows(logs, start.vehicle, ends, stride, WARM_UP)
         if self.has_motion:
             # The noise of where a window begins would grow with some parameters, and bias them.
@@ -116,18 +104,17 @@ class Model:
         parts = [np.stack(one, axis=1) for one in zip(*found, strict=True)]
         # The first body rate of a window is as noisy as the others: only changes count. Where the
         # airspeed is unknown, so are the moments of the air, which change slowly.
-        times = np.array(windows.ends, float)
-        slow = np.vander(times / times[-1], 1 if self.has_motion else 2)
-        parts[3] -= np.einsum("hk,wkc->whc", slow @ np.linalg.pinv(slow), parts[3])
+        parts[3] = detrend(parts[3], 1, "constant" if self.has_motion else "linear")
         return parts
 
     def residuals(self, vector: FloatArray) -> FloatArray:
         """Return the errors that logs tell by their sizes, (windows, n)."""
-        pairs = zip(self.parts(vector), self.sizes, strict=True)
-        scaled = [(part / size).reshape(len(part), -1) for part, size in pairs]
-        known = scaled if self.has_motion else scaled[3:]
+        scaled = []
+        for part, size in zip(self.parts(vector), self.sizes, strict=True):
+            scaled.append((part / size).reshape(len(part), -1))
+        known = np.hstack(scaled if self.has_motion else scaled[3:])
         # Predictions that diverge must not become infinite.
-        return np.asarray(np.clip(np.nan_to_num(np.hstack(known), nan=1e3), -1e3, 1e3))
+        return np.asarray(np.clip(np.nan_to_num(known, nan=1e3), -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each kind after each horizon."""
@@ -153,9 +140,9 @@ class Model:
         def slopes(values: FloatArray) -> FloatArray:
             here = residuals(values)
             steps = DIFFERENCE * np.eye(len(free))
-            return np.stack([(residuals(values + h) - here) / DIFFERENCE for h in steps], axis=1)
+            return np.stack([residuals(values + step) - here for step in steps], 1) / DIFFERENCE
 
-        limits = self.least[free], self.most[free]
+        limits = self.limits[free].T
         solution = least_squares(
             residuals,
             np.clip(vector[free], *limits),
@@ -168,20 +155,10 @@ class Model:
         )
         found[free] = solution.x
         # SciPy has weighted the slopes, but not the errors.
-        weighted = solution.fun * (1.0 + solution.fun**2) ** 0.25
+        errors = solution.fun * (1.0 + solution.fun**2) ** 0.25
         windows = len(self.windows.rows)
-        slopes_by_window = solution.jac.reshape(windows, -1, len(free))
-        return found, slopes_by_window, weighted.reshape(windows, -1)
-
-    def best_multiple(self, vector: FloatArray, places: IntArray) -> FloatArray:
-        """Return the vector with that multiple of some elements that fits best."""
-        trials = []
-        for factor in FACTORS:
-            trial = vector.copy()
-            trial[places] *= factor
-            trials.append(trial)
-        costs = [np.sqrt(1.0 + self.residuals(trial) ** 2).sum() for trial in trials]
-        return trials[int(np.argmin(costs))]
+        jacobian = solution.jac.reshape(windows, -1, len(free))
+        return found, jacobian, errors.reshape(windows, -1)
 
 
 def fit_vehicle(
@@ -199,59 +176,54 @@ def fit_vehicle(
     report = show or (lambda done, total, text: None)
     report(0, 5, "regressions")
     guess = first_guess(logs, start)
-    reasons = keys_for(logs, guess)
-    keys = [*reasons]
-    fields = np.array([field for field, _ in keys])
-    free = np.flatnonzero([not reason for reason in reasons.values()])
-    has_motion = all(log.has_motion for log in logs)
+    short, long = HORIZONS if logs[0].has_motion else HORIZONS_OF_RATES
     report(1, 5, "short horizons")
-    model = Model(logs, guess, SHORT if has_motion else SHORT_RATES)
-    vector = guess.vector() / model.scale
-    for field in ("inertia", "moment_thrust_ratio"):
-        vector = model.best_multiple(vector, np.flatnonzero(fields == field))
-    vector, *_ = model.solve(vector, free, 12)
+    model = Model(logs, guess, short)
+    table = model.table
+    free = np.flatnonzero(table["reason"] == "")
+    vector, *_ = model.solve(guess.vector() / model.scale, free, 12)
     report(2, 5, "all horizons")
     # Sizes are those of what has been found, since damping grows with the inertia.
     guess = guess.moved(vector * model.scale)
-    vector = guess.vector() / guess.sizes()
-    model = Model(logs, guess, LONG if has_motion else LONG_RATES)
+    model = Model(logs, guess, long)
+    vector = guess.vector() / model.scale
     for _ in range(2):
         model.weigh(vector)
         vector, slopes, errors = model.solve(vector, free, 8)
     report(3, 5, "what the logs tell")
-    reasons_held = _not_told(model, vector, free, slopes, errors)
-    known = guess._replace(vehicle=start).vector()
-    for place, reason in reasons_held.items():
-        vector[place] = known[place] / model.scale[place]
-        reasons[keys[place]] = reason
-    free = np.setdiff1d(free, [*reasons_held])
+    before = guess._replace(vehicle=start)
+    known = before.vector() / model.scale
+    for place, reason in _not_told(model, vector, free, slopes, errors).items():
+        vector[place] = known[place]
+        table.loc[place, "reason"] = reason
+    free = np.flatnonzero(table["reason"] == "")
     vector, slopes, errors = model.solve(vector, free, 8)
-    values = known.copy()
-    values[free] = (vector * model.scale)[free]
-    widths = np.full(len(keys), np.nan)
+    known[free] = vector[free]
+    table["start"] = before.vector()
+    table["value"] = known * model.scale
+    delay = len(guess.curve.coefficients)
+    widths = np.full(len(table), np.nan)
     widths[free] = jackknife(slopes, errors) * model.scale[free]
-    widths = np.maximum(widths, np.where(fields == "delay", LEAST_DELAY_WIDTH, LEAST_WIDTH * values))
-    estimates = []
-    for (key, reason), value, width in zip(reasons.items(), values, widths, strict=True):
-        estimates.append(Estimate(*key, float(value), float(width), reason))
+    least = LEAST_WIDTH * np.abs(table["value"].to_numpy())
+    least[delay] = LEAST_DELAY_WIDTH
+    table["width"] = np.maximum(widths, least)
     # The delay of a vehicle is a whole number of control steps, and its lag makes up for the rest.
     report(4, 5, "with whole steps of delay")
-    is_delay = fields == "delay"
-    steps = round(values[is_delay].item() / start.control_step)
-    vector[is_delay] = steps * start.control_step / model.scale[is_delay]
-    vector, *_ = model.solve(vector, free[~is_delay[free]], 5)
-    fitted = guess.moved(vector * model.scale)
+    steps = round(table["value"][delay] / start.control_step)
+    vector[delay] = steps * start.control_step / model.scale[delay]
+    vector, *_ = model.solve(vector, free[free != delay], 5)
+    known[free] = vector[free]
     report(5, 5, "done")
-    return Fit(_as_file(start, fitted, logs, steps, name), fitted.curve, estimates)
+    fitted = before.moved(known * model.scale)
+    return Fit(_with_limits(fitted, name, steps), fitted.curve, table)
 
 
 def _smoothed(log: Log) -> FloatArray:
     """Return the motion of a log with position, attitude and velocity smoothed, (n, 13)."""
     motion = log.motion.copy()
     slow = slice(0, VELOCITY.stop)
-    size = 2 * round(0.5 * SMOOTHED / log.step) + 1
+    size = round(SMOOTHED / log.step) // 2 * 2 + 1
     motion[:, slow] = savgol_filter(motion[:, slow], size, 2, axis=0)
-    motion[:, QUATERNION] /= np.linalg.norm(motion[:, QUATERNION], axis=1, keepdims=True)
     return motion
 
 
@@ -260,29 +232,28 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
 
     :raises ConfigError: motors turn the vehicle otherwise than its file says.
     """
-    gains = [FASTEST] if logs[0].kind == "rotor_speed" else 1.0 / LAGS
-    pairs = list(product(gains, DELAYS))
+    kind = logs[0].kind
+    pairs = list(product([FASTEST] if kind == "rotor_speed" else 1.0 / LAGS, DELAYS))
     found = [regress(logs, start, *pair) for pair in pairs]
-    best = int(np.argmin([rest for _, rest in found]))
-    gain, delay = pairs[best]
+    best = np.argmin([rest for _, rest in found])
     curve, _ = found[best]
-    commands = np.concatenate([log.mean_commands()[log.flying] for log in logs])
-    strongest = float(curve.thrust(np.array(commands.max())))
+    gain, delay = pairs[best]
+    for log in logs:
+        refuse_other_order(log, start, log_thrusts([log], start, curve, delay))
+    strongest = max(curve.thrust(log.mean_commands()).max() for log in logs)
     changes: StrDict = {
         "motor_gain": gain,
         "motor_integration": "exact",
         "control_step": logs[0].step,
         "physics_step": MAX_PHYSICS_STEP,
         "delay": 0,
-        # Nothing is clipped.
+        # Nothing is clipped, and the search may pass through anything.
+        "allow_impossible_inertia": True,
         "rotor_thrust_limits": (0.0, 4.0 * max(strongest, start.hover_thrust)),
     }
-    if curve.kind == "rotor_speed":
+    if kind == "rotor_speed":
         changes["thrust_coefficient"] = float(curve.coefficients[0])
-    guess = Guess(start.model_copy(update=changes), curve, delay)
-    for log in logs:
-        refuse_other_order(log, start, log_thrusts([log], start, curve, delay))
-    return guess
+    return Guess(start.model_copy(update=changes), curve, float(delay))
 
 
 def jackknife(slopes: FloatArray, errors: FloatArray) -> FloatArray:
@@ -293,14 +264,12 @@ def jackknife(slopes: FloatArray, errors: FloatArray) -> FloatArray:
     """
     count = min(BLOCKS, len(errors))
     rows = np.array_split(np.arange(len(errors)), count)
-    squares = [np.einsum("wni,wnj->ij", slopes[one], slopes[one]) for one in rows]
-    products = [np.einsum("wni,wn->i", slopes[one], errors[one]) for one in rows]
-    shifts = []
-    for square, right in zip(squares, products, strict=True):
-        left = sum(squares) - square
-        shifts.append(np.linalg.lstsq(left, right - sum(products), rcond=None)[0])
-    spread = np.sqrt((count - 1) * np.var(shifts, axis=0))
-    return np.asarray(student.ppf(0.975, count - 1) * spread)
+    squares = np.array([np.einsum("wni,wnj->ij", slopes[one], slopes[one]) for one in rows])
+    products = np.array([np.einsum("wni,wn->i", slopes[one], errors[one]) for one in rows])
+    left = squares.sum(axis=0) - squares
+    right = products.sum(axis=0) - products
+    shifts = [np.linalg.lstsq(*one, rcond=None)[0] for one in zip(left, right, strict=True)]
+    return np.asarray(student.ppf(0.975, count - 1) * np.std(shifts, axis=0) * np.sqrt(count - 1))
 
 
 def _not_told(
@@ -310,48 +279,44 @@ def _not_told(
 
     The least certain one is held first, which makes the others more certain.
     """
-    # A value that runs away says nothing.
-    far = (vector < 1.02 * model.least) | (vector > 0.98 * model.most)
     held = {}
-    for place in free[(far & (model.least > 0.0))[free]].tolist():
+    least, most = model.limits.T
+    # A value that runs away says nothing.
+    far = (least > 0.0) & ((vector < 1.02 * least) | (vector > 0.98 * most))
+    for place in free[far[free]].tolist():
         held[place] = f"it would run to {vector[place] * model.scale[place]:.2g}"
     while True:
         kept = np.flatnonzero(~np.isin(free, [*held]))
-        places = free[kept]
         widths = jackknife(slopes[:, :, kept], errors)
-        shares = widths / np.maximum(np.abs(vector[places]), 1e-9)
+        shares = widths / np.maximum(np.abs(vector[free[kept]]), 1e-9)
         # Thrust and delay are always fitted.
         shares[: len(model.start.curve.coefficients) + 1] = 0.0
-        worst = int(np.argmax(shares))
+        worst = shares.argmax()
         if shares[worst] <= LARGEST_WIDTH:
             return held
-        place = int(places[worst])
+        place = int(free[kept[worst]])
         held[place] = f"its interval would be ± {widths[worst] * model.scale[place]:.2g}"
 
 
-def _as_file(start: Vehicle, fitted: Guess, logs: Sequence[Log], delay: int, name: str) -> Vehicle:
-    """Return the vehicle with what was fitted, and with the limits of its commands.
+def _with_limits(fitted: Guess, name: str, delay: int) -> Vehicle:
+    """Return a fitted vehicle with the limits of its commands.
 
-    :raises ConfigError: no vehicle can be like this.
+    :raises ConfigError: it does not hover.
     """
+    vehicle = fitted.vehicle
     changes: StrDict = {"name": name, "motor_integration": "exact", "delay": delay}
-    for field in [*TERMS][2:]:
-        changes[field] = getattr(fitted.vehicle, field)
-    changes["motor_gain_down"] = changes["motor_gain_up"]
-    curve = fitted.curve
-    if curve.kind == "thrust":
-        low, high = curve.thrust(np.array(start.thrust_range))
-    elif curve.kind == "share":
-        low, high = curve.thrust(np.array([0.0, 1.0]))
-    else:
-        changes["thrust_coefficient"] = float(curve.coefficients[0])
-        changes |= {"motor_gain_up": start.motor_gain_up, "motor_gain_down": start.motor_gain_down}
-        commands = np.concatenate([log.mean_commands()[log.flying] for log in logs])
-        low, high = curve.thrust(np.array([commands.min(), commands.max()]))
-    if not high > 1.05 * start.hover_thrust:
+    limits = {
+        "thrust": vehicle.thrust_range,
+        "share": (0.0, 1.0),
+        "rotor_speed": vehicle.rotor_speed_range,
+    }
+    low, high = fitted.curve.thrust(np.array(limits[fitted.curve.kind]))
+    if not high > 1.05 * vehicle.hover_thrust:
         raise ConfigError(
-            f"the motors would push with {high:.3g} N at full command, and {start.name} needs "
-            f"{start.hover_thrust:.3g} N of each to hover; is its mass right?"
+            f"the motors would push with {high:.3g} N at full command, and {vehicle.name} needs "
+            f"{vehicle.hover_thrust:.3g} N of each to hover; is its mass right?"
         )
-    changes["rotor_thrust_limits"] = max(low, 0.01 * start.hover_thrust), high
-    return start.model_copy(update=changes)
+    if fitted.curve.kind == "rotor_speed":
+        changes["thrust_coefficient"] = float(fitted.curve.coefficients[0])
+    changes["rotor_thrust_limits"] = max(low, 0.01 * vehicle.hover_thrust), high
+    return vehicle.model_copy(update=changes)

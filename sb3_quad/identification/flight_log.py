@@ -5,7 +5,7 @@ attitude agree best; and how the markers of a motion capture are mounted, so tha
 force lies along z.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from sb3_quad.base.validate import LARGEST
 from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from sb3_quad.envs.vehicles.layout import ORDERS
 from sb3_quad.envs.vehicles.vehicle import GRAVITY, Vehicle
-from sb3_quad.identification.readers import COMMANDS, WAY_OUT, Recording, Series, read_recording
+from sb3_quad.identification.readers import COMMANDS, WAY_OUT, Recording, read_recording
 
 # Rows below this height do not count, since the ground changes the thrust, m
 LEAST_HEIGHT = 0.3
@@ -37,10 +37,11 @@ LEAST_AGREEMENT = 0.1
 WORTH_A_SHIFT = 0.998
 AVERAGED = 0.1  # s
 # Clock offsets that are tried, s
-OFFSETS = np.arange(-0.1, 0.1005, 0.001)
+OFFSETS = np.append(0.0, np.arange(-0.1, 0.1005, 0.001))
 # The least that a log needs: rotors that spin up, and the longest horizon, s
 LEAST_DURATION = 1.0
 MOTION_SIZE = 13
+UPWARD = np.array([0.0, 0.0, GRAVITY])
 # Thrust of a motor, N, as coefficients of the powers of its voltage, from the 0th:
 # crazyflie-firmware 2025.12, platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM
 # / 65,535 of the battery's.
@@ -62,7 +63,7 @@ class Log:
     has_motion: bool  #: whether attitude and velocity are known, not the body rates alone
     flying: BoolArray  #: (n,), in the air
     times: FloatArray  #: (n,), of the rows by the vehicle's clock, s
-    commands: Series  #: as recorded
+    commands: FloatArray  #: as recorded: time, s, and values, (samples, 5)
     offset: float  #: how far the vehicle's clock was behind that of the motion capture, s
     notes: tuple[str, ...]  #: on rows without numbers
 
@@ -73,10 +74,11 @@ class Log:
 
         :param delay: how much later commands act, s.
         """
-        time, values = self.commands
-        areas = np.cumsum(np.diff(time, prepend=time[0])[:, None] * np.roll(values, 1, axis=0), 0)
+        areas = self.commands.copy()
+        areas[1:, 1:] = np.cumsum(np.diff(areas[:, :1], axis=0) * areas[:-1, 1:], axis=0)
+        areas[0, 1:] = 0.0
         edges = np.append(self.times, self.times[-1] + self.step) - delay
-        return np.diff(_interpolated((time, areas), edges), axis=0) / self.step
+        return np.diff(_interpolated(areas, edges), axis=0) / self.step
 
     @cached_property
     def mean_velocity(self) -> FloatArray:
@@ -143,18 +145,19 @@ def read_logs(paths: Iterable[StrPath] | StrPath, step: float | None = None) -> 
             "commands for all motors; does z point up, and is it in the air?"
         )
     for log in airborne:
-        if log.kind != airborne[0].kind:
-            raise ConfigError(f"{log.path}: its commands are {log.kind}, others {airborne[0].kind}")
+        if (log.kind, log.has_motion) != (airborne[0].kind, airborne[0].has_motion):
+            raise ConfigError(
+                f"{log.path}: holds other commands than {airborne[0].path}, or only one of both "
+                "holds velocity; fit them one by one"
+            )
     return airborne
 
 
 def on_grid(recording: Recording, step: float) -> Log:
     """Return a log with rows ``step`` s apart, see :func:`read_logs`."""
-    path = recording.path
+    path, order, series = recording
     notes: list[str] = []
-    series = {}
-    for name, one in recording.series.items():
-        series[name] = _cleaned(f"{path}: {name}", one, notes)
+    series = {name: _cleaned(f"{path}: {name}", one, notes) for name, one in series.items()}
     kind = next(name for name in COMMANDS if name in series)
     commands = series.pop(kind)
     if "battery" in series:
@@ -165,15 +168,15 @@ def on_grid(recording: Recording, step: float) -> Log:
         if "accelerometer" not in series:
             raise ConfigError(f"{path}: lacks an accelerometer; {WAY_OUT}")
         series = {name: series[name] for name in ("gyro", "accelerometer")}
-    begin = max(time[0] for time, _ in series.values())
-    end = min(time[-1] for time, _ in series.values())
+    begin = max(one[0, 0] for one in series.values())
+    end = min(one[-1, 0] for one in series.values())
     if not end - begin > LEAST_DURATION:
         raise ConfigError(f"{path}: is shorter than {LEAST_DURATION:g} s, or cut")
     grid = np.arange(begin, end, step)
 
     motion = np.zeros((len(grid), MOTION_SIZE))
     motion[:, POSITION.stop] = 1.0
-    flying = _without_gaps(commands[0], grid)
+    flying = _without_gaps(commands, grid)
     offset = 0.0
     if has_motion:
         offset = _fill_motion(path, series, grid, motion, flying)
@@ -182,15 +185,15 @@ def on_grid(recording: Recording, step: float) -> Log:
     if "accelerometer" in series:
         force = _resampled(series["accelerometer"], times, step)
     else:
-        force = np.gradient(motion[:, VELOCITY], step, axis=0) + [0.0, 0.0, GRAVITY]
+        force = np.gradient(motion[:, VELOCITY], step, axis=0) + UPWARD
         force = attitudes(motion).inv().apply(force)
-    for name, (time, _) in series.items():
-        flying &= _without_gaps(time, times if name in ("gyro", "accelerometer") else grid)
+    for name, one in series.items():
+        flying &= _without_gaps(one, times if name in ("gyro", "accelerometer") else grid)
     # A row's command must last to the next row.
-    flying &= _without_gaps(commands[0], times + step)
+    flying &= _without_gaps(commands, times + step)
     log = Log(
         path=path,
-        order=recording.order,
+        order=order,
         kind=kind,
         step=step,
         motion=motion,
@@ -205,20 +208,19 @@ def on_grid(recording: Recording, step: float) -> Log:
     return _in_the_air(log, "position" in series)
 
 
-def _cleaned(name: str, one: Series, notes: list[str]) -> Series:
-    """Return a series without rows that are not finite.
+def _cleaned(name: str, table: FloatArray, notes: list[str]) -> FloatArray:
+    """Return a series without rows that are not finite, or are of the same time.
 
     :param name: of the series, for messages.
     :raises ConfigError: hardly a row is left, times fall or are no seconds, numbers are too large.
     """
-    good = np.isfinite(np.column_stack(one)).all(axis=1)
-    count = good.sum()
-    if count < max(2, 0.5 * len(good)):
-        raise ConfigError(f"{name}: {count} of {len(good)} rows hold numbers")
-    if count < len(good):
-        missing = len(good) - count
-        notes.append(f"{name}: {missing} of {len(good)} rows hold no number, and are left out")
-    time, values = (array[good] for array in one)
+    rows = table[np.isfinite(table).all(axis=1)]
+    missing = len(table) - len(rows)
+    if len(rows) < max(2, missing):
+        raise ConfigError(f"{name}: {len(rows)} of {len(table)} rows hold numbers")
+    if missing:
+        notes.append(f"{name}: {missing} of {len(table)} rows hold no number, and are left out")
+    time = rows[:, 0]
     steps = np.diff(time, prepend=-np.inf)
     if steps.min() < 0.0:
         row = steps.argmin()
@@ -229,34 +231,34 @@ def _cleaned(name: str, one: Series, notes: list[str]) -> Series:
             f"{name}: rows are {apart:.3g} s apart on average, where {LONGEST_GAP:g} s is "
             "the longest gap; is the time in the unit of its format?"
         )
-    largest = np.abs(values).max()
+    largest = np.abs(rows[:, 1:]).max()
     if largest > LARGEST:
         raise ConfigError(f"{name}: {largest:.3g} is too large")
-    return time[steps > 0.0], values[steps > 0.0]
+    return rows[steps > 0.0]
 
 
-def _interpolated(series: Series, grid: FloatArray) -> FloatArray:
+def _interpolated(series: FloatArray, grid: FloatArray) -> FloatArray:
     """Return values at the times of a grid, (n, columns)."""
-    time, values = series
-    return np.column_stack([np.interp(grid, time, column) for column in values.T])
+    time, *columns = series.T
+    return np.stack([np.interp(grid, time, column) for column in columns], axis=1)
 
 
-def _resampled(series: Series, grid: FloatArray, step: float) -> FloatArray:
+def _resampled(series: FloatArray, grid: FloatArray, step: float) -> FloatArray:
     """Return values at the times of a grid, (n, columns), as means over about a step."""
-    time, values = series
-    samples = int(step / np.median(np.diff(time))) // 2 * 2 + 1
-    return _interpolated((time, uniform_filter1d(values, samples, axis=0)), grid)
+    samples = step // np.median(np.diff(series[:, 0])) // 2 * 2 + 1
+    return _interpolated(uniform_filter1d(series, int(samples), axis=0), grid)
 
 
-def _without_gaps(time: FloatArray, grid: FloatArray) -> BoolArray:
+def _without_gaps(series: FloatArray, grid: FloatArray) -> BoolArray:
     """Whether each row of a grid lies between two samples that are close."""
+    time = series[:, 0]
     gaps = np.diff(time, prepend=-np.inf, append=np.inf)
     return np.asarray(gaps[np.searchsorted(time, grid, side="right")] < LONGEST_GAP)
 
 
 def _fill_motion(
     path: Path,
-    series: dict[str, Series],
+    series: dict[str, FloatArray],
     grid: FloatArray,
     motion: FloatArray,
     flying: BoolArray,
@@ -266,40 +268,38 @@ def _fill_motion(
     :return: how far the gyro's clock is behind that of the attitude, s.
     """
     step = grid[1] - grid[0]
-    time, quaternions = series["attitude"]
-    norms = np.linalg.norm(quaternions, axis=1)
+    time, w, x, y, z = series["attitude"].T
+    norms = np.linalg.norm([w, x, y, z], axis=0)
     worst = np.abs(norms - 1.0).argmax()
     if not 0.9 < norms[worst] < 1.1:
         raise ConfigError(f"{path}: row {worst + 1}: qw, qx, qy, qz have length {norms[worst]:.3g}")
-    attitude = Slerp(time, Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]))(grid)
-    velocity = _interpolated(series["velocity"], grid)
-    motion[:, VELOCITY] = velocity
+    attitude = Slerp(time, Rotation.from_quat(np.stack([x, y, z, w], axis=1)))(grid)
+    velocity = motion[:, VELOCITY] = _interpolated(series["velocity"], grid)
+    motion[:, POSITION] = np.cumsum(velocity, axis=0) * step
     if "position" in series:
         motion[:, POSITION] = _interpolated(series["position"], grid)
         flying &= motion[:, 2] > LEAST_HEIGHT
-        speeds = np.gradient(motion[:, POSITION], step, axis=0)
-        _refuse_unlike(path, "velocity", velocity[flying], speeds[flying], step)
-    else:
-        motion[:, POSITION] = np.cumsum(velocity, axis=0) * step
+    speeds = np.gradient(motion[:, POSITION], step, axis=0)
+    _refuse_unlike(path, "velocity", velocity[flying], speeds[flying], step)
 
     turned = (attitude[:-2].inv() * attitude[2:]).as_rotvec() / (2.0 * step)
     rates = np.pad(turned, ((1, 1), (0, 0)), "edge")[flying]
-    found = []
-    for behind in (0.0, *OFFSETS):
-        gyro = _resampled(series["gyro"], grid[flying] + behind, step)
-        found.append(np.square(gyro - rates).sum())
-    best = int(np.argmin(found))
-    # Noise alone must not move the clock.
-    offset = OFFSETS[best - 1] if found[best] < WORTH_A_SHIFT * found[0] else 0.0
-    gyro = _resampled(series["gyro"], grid[flying] + offset, step)
-    _refuse_unlike(path, "gyro", gyro, rates, step)
+    gyros = [_resampled(series["gyro"], grid[flying] + behind, step) for behind in OFFSETS]
+    costs = np.square(np.array(gyros) - rates).sum(axis=(1, 2))
+    # The first one is 0, and noise alone must not move the clock.
+    best = costs.argmin() if costs.min() < WORTH_A_SHIFT * costs[0] else 0
+    _refuse_unlike(path, "gyro", gyros[best], rates, step)
 
     if flying.any():
-        force = np.gradient(velocity, step, axis=0) + [0.0, 0.0, GRAVITY]
+        force = np.gradient(velocity, step, axis=0) + UPWARD
         x, y, z = attitude.inv().apply(force)[flying].mean(axis=0)
         attitude = attitude * Rotation.from_rotvec([-y / z, x / z, 0.0])
-    motion[:, QUATERNION] = attitude.as_quat()[:, [3, 0, 1, 2]]
-    return float(offset)
+    quaternions = attitude.as_quat()[:, [3, 0, 1, 2]]
+    # Of q and -q, which are the same attitude, the one nearer to the row before
+    signs = np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=1))
+    quaternions[1:] *= np.cumprod(signs)[:, None]
+    motion[:, QUATERNION] = quaternions
+    return float(OFFSETS[best])
 
 
 def _in_the_air(log: Log, knows_height: bool) -> Log:
@@ -336,34 +336,26 @@ def _refuse_unlike(
 
     :raises ConfigError: the message names the column.
     """
-    # Means over blocks: what follows from positions and attitudes is noisy.
-    block = round(AVERAGED / step)
-    count = len(measured) // block
-    pair = np.stack([measured, other])[:, : count * block]
-    own, expected = pair.reshape(2, count, block, 3).mean(axis=2)
+    # What follows from positions and attitudes is noisy.
+    own = uniform_filter1d(measured, round(AVERAGED / step), axis=0)
+    expected = uniform_filter1d(other, round(AVERAGED / step), axis=0)
     larger = np.maximum((own**2).sum(axis=0), (expected**2).sum(axis=0))
     agrees = (own * expected).sum(axis=0) >= LEAST_AGREEMENT * larger
-    for axis in np.flatnonzero(~agrees & (larger > count * LEAST_MOTION**2)):
+    for axis in np.flatnonzero(~agrees & (larger > len(own) * LEAST_MOTION**2)):
         raise ConfigError(
             f"{path}: {what} {'xyz'[axis]} contradicts the motion; check units, axes and the order "
             "of columns"
         )
 
 
-def motor_thrusts(share: Series, battery: Series) -> Series:
-    """Return the thrusts, N, that the Crazyflie's firmware expects from its commands, (n, 4).
+def motor_thrusts(share: FloatArray, battery: FloatArray) -> FloatArray:
+    """Return the thrusts that the Crazyflie's firmware expects from its commands, (n, 5), N.
 
     Rows in which a motor rests, or gets more than it can, are left out.
 
-    :param share: commands of the motors, 0 to 1.
-    :param battery: V.
+    :param share: times, s, and commands of the motors, 0 to 1, (n, 5).
+    :param battery: times, s, and V, (samples, 2).
     """
-    time, values = share
-    thrusts = np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(values * _interpolated(battery, time))
-    valid = ((values > 0.0) & (values <= 1.0)).all(axis=1)
-    return time[valid], thrusts[valid]
-
-
-def flown(logs: Sequence[Log]) -> float:
-    """Return how long logs fly, s."""
-    return float(sum(log.step * log.flying.sum() for log in logs))
+    valid = share[((share[:, 1:] > 0.0) & (share[:, 1:] <= 1.0)).all(axis=1)]
+    voltage = valid[:, 1:] * _interpolated(battery, valid[:, 0])
+    return np.hstack([valid[:, :1], np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(voltage)])

@@ -1,6 +1,6 @@
 """Recorded commands flown again from recorded states, and how far that is off."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,7 +25,6 @@ HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s
 WARM_UP = 0.5
 QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
-HEADINGS = ("root mean square of the error", "simulated", "nothing changes", "velocity, rates stay")
 
 
 class Windows:
@@ -57,7 +56,7 @@ class Windows:
             seconds = length * vehicle.control_step
             raise ConfigError(f"no log flies for {seconds:.3g} s without a gap")
         self.record = np.concatenate([log.motion for log in logs])
-        if not all(log.has_motion for log in logs):
+        if not logs[0].has_motion:
             # Where gravity is unknown, it must not matter how high a vehicle flies.
             self.record[:, 2] = 100.0
         self.start = self.record[self.rows]
@@ -112,37 +111,6 @@ def log_thrusts(
     return np.concatenate(found)
 
 
-def open_loop(
-    logs: Sequence[Log], vehicle: Vehicle, curve: Curve
-) -> Iterator[tuple[float, FloatArray]]:
-    """Fly recorded commands from recorded states.
-
-    Each row from which a log flies on for long enough begins a window. Its rotors begin with the
-    speeds that the commands of the preceding ``WARM_UP`` lead to.
-
-    :param logs: logs with rows at the vehicle's control step.
-    :param curve: thrust of a motor over its command.
-    :return: for each horizon: its time, s, and the root mean squares of the errors, (predictions,
-        quantities), in the order of ``HEADINGS`` and ``QUANTITIES``.
-    :raises ConfigError: no log flies for long enough, or the rotors are not placed as those of the
-        log.
-    """
-    ends = [round(horizon / vehicle.control_step) for horizon in HORIZONS]
-    windows = Windows(logs, vehicle, ends)
-    start = windows.start
-    thrusts = log_thrusts(logs, vehicle, curve)
-    # They are calibrated already.
-    vehicle = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
-    for end, flown in zip(ends, windows.fly(vehicle, thrusts), strict=True):
-        time = end * vehicle.control_step
-        stays = start.copy()
-        stays[:, POSITION] += start[:, VELOCITY] * time
-        rotation = attitudes(start) * Rotation.from_rotvec(start[:, BODY_RATES] * time)
-        stays[:, QUATERNION] = rotation.as_quat()[:, [3, 0, 1, 2]]
-        record = windows.record[windows.rows + end]
-        yield time, np.array([errors(motion, record) for motion in (flown, start, stays)])
-
-
 def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
     """Return how far predictions (n, 13) are off what was recorded, (n, 3) each, in the order and
     units of ``QUANTITIES`` but rad: attitudes as rotation vectors in recorded body axes.
@@ -152,22 +120,54 @@ def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
     return [gap[:, POSITION], gap[:, VELOCITY], turned, gap[:, BODY_RATES]]
 
 
-def errors(motion: FloatArray, record: FloatArray) -> FloatArray:
-    """Return the root mean squares of how far predictions are off, (4,), see ``QUANTITIES``."""
-    squares = np.square(gaps(motion, record)).sum(axis=2).mean(axis=1)
+def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray:
+    """Fly recorded commands from recorded states.
+
+    Each row from which a log flies on for long enough begins a window. Its rotors begin with the
+    speeds that the commands of the preceding ``WARM_UP`` lead to.
+
+    :param logs: logs with rows at the vehicle's control step.
+    :param curve: thrust of a motor over its command.
+    :return: root mean squares of the errors, (horizons, 2, quantities), of the vehicle and of one
+        whose velocity and body rates stay, in the order of ``HORIZONS`` and ``QUANTITIES``.
+    :raises ConfigError: no log flies for long enough, or the rotors are not placed as those of the
+        log.
+    """
+    ends = [round(horizon / vehicle.control_step) for horizon in HORIZONS]
+    windows = Windows(logs, vehicle, ends)
+    start = windows.start
+    stays = start.copy()
+    thrusts = log_thrusts(logs, vehicle, curve)
+    # They are calibrated already.
+    vehicle = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
+    found = []
+    for end, flown in zip(ends, windows.fly(vehicle, thrusts), strict=True):
+        time = end * vehicle.control_step
+        stays[:, POSITION] = start[:, POSITION] + start[:, VELOCITY] * time
+        rotation = attitudes(start) * Rotation.from_rotvec(start[:, BODY_RATES] * time)
+        stays[:, QUATERNION] = rotation.as_quat()[:, [3, 0, 1, 2]]
+        record = windows.record[windows.rows + end]
+        found.append([gaps(flown, record), gaps(stays, record)])
+    squares = np.square(found).sum(axis=4).mean(axis=3)
     return np.asarray(np.sqrt(squares) * [1.0, 1.0, 180.0 / np.pi, 1.0])
 
 
-def error_table(logs: Sequence[Log], vehicle: Vehicle, curve: Curve | None = None) -> Table:
-    """Return the errors of a vehicle in open loop, over all windows of all logs.
+def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve | None]]) -> Table:
+    """Return the errors of vehicles in open loop, over all windows of all logs.
 
-    :param curve: thrust of a motor over its command; None: fitted to these logs.
+    :param vehicles: by the heading of their column, with the thrust of a motor over its command, or
+        None: fitted to these logs.
     """
-    curve = curve or fit_curve(logs, vehicle)
+    columns = []
+    for vehicle, curve in vehicles.values():
+        errors = open_loop(logs, vehicle, curve or fit_curve(logs, vehicle))
+        columns.append(errors[:, 0])
+    columns.append(errors[:, 1])
     rows = []
     # Without motion, body rates are all that is known.
-    known = 0 if all(log.has_motion for log in logs) else len(QUANTITIES) - 1
-    for time, values in open_loop(logs, vehicle, curve):
-        for quantity, numbers in zip(QUANTITIES[known:], values.T[known:], strict=True):
-            rows.append([f"{quantity}, after {time:g} s", *(f"{one:.3g}" for one in numbers)])
-    return Table(HEADINGS, rows, f"{vehicle.name}: {len(logs)} logs, open loop")
+    known = 0 if logs[0].has_motion else len(QUANTITIES) - 1
+    for number, quantity in enumerate(QUANTITIES[known:], known):
+        for horizon, values in zip(HORIZONS, np.array(columns)[:, :, number].T, strict=True):
+            rows.append([f"{quantity}, after {horizon:g} s", *(f"{one:.3g}" for one in values)])
+    heads = ("root mean square of the error", *vehicles, "velocity, rates stay")
+    return Table(heads, rows, f"{len(logs)} logs, open loop")

@@ -23,18 +23,18 @@ from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.envs.simulation.motions import read_table
 
 LARGEST_LOG = 300_000_000  # bytes
+LONGEST_NAME = 100  # bytes
 FORMATS = read_yaml(Path(__file__).with_name("formats.yaml"))
 UNITS = FORMATS.pop("units")
 ORDERS_OF = FORMATS.pop("orders")
 DOWN = FORMATS.pop("down")
+MARKS = FORMATS.pop("marks")
 COMMANDS = ("thrust", "rotor_speed", "share")
 WAY_OUT = (
     "a log has motor commands, gyro, and an accelerometer or attitude and velocity; "
     "docs/your_vehicle.md lists the columns of each format"
 )
 
-Series = tuple[FloatArray, FloatArray]
-"""Times (n,), s, and values (n, columns)."""
 Part = Mapping[str, Any]
 """Columns that were recorded at the same times, (n,) each, by name."""
 
@@ -44,7 +44,8 @@ class Recording(NamedTuple):
 
     path: Path  #: of its file
     order: str  #: of the motors, a key of ``ORDERS``; empty: that of the vehicle
-    series: dict[str, Series]  #: by the quantities of ``formats.yaml``
+    #: by the quantities of ``formats.yaml``: time, s, and values, (n, 1 + columns)
+    series: dict[str, FloatArray]
 
 
 def read_recording(source: StrPath) -> Recording:
@@ -60,36 +61,33 @@ def read_recording(source: StrPath) -> Recording:
             if start.startswith(magic):
                 return _recording(path, name, *read(path))
         table, headers = _csv(path)
-        return _recording(path, _format_of(path, table), [table], headers)
+        name = next((name for name, mark in MARKS.items() if mark in table), "plain CSV")
+        return _recording(path, name, [table], headers)
 
 
 def _recording(path: Path, name: str, parts: Sequence[Part], headers: StrDict) -> Recording:
     """Find the quantities of a format among the columns of a log."""
-    columns = dict(FORMATS[name])
     units = UNITS | _units(headers)
-    (clock,) = columns.pop("time").items()
-    series: dict[str, Series] = {}
-    for quantity, options in columns.items():
+    ((clock, clock_unit),) = FORMATS[name]["time"].items()
+    series: dict[str, FloatArray] = {}
+    for quantity, options in FORMATS[name].items():
         for names, unit in options.items():
+            zero, scale = units[unit]
             for part in parts:
-                if quantity not in series and {clock[0], *names.split()} <= part.keys():
-                    time = _in_si(part, *clock, units)[:, 0]
-                    series[quantity] = time, _in_si(part, names, unit, units)
-    for needed, what in ((COMMANDS, "motor commands"), (["gyro"], "a gyro")):
-        if series.keys().isdisjoint(needed):
+                if quantity not in series and {clock, *names.split()} <= part.keys():
+                    columns = [part[column] for column in names.split()]
+                    values = (np.array(columns, float) - zero) * scale
+                    time = np.array(part[clock], float) * units[clock_unit][1]
+                    series[quantity] = np.vstack([time, values]).T
+    for what, names in {"time": ["time"], "motor commands": COMMANDS, "gyro": ["gyro"]}.items():
+        if series.keys().isdisjoint(names):
             raise ConfigError(f"{path}: lacks {what}; {WAY_OUT}")
+    del series["time"]
     if name in DOWN:
         # Of vectors and quaternions, the last two elements are those of y and z.
         for quantity in series.keys() - COMMANDS:
-            series[quantity][1][:, -2:] *= -1.0
+            series[quantity][:, -2:] *= -1.0
     return Recording(path, ORDERS_OF.get(name, ""), series)
-
-
-def _in_si(part: Part, names: str, unit: Any, units: StrDict) -> FloatArray:
-    """Return columns in the unit of their quantity, (n, columns)."""
-    zero, scale = units[unit]
-    values = np.array([part[name] for name in names.split()], float).T
-    return np.asarray((values - zero) * scale)
 
 
 def _units(headers: StrDict) -> StrDict:
@@ -102,9 +100,8 @@ def _units(headers: StrDict) -> StrDict:
     if isinstance(scale, float) and scale != 1.0:
         units["gyro_scale"] = 0.0, scale * UNITS["deg/s"][1]
     # The commands for a motor that rests and one at full throttle
-    limits = headers.get("motorOutput") or ""
-    numbers = limits.split(",") if isinstance(limits, str) else limits
-    if len(numbers) == 2 and float(numbers[1]) <= 2000.0:
+    limits = str(headers.get("motorOutput")).strip("[]").split(",")
+    if len(limits) == 2 and float(limits[1]) <= 2000.0:
         units["DShot"] = UNITS["PWM"]
     return units
 
@@ -141,34 +138,30 @@ def _usd(path: Path) -> tuple[list[Part], StrDict]:
     # Version 1 counts milliseconds, version 2 microseconds.
     time, scale = {1: ("<I", 1.0), 2: ("<Q", 1e-3)}[version]
     place = 5
-    layouts: dict[int, tuple[list[str], struct.Struct, list[Any]]] = {}
+    layouts: dict[int, struct.Struct] = {}
+    names: dict[int, list[str]] = {}
     for _ in range(kinds):
         (kind,) = struct.unpack_from("<H", data, place)
-        place = data.index(b"\0", place + 2) + 1
-        (count,) = struct.unpack_from("<H", data, place)
-        place += 2
-        names = ["timestamp"]
-        row = time
-        for _ in range(count):
-            end = data.index(b"\0", place)
-            # Its types are those of Python's struct.
-            name, _, letters = data[place:end].decode().partition("(")
-            names.append(name)
-            row += letters[0]
-            place = end + 1
-        layouts[kind] = names, struct.Struct(row), []
+        place = data.index(b"\0", place + 2) + 3
+        (count,) = struct.unpack_from("<H", data, place - 2)
+        *fields, _ = data[place : place + LONGEST_NAME * count].split(b"\0", count)
+        place += len(b"\0".join(fields)) + 1
+        # Its types are those of Python's struct.
+        pairs = [field.decode().split("(") for field in fields]
+        layouts[kind] = struct.Struct(time + "".join(letters[0] for _, letters in pairs))
+        names[kind] = ["timestamp", *(name for name, _ in pairs)]
+    rows: dict[int, list[Any]] = {kind: [] for kind in layouts}
     # The last four bytes are a checksum; a log that was cut ends anywhere.
     with suppress(struct.error, KeyError):
         while True:
             (kind,) = struct.unpack_from("<H", data, place)
-            _, layout, rows = layouts[kind]
-            rows.append(layout.unpack_from(data, place + 2))
-            place += 2 + layout.size
+            rows[kind].append(layouts[kind].unpack_from(data, place + 2))
+            place += 2 + layouts[kind].size
     parts = []
-    for names, _, rows in layouts.values():
-        values = np.array(rows, float).reshape(len(rows), len(names)).T
-        values[0] *= scale
-        parts.append(dict(zip(names, values, strict=True)))
+    for kind, values in rows.items():
+        table = pd.DataFrame(values, columns=names[kind], dtype=float)
+        table["timestamp"] *= scale
+        parts.append(dict(table))
     return parts, {}
 
 
@@ -177,21 +170,6 @@ READERS: Mapping[bytes, tuple[str, Callable[[Path], tuple[list[Part], StrDict]]]
     b"H Product:Blackbox": ("Betaflight", _blackbox),
     b"\xbc": ("Crazyflie", _usd),
 }
-
-
-def _format_of(path: Path, table: Part) -> str:
-    """Return the name of the format that has the most columns of a table.
-
-    :raises ConfigError: none has its column for the time.
-    """
-    found = {}
-    for name, columns in FORMATS.items():
-        if columns["time"].keys() <= table.keys():
-            known = " ".join(key for options in columns.values() for key in options)
-            found[name] = len({*known.split()} & table.keys())
-    if not found:
-        raise ConfigError(f"{path}: has no column for the time; {WAY_OUT}")
-    return max(found, key=found.__getitem__)
 
 
 def _csv(path: Path) -> tuple[Part, StrDict]:
