@@ -1,6 +1,7 @@
 """The thrust of a motor over its command, and the response of the vehicle to it, by regression."""
 
 from collections.abc import Sequence
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -9,12 +10,13 @@ from scipy.signal import lfilter
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.state import BODY_RATES
-from sb3_quad.envs.vehicles.layout import ORDERS
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.identification.flight_log import Log
 
 # The powers of a command that its thrust consists of, by the kind of the command
 POWERS = {"thrust": (1,), "rotor_speed": (2,), "share": (0, 1, 2)}
+# The sum of three correlations that speaks for another order
+LEAST_BETTER = 0.25
 
 
 class Curve(NamedTuple):
@@ -76,28 +78,32 @@ def regress(
 
 
 def refuse_other_order(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> None:
-    """Refuse a log whose rotors turn the vehicle otherwise than its file says.
+    """Refuse a log that turns as with rotors in another order, or props that turn the other way.
 
     :param thrusts: commanded, in the vehicle's order, (n, 4), N.
-    :raises ConfigError: with the axis that answers the wrong way, and an order that would fit.
+    :raises ConfigError: with the axes that answer otherwise, and the order that fits.
     """
-    wrong = np.flatnonzero(_agreement(log, vehicle, thrusts) < -0.25).tolist()
-    if not wrong:
+    orders = [*permutations(range(4))]
+    found = [_agreement(log, vehicle, thrusts[:, order]) for order in orders]
+    both = np.vstack([found, found * np.array([1.0, 1.0, -1.0])])
+    best = both.sum(axis=1).argmax()
+    better = both[best] - both[0]
+    if better.sum() < LEAST_BETTER:
         return
-    advice = "check axes, signs and the order of the motors"
-    for name, order in ORDERS.items():
-        other = [order.index(place) for place in ORDERS[log.order or "crazyflie"]]
-        if (_agreement(log, vehicle, thrusts[:, np.argsort(other)]) > 0.0).all():
-            advice = f"the order of {name} would fit"
-    if wrong == [2]:
-        advice = "props that turn the other way (rotor_directions) would fit"
-    axes = " and ".join(("roll", "pitch", "yaw")[axis] for axis in wrong)
-    raise ConfigError(f"{log.path}: {axes}: turns against its motors by {vehicle.name}: {advice}")
+    named = [("roll", "pitch", "yaw")[axis] for axis in np.flatnonzero(better > 0.1)]
+    order = [motor + 1 for motor in orders[best % len(orders)]]
+    props = ""
+    if best >= len(orders):
+        props = ", with props that turn the other way (rotor_directions)"
+    raise ConfigError(
+        f"{log.path}: {' and '.join(named)}: the motors of {vehicle.name} turn it otherwise; the "
+        f"log fits its motors in the order {order}{props}; check axes and signs, too"
+    )
 
 
 def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     """Return the correlation of body accelerations with moments about each axis, (3,), for that lag
-    up to 0.1 s where it is largest.
+    up to 0.1 s where it is largest; 0 where nothing changes.
     """
     moments = lagged(thrusts, 30.0, log.step) @ vehicle.mixer[1:].T
     rates = log.motion[:, BODY_RATES]
@@ -106,6 +112,7 @@ def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     found = []
     for lag in range(0, 5 * near, near):
         both = np.hstack([np.roll(turned, -lag, axis=0), moments])[log.flying]
-        found.append(np.corrcoef(both, rowvar=False).diagonal(3))
-    best = np.abs(found).argmax(axis=0)
-    return np.array(found)[best, range(3)]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found.append(np.corrcoef(both, rowvar=False).diagonal(3))
+    best = np.abs(np.nan_to_num(found)).argmax(axis=0)
+    return np.nan_to_num(found)[best, range(3)]

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.signal import detrend, savgol_filter
 from scipy.stats import t as student
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import FloatArray, IntArray, StrDict
 from sb3_quad.envs.simulation.state import VELOCITY
 from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
@@ -40,6 +40,7 @@ LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
 DELAYS = np.arange(0.0, 0.035, 0.005)
 DIFFERENCE = 2e-3
 BLOCKS = 20
+MOST_THRUST = 30.0  # of a motor at full command, by what it needs to hover
 # Half an interval, as a part of its value, beyond which the logs do not tell a parameter
 LARGEST_WIDTH = 0.4
 # No interval is narrower than this part of its value, or this many seconds of a delay: simulated
@@ -114,7 +115,7 @@ class Model:
             scaled.append((part / size).reshape(len(part), -1))
         known = np.hstack(scaled if self.has_motion else scaled[3:])
         # Predictions that diverge must not become infinite.
-        return np.asarray(np.clip(np.nan_to_num(known, nan=1e3), -1e3, 1e3))
+        return np.clip(known, -1e3, 1e3)
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each kind after each horizon."""
@@ -214,7 +215,8 @@ def fit_vehicle(
     vector, *_ = model.solve(vector, free[free != delay], 5)
     known[free] = vector[free]
     report(5, 5, "done")
-    fitted = before.moved(known * model.scale)
+    with raised_as(ConfigError, f"{logs[0].path}: the fit is no vehicle that can fly"):
+        fitted = before.moved(known * model.scale)
     return Fit(_with_limits(fitted, name, steps), fitted.curve, table)
 
 
@@ -253,6 +255,8 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     }
     if kind == "rotor_speed":
         changes["thrust_coefficient"] = float(curve.coefficients[0])
+    # Commands that cannot be right are refused at once.
+    _with_limits(Guess(start, curve, 0.0), start.name, 0)
     return Guess(start.model_copy(update=changes), curve, float(delay))
 
 
@@ -311,10 +315,11 @@ def _with_limits(fitted: Guess, name: str, delay: int) -> Vehicle:
         "rotor_speed": vehicle.rotor_speed_range,
     }
     low, high = fitted.curve.thrust(np.array(limits[fitted.curve.kind]))
-    if not high > 1.05 * vehicle.hover_thrust:
+    if not 1.05 < high / vehicle.hover_thrust < MOST_THRUST:
         raise ConfigError(
             f"the motors would push with {high:.3g} N at full command, and {vehicle.name} needs "
-            f"{vehicle.hover_thrust:.3g} N of each to hover; is its mass right?"
+            f"{vehicle.hover_thrust:.3g} N of each to hover; are its mass, and the commands' unit, "
+            "right?"
         )
     if fitted.curve.kind == "rotor_speed":
         changes["thrust_coefficient"] = float(fitted.curve.coefficients[0])

@@ -24,9 +24,9 @@ from sb3_quad.identification.readers import COMMANDS, WAY_OUT, Recording, read_r
 
 # Rows below this height do not count, since the ground changes the thrust, m
 LEAST_HEIGHT = 0.3
-# Where the height is unknown, a vehicle flies while its motors get this share of their command in
-# the middle of the flight, and not within this time of a start or landing, s.
-FLYING_SHARE = 0.6
+# Where the height is unknown, a vehicle flies while its motors get this share of what they usually
+# get, and not within this time of a start or landing, s.
+FLYING_SHARE = 0.55
 NEAR_GROUND = 0.5
 # Longer gaps between rows are not filled, s
 LONGEST_GAP = 0.05
@@ -40,6 +40,8 @@ AVERAGED = 0.1  # s
 OFFSETS = np.append(0.0, np.arange(-0.1, 0.1005, 0.001))
 # The least that a log needs: rotors that spin up, and the longest horizon, s
 LEAST_DURATION = 1.0
+# Mean commands in flight: N, rad/s, and a part of the full command
+LIKELY = {"thrust": (1e-3, 1e3), "rotor_speed": (50.0, 1e4), "share": (0.05, 1.0)}
 MOTION_SIZE = 13
 UPWARD = np.array([0.0, 0.0, GRAVITY])
 # Thrust of a motor, N, as coefficients of the powers of its voltage, from the 0th:
@@ -135,8 +137,9 @@ def read_logs(paths: Iterable[StrPath] | StrPath, step: float | None = None) -> 
     if not recordings:
         raise ConfigError(f"{paths}: no logs there; {WAY_OUT}")
     if step is None:
-        sampled = [np.median(np.diff(record.series["gyro"][0])) for record in recordings]
-        step = 0.005 if max(sampled) < 1.0 / 150.0 else 0.01
+        gyros = [recording.series["gyro"] for recording in recordings]
+        is_fast = all(np.ptp(gyro[:, 0]) / len(gyro) < 1.0 / 150.0 for gyro in gyros if len(gyro))
+        step = 0.005 if is_fast else 0.01
     logs = [on_grid(recording, step) for recording in recordings]
     airborne = [log for log in logs if log.flying.any()]
     if not airborne:
@@ -178,12 +181,13 @@ def on_grid(recording: Recording, step: float) -> Log:
     motion[:, POSITION.stop] = 1.0
     flying = _without_gaps(commands, grid)
     offset = 0.0
+    gyro = _averaged(series["gyro"], step)
     if has_motion:
-        offset = _fill_motion(path, series, grid, motion, flying)
+        offset = _fill_motion(path, series, gyro, grid, motion, flying)
     times = grid + offset
-    motion[:, BODY_RATES] = _resampled(series["gyro"], times, step)
+    motion[:, BODY_RATES] = _interpolated(gyro, times)
     if "accelerometer" in series:
-        force = _resampled(series["accelerometer"], times, step)
+        force = _interpolated(_averaged(series["accelerometer"], step), times)
     else:
         force = np.gradient(motion[:, VELOCITY], step, axis=0) + UPWARD
         force = attitudes(motion).inv().apply(force)
@@ -243,10 +247,10 @@ def _interpolated(series: FloatArray, grid: FloatArray) -> FloatArray:
     return np.stack([np.interp(grid, time, column) for column in columns], axis=1)
 
 
-def _resampled(series: FloatArray, grid: FloatArray, step: float) -> FloatArray:
-    """Return values at the times of a grid, (n, columns), as means over about a step."""
+def _averaged(series: FloatArray, step: float) -> FloatArray:
+    """Return running means over about a step."""
     samples = step // np.median(np.diff(series[:, 0])) // 2 * 2 + 1
-    return _interpolated(uniform_filter1d(series, int(samples), axis=0), grid)
+    return np.asarray(uniform_filter1d(series, int(samples), axis=0))
 
 
 def _without_gaps(series: FloatArray, grid: FloatArray) -> BoolArray:
@@ -259,6 +263,7 @@ def _without_gaps(series: FloatArray, grid: FloatArray) -> BoolArray:
 def _fill_motion(
     path: Path,
     series: dict[str, FloatArray],
+    gyro: FloatArray,
     grid: FloatArray,
     motion: FloatArray,
     flying: BoolArray,
@@ -284,7 +289,7 @@ def _fill_motion(
 
     turned = (attitude[:-2].inv() * attitude[2:]).as_rotvec() / (2.0 * step)
     rates = np.pad(turned, ((1, 1), (0, 0)), "edge")[flying]
-    gyros = [_resampled(series["gyro"], grid[flying] + behind, step) for behind in OFFSETS]
+    gyros = [_interpolated(gyro, grid[flying] + behind) for behind in OFFSETS]
     costs = np.square(np.array(gyros) - rates).sum(axis=(1, 2))
     # The first one is 0, and noise alone must not move the clock.
     best = costs.argmin() if costs.min() < WORTH_A_SHIFT * costs[0] else 0
@@ -311,14 +316,18 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
     flying = log.flying
     if not knows_height:
         mean = commands.mean(axis=1)
-        low = mean <= FLYING_SHARE * np.median(mean[mean > 0.2 * mean.max()])
+        top = mean.max()
+        usual = np.quantile(mean[mean >= min(0.2 * top, top)], 0.7)
+        low = mean <= FLYING_SHARE * usual
         flying &= ~binary_dilation(low, iterations=round(NEAR_GROUND / log.step))
     if flying.sum() * log.step < LEAST_DURATION:
         return replace(log, flying=np.zeros_like(flying))
-    least = commands[flying].mean(axis=0)
-    if least.min() <= 0.0:
+    means = commands[flying].mean(axis=0)
+    low, high = LIKELY[log.kind]
+    for motor in np.flatnonzero((means < low) | (means > high)):
         raise ConfigError(
-            f"{log.path}: motor M{least.argmin() + 1} gets {least.min():.3g} on average"
+            f"{log.path}: motor M{motor + 1} gets {means[motor]:.3g} on average as {log.kind}, "
+            f"where {low:g} to {high:g} is likely; check its unit"
         )
     mean_force = log.force[flying].mean()
     if not 0.6 * GRAVITY < mean_force < 1.6 * GRAVITY:

@@ -76,9 +76,9 @@ class Windows:
         batch = self.batch
         batch.vehicles[:] = vehicle.parameters()[:, None]
         batch.reset()
-        actions = vehicle.thrust_to_action(np.nan_to_num(thrusts))
+        actions = vehicle.thrust_to_action(thrusts)
         rows = self.rows - self.before
-        held = np.clip(np.nan_to_num(thrusts[rows]), *vehicle.thrust_range)
+        held = np.clip(thrusts[rows], *vehicle.thrust_range)
         batch.state[ROTOR_SPEEDS] = np.sqrt(held / vehicle.lift).T
         motion = batch.state[:MOTION_SIZE]
         for now in range(-self.before, self.ends[-1]):

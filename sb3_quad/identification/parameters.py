@@ -82,7 +82,7 @@ class Guess(NamedTuple):
         changes["inertia"].append(ratio * vehicle.inertia[2])
         gain = changes.pop("motor_gain_up")
         if gain != vehicle.motor_gain_up:
-            changes["motor_gain"] = gain
+            changes["motor_gain"] = min(gain, FASTEST)
         return Guess(vehicle.model_copy(update=changes), curve, delay)
 
 
@@ -123,7 +123,7 @@ def parameters_of(logs: Sequence[Log], guess: Guess) -> pd.DataFrame:
                 reason = "the other kind of drag explains the same"
             elif field == "motor_gain_up" and guess.curve.kind == "rotor_speed":
                 reason = "the logs hold the speeds themselves"
-            name = f"{field} {axis}".strip()
+            name = f"{field.removesuffix('_up')} {axis}".strip()
             if field == "curve":
                 name = f"thrust, {guess.curve.kind}^{POWERS[guess.curve.kind][k]}"
             most = term.most
