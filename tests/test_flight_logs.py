@@ -267,7 +267,7 @@ def test_the_fit_gives_back_what_flew(tmp_path):
     commands = np.array([0.5, 0.8])
     expected = flew.thrust_range[1] * commands**2
     np.testing.assert_allclose(fit.curve.thrust(commands), expected, rtol=0.05)
-    held = {one.field: one.reason for one in fit.estimates if one.reason}
+    held = {one.field: one.reason for one in fit.estimates.itertuples() if one.reason}
     assert "no velocity" in held["drag"]
 
 

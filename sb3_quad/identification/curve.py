@@ -114,5 +114,5 @@ def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
         both = np.hstack([np.roll(turned, -lag, axis=0), moments])[log.flying]
         with np.errstate(divide="ignore", invalid="ignore"):
             found.append(np.corrcoef(both, rowvar=False).diagonal(3))
-    best = np.abs(np.nan_to_num(found)).argmax(axis=0)
-    return np.nan_to_num(found)[best, range(3)]
+    known = np.nan_to_num(found)
+    return np.asarray(known[np.abs(known).argmax(axis=0), range(3)])

@@ -27,7 +27,7 @@ from sb3_quad.identification.parameters import FASTEST, Guess, parameters_of
 
 Show = Callable[[int, int, str], object]
 # Short and long horizons of logs with velocity, and of body rates alone, s
-HORIZONS = (0.02, 0.05, 0.1), (0.05, 0.1, 0.2, 0.3, 0.5)
+HORIZONS = np.array([0.02, 0.05, 0.1]), np.array([0.05, 0.1, 0.2, 0.3, 0.5])
 HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 WARM_UP = 0.25  # s
 SMOOTHED = 0.1  # s
@@ -67,9 +67,7 @@ class Model:
     :param horizons: where predictions are compared, s.
     """
 
-    def __init__(
-        self, logs: Sequence[Log], start: Guess, horizons: Sequence[float] | FloatArray
-    ) -> None:
+    def __init__(self, logs: Sequence[Log], start: Guess, horizons: FloatArray) -> None:
         self.logs = logs
         self.start = start
         self.table = parameters_of(logs, start)
@@ -115,7 +113,7 @@ class Model:
             scaled.append((part / size).reshape(len(part), -1))
         known = np.hstack(scaled if self.has_motion else scaled[3:])
         # Predictions that diverge must not become infinite.
-        return np.clip(known, -1e3, 1e3)
+        return np.asarray(np.clip(known, -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each kind after each horizon."""
@@ -235,9 +233,10 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     :raises ConfigError: motors turn the vehicle otherwise than its file says.
     """
     kind = logs[0].kind
-    pairs = list(product([FASTEST] if kind == "rotor_speed" else 1.0 / LAGS, DELAYS))
+    gains = np.array([FASTEST]) if kind == "rotor_speed" else 1.0 / LAGS
+    pairs = [*product(gains.tolist(), DELAYS.tolist())]
     found = [regress(logs, start, *pair) for pair in pairs]
-    best = np.argmin([rest for _, rest in found])
+    best = int(np.argmin([rest for _, rest in found]))
     curve, _ = found[best]
     gain, delay = pairs[best]
     for log in logs:
@@ -257,7 +256,7 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
         changes["thrust_coefficient"] = float(curve.coefficients[0])
     # Commands that cannot be right are refused at once.
     _with_limits(Guess(start, curve, 0.0), start.name, 0)
-    return Guess(start.model_copy(update=changes), curve, float(delay))
+    return Guess(start.model_copy(update=changes), curve, delay)
 
 
 def jackknife(slopes: FloatArray, errors: FloatArray) -> FloatArray:

@@ -80,7 +80,7 @@ class Log:
         areas[1:, 1:] = np.cumsum(np.diff(areas[:, :1], axis=0) * areas[:-1, 1:], axis=0)
         areas[0, 1:] = 0.0
         edges = np.append(self.times, self.times[-1] + self.step) - delay
-        return np.diff(_interpolated(areas, edges), axis=0) / self.step
+        return np.asarray(np.diff(_interpolated(areas, edges), axis=0) / self.step)
 
     @cached_property
     def mean_velocity(self) -> FloatArray:
@@ -318,8 +318,8 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
         mean = commands.mean(axis=1)
         top = mean.max()
         usual = np.quantile(mean[mean >= min(0.2 * top, top)], 0.7)
-        low = mean <= FLYING_SHARE * usual
-        flying &= ~binary_dilation(low, iterations=round(NEAR_GROUND / log.step))
+        is_low = mean <= FLYING_SHARE * usual
+        flying &= ~binary_dilation(is_low, iterations=round(NEAR_GROUND / log.step))
     if flying.sum() * log.step < LEAST_DURATION:
         return replace(log, flying=np.zeros_like(flying))
     means = commands[flying].mean(axis=0)

@@ -73,8 +73,8 @@ def run(options: Namespace) -> int:
     with progress_bar(options.progress) as show:
         fit = fit_vehicle(fitted, start, output.stem, show)
     console().print(estimate_table(fit))
-    pairs = {"before": (start, None), "fitted": (fit.vehicle, fit.curve)}
-    console().print(error_table(judged, pairs))
+    vehicles = {"before": (start, None), "fitted": (fit.vehicle, fit.curve)}
+    console().print(error_table(judged, vehicles))
     write_vehicle(output, fit, fitted)
     save_figure(prediction_plot(judged, fit.vehicle, fit.curve), picture)
     print("saved", output, "and", picture)
