@@ -31,7 +31,7 @@ HORIZONS = np.array([0.02, 0.05, 0.1]), np.array([0.05, 0.1, 0.2, 0.3, 0.5])
 HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 WARM_UP = 0.25  # s
 SMOOTHED = 0.1  # s
-MOST_WINDOWS = 600
+MOST_WINDOWS = 1500
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
 ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
@@ -42,7 +42,7 @@ DIFFERENCE = 2e-3
 BLOCKS = 20
 MOST_THRUST = 30.0  # of a motor at full command, by what it needs to hover
 # Half an interval, as a part of its value, beyond which the logs do not tell a parameter
-LARGEST_WIDTH = 0.4
+LARGEST_WIDTH = 0.7
 # No interval is narrower than this part of its value, or this many seconds of a delay: simulated
 # logs with noise show such errors beyond the jackknife's intervals.
 LEAST_WIDTH = 0.03
