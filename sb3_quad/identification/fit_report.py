@@ -69,17 +69,18 @@ def prediction_plot(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> Figu
     # A row without numbers parts each prediction from the next.
     pieces = [windows.start, *flights, np.full_like(windows.start, np.nan)]
     predicted = np.concatenate([piece[:, None, :MOTION_SIZE] for piece in pieces], axis=1)
-    times = step * (windows.rows[:, None] + np.arange(count + 2))
+    rows = np.arange(len(log.motion))[windows.rows[0] :][: round(SHOWN / step)]
+    shown = windows.rows < rows[-1]
+    times = step * (windows.rows[shown, None] + np.arange(count + 2))
     panels = PANELS if log.has_motion else PANELS[:1]
     figure = Figure(figsize=(3 * WIDTH, HEIGHT * len(panels)), layout="constrained")
     all_axes = figure.subplots(len(panels), 3, squeeze=False, sharex=True)
     for line, (name, unit, part) in zip(all_axes, panels, strict=True):
         for k, axes in enumerate(line, part.start):
-            axes.plot(step * np.arange(len(log.motion)), log.motion[:, k], "k", label="measured")
-            flat = predicted[:, :, k].ravel()
+            axes.plot(step * rows, log.motion[rows, k], "k", label="measured")
+            flat = predicted[shown, :, k].ravel()
             axes.plot(times.ravel(), flat, color=COLOURS[1], label="predicted")
             axes.set(ylabel=f"{name} {'xyz'[k - part.start]} ({unit})", xlabel="time (s)")
-    all_axes[0, 0].set_xlim(times[0, 0], times[0, 0] + SHOWN)
     legend(figure)
     return figure
 

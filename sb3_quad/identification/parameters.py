@@ -123,7 +123,9 @@ def parameters_of(logs: Sequence[Log], guess: Guess) -> pd.DataFrame:
                 reason = "the other kind of drag explains the same"
             elif field == "motor_gain_up" and guess.curve.kind == "rotor_speed":
                 reason = "the logs hold the speeds themselves"
-            name = f"{field.removesuffix('_up')} {axis}".strip()
+            name = field.removesuffix("_up")
+            if len(numbers) > 1:
+                name += f" {axis}"
             if field == "curve":
                 name = f"thrust, {guess.curve.kind}^{POWERS[guess.curve.kind][k]}"
             most = term.most
