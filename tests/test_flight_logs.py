@@ -146,6 +146,7 @@ def test_check_vehicle_prints_the_errors(folder, capsys):
         (lambda table: table.assign(thrust_m2=-0.1), "M2"),
         (lambda table: table.assign(thrust_m2=1e300), "thrust"),
         (lambda table: table.assign(thrust_m2=1e4), "M2"),
+        (lambda table: table.assign(gyro_y=table["gyro_y"].where(table.index < 99, 400)), "gyro"),
         (lambda table: table.rename(columns={"vz": "vx"}), "twice"),
         (lambda table: table.assign(acc_x=0.0, acc_y=0.0, acc_z=1.0), "accelerometer"),
     ],

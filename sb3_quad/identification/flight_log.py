@@ -42,6 +42,7 @@ OFFSETS = np.append(0.0, np.arange(-0.1, 0.1005, 0.001))
 LEAST_DURATION = 1.0
 # Mean commands in flight: N, rad/s, and a part of the full command
 LIKELY = {"thrust": (1e-3, 1e3), "rotor_speed": (50.0, 1e4), "share": (0.05, 1.0)}
+MOST_RATE = 100.0  # rad/s, beyond what gyros measure
 MOTION_SIZE = 13
 UPWARD = np.array([0.0, 0.0, GRAVITY])
 # Thrust of a motor, N, as coefficients of the powers of its voltage, from the 0th:
@@ -335,6 +336,9 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
             f"{log.path}: the accelerometer shows {mean_force:.3g} m/s² along z in flight, "
             f"where {GRAVITY:g} is likely; check its unit, axes and sign"
         )
+    fastest = np.abs(log.motion[flying, BODY_RATES]).max()
+    if fastest > MOST_RATE:
+        raise ConfigError(f"{log.path}: the gyro shows {fastest:.3g} rad/s; check its unit")
     return log
 
 
